@@ -1,0 +1,23 @@
+"""Shared fixtures: one torch thread, Warp's mode, and the folder of real scans."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+torch.set_num_threads(1)
+wp.config.quiet = True
+if os.environ.get("MAEXP_WARP_MODE"):  # `.ci/run` repeats the kernel tests with "debug" (bounds checks)
+    wp.config.mode = os.environ["MAEXP_WARP_MODE"]
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of real scans and floor maps; tests that need it skip where it is absent."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("MAEXP_DATA", default))
+    if not (folder / "manifest.csv").is_file():
+        pytest.skip(f"REAL DATA ABSENT: no manifest.csv in {folder}; set MAEXP_DATA to the folder of scans")
+    return folder
