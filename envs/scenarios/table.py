@@ -1,0 +1,84 @@
+"""The table of scenarios: sizes, robots, radars and episode lengths that belong together (design 5)."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from numbers import Integral
+
+from maexp.envs.map import PointCloudMap
+
+from .maze import build_maze
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One kind of place, and the robot, radar, planner and episode length that fit it."""
+
+    name: str
+    count: int | None  # maps in the suite; None: the user brings the map
+    resolution: float  # spacing of the points [m]; the finest where maps of a scenario differ
+    size: float | None  # longest side of the largest maps, in points x resolution [m]
+    radar_range: float  # [m]
+    max_speed: float  # [m/s]
+    max_accel: float  # [m/s^2]
+    body_length: float  # [m]
+    body_width: float  # [m]
+    collision_threshold: float  # centre to boundary point or to another centre [m]
+    clearance_factor: float  # DWA's k: it keeps clearance_factor * collision_threshold away
+    local_steps: int  # control steps in one decision of the policy
+    macro_steps: int | None  # decisions in one episode; None: from the free area
+    num_steering: int = 25  # DWA candidates over the steering angle
+    max_steer: float = math.pi / 3  # [rad]
+    build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
+
+
+_CAR = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)
+_MAZE = dict(
+    _CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20
+)
+
+
+_ROWS = [
+    Scenario("maze", size=125.0, macro_steps=30, **_MAZE,
+             build=partial(build_maze, scenario="maze", cells=12, corridor=5, wall=5, resolution=1.0)),
+    Scenario("maze_small", size=37.0, macro_steps=15, **_MAZE,
+             build=partial(build_maze, scenario="maze_small", cells=6, corridor=5, wall=1, resolution=1.0)),
+    Scenario("pointcloud", count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
+             max_accel=1.0, body_length=0.6, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
+             local_steps=20, macro_steps=None),
+]  # fmt: skip
+
+SCENARIOS: dict[str, Scenario] = {row.name: row for row in _ROWS}
+
+
+def find_scenario(name: str) -> Scenario:
+    """The scenario called `name`; ValueError naming the choices if there is none."""
+    if name not in SCENARIOS:
+        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(SCENARIOS)}.")
+    return SCENARIOS[name]
+
+
+def make_map(name: str, index: int = 0) -> PointCloudMap:
+    """Map `index` (any integer >= 0) of scenario `name`: the same points on every call.
+
+    ValueError for an unknown scenario, a negative index, or a scenario whose map the user brings.
+    """
+    scenario = find_scenario(name)
+    if scenario.build is None:
+        raise ValueError(
+            f"scenario={name!r} has no generated maps: give the file of your map as scenario.path=FILE "
+            "(in Python: maexp.envs.import_map(FILE))."
+        )
+    if not isinstance(index, Integral) or index < 0:
+        raise ValueError(f"index={index!r} of scenario {name!r} must be an integer >= 0.")
+    return scenario.build(int(index))
+
+
+def split(name: str) -> tuple[range, range]:
+    """Indices of the training maps and of the held-out maps (the last fifth of the table's count)."""
+    scenario = find_scenario(name)
+    if scenario.count is None:
+        raise ValueError(f"scenario={name!r} has no generated maps to hold out: it plays the map you bring.")
+    train = scenario.count - max(1, round(0.2 * scenario.count))
+    return range(train), range(train, scenario.count)
