@@ -1,0 +1,137 @@
+"""Motion of the robots and their footprints (design 4.3).
+
+A pose is ``(x, y, v, theta)`` of the reference point [m, m, m/s, rad]: the rear axle of an Ackermann
+car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirectional robot [m/s].
+"""
+
+import warp as wp
+
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots
+
+
+@wp.func
+def wrap_angle(theta: float) -> float:
+    """Angle in [-pi, pi)."""
+    return theta - 2.0 * PI * wp.floor((theta + PI) / (2.0 * PI))
+
+
+@wp.func
+def center_of(pose: wp.vec4, offset: float) -> wp.vec2:
+    return wp.vec2(pose[0] + offset * wp.cos(pose[3]), pose[1] + offset * wp.sin(pose[3]))
+
+
+@wp.func
+def advance(kind: int, pose: wp.vec4, slip: float, control: wp.vec2, wheelbase: float, dt: float) -> wp.vec4:
+    """One explicit Euler step; the speed is not limited here."""
+    x = pose[0]
+    y = pose[1]
+    v = pose[2]
+    theta = pose[3]
+    c = wp.cos(theta)
+    s = wp.sin(theta)
+    x += (v * c - slip * s) * dt
+    y += (v * s + slip * c) * dt
+    if kind == ACKERMANN:
+        theta += v * wp.tan(control[1]) / wheelbase * dt
+    elif kind == DIFFERENTIAL:
+        theta += control[1] * dt
+    return wp.vec4(x, y, v + control[0] * dt, theta)
+
+
+@wp.func
+def rectangle_distance(p: wp.vec2, center: wp.vec2, theta: float, length: float, width: float) -> float:
+    """Distance of a point to an oriented rectangle, 0 inside."""
+    d = p - center
+    c = wp.cos(theta)
+    s = wp.sin(theta)
+    a = wp.max(wp.abs(c * d[0] + s * d[1]) - 0.5 * length, 0.0)
+    b = wp.max(wp.abs(c * d[1] - s * d[0]) - 0.5 * width, 0.0)
+    return wp.sqrt(a * a + b * b)
+
+
+@wp.func
+def rectangle_corner(k: int, center: wp.vec2, theta: float, length: float, width: float) -> wp.vec2:
+    a = wp.where(k < 2, 0.5, -0.5) * length
+    b = wp.where(k == 0 or k == 3, 0.5, -0.5) * width
+    c = wp.cos(theta)
+    s = wp.sin(theta)
+    return wp.vec2(center[0] + a * c - b * s, center[1] + a * s + b * c)
+
+
+@wp.func
+def separated(
+    center: wp.vec2, theta: float, length: float, width: float, other: wp.vec2, theta_o: float, length_o: float, width_o: float
+) -> bool:
+    """Whether an axis of the first rectangle separates the two."""
+    c = wp.cos(theta)
+    s = wp.sin(theta)
+    d = other - center
+    co = wp.abs(wp.cos(theta_o - theta))
+    so = wp.abs(wp.sin(theta_o - theta))
+    along = 0.5 * (length + co * length_o + so * width_o)
+    across = 0.5 * (width + so * length_o + co * width_o)
+    return wp.abs(c * d[0] + s * d[1]) > along or wp.abs(c * d[1] - s * d[0]) > across
+
+
+@wp.func
+def rectangles_gap(
+    center: wp.vec2, theta: float, length: float, width: float, other: wp.vec2, theta_o: float, length_o: float, width_o: float
+) -> float:
+    """Distance of two oriented rectangles, 0 where they overlap.
+
+    The nearest points of two disjoint convex polygons include a corner of one of them.
+    """
+    if not separated(center, theta, length, width, other, theta_o, length_o, width_o):
+        if not separated(other, theta_o, length_o, width_o, center, theta, length, width):
+            return 0.0
+    gap = float(1.0e30)
+    for k in range(4):
+        p = rectangle_corner(k, center, theta, length, width)
+        q = rectangle_corner(k, other, theta_o, length_o, width_o)
+        gap = wp.min(gap, rectangle_distance(p, other, theta_o, length_o, width_o))
+        gap = wp.min(gap, rectangle_distance(q, center, theta, length, width))
+    return gap
+
+
+@wp.kernel
+def _move_robots(
+    # Robots:
+    robots: Robots,
+    dt: float,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    collided: wp.array2d(dtype=wp.int32),
+    control: wp.array2d(dtype=wp.vec2),
+    # State out:
+    pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
+    center: wp.array2d(dtype=wp.vec3),
+    path_length: wp.array2d(dtype=wp.float32),
+):
+    """Clamp the controls to the robot's limits and move it by one local step."""
+    e, i = wp.tid()
+    if active[e] == 0 or collided[e, i] != 0:
+        return
+    kind = robots.kind[e, i]
+    accel = robots.max_accel[e, i]
+    turn = robots.max_turn[e, i]
+    u = control[e, i]
+    old = pose[e, i]
+    side = slip[e, i]
+    limit = robots.max_speed[e, i]
+    path_length[e, i] = path_length[e, i] + wp.length(wp.vec2(old[2], side)) * dt
+    if kind == ACKERMANN or kind == DIFFERENTIAL:
+        u = wp.vec2(wp.clamp(u[0], -accel, accel), wp.clamp(u[1], -turn, turn))
+        after = advance(kind, old, side, u, robots.wheelbase[e, i], dt)
+        pose[e, i] = wp.vec4(after[0], after[1], wp.clamp(after[2], -limit, limit), wrap_angle(after[3]))
+    else:
+        u = wp.vec2(wp.clamp(u[0], -accel, accel), wp.clamp(u[1], -accel, accel))
+        after = advance(kind, old, side, u, robots.wheelbase[e, i], dt)
+        velocity = wp.vec2(after[2], side + u[1] * dt)
+        speed = wp.length(velocity)
+        if speed > limit:
+            velocity = velocity * (limit / speed)
+        slip[e, i] = velocity[1]
+        pose[e, i] = wp.vec4(after[0], after[1], velocity[0], wrap_angle(after[3]))
+    c = center_of(pose[e, i], robots.center_offset[e, i])
+    center[e, i] = wp.vec3(c[0], c[1], 0.0)

@@ -1,0 +1,104 @@
+"""Frontiers: where what the team knows to be free borders on what it does not know.
+
+A grid cell is `UNKNOWN`, `FREE` or `OBSTACLE`; a frontier cell is a free one that shares an edge with an
+unknown one. What lies outside the grid is not unknown: nothing can ever be seen there.
+"""
+
+import torch
+import warp as wp
+
+UNKNOWN = 0
+FREE = 1
+OBSTACLE = 2
+
+wp_unknown = wp.constant(wp.uint8(UNKNOWN))
+wp_free = wp.constant(wp.uint8(FREE))
+
+
+@wp.kernel(enable_backward=False)
+def _mark_frontier(
+    # Grid:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    width: wp.array(dtype=wp.int32),  # [grid]
+    height: wp.array(dtype=wp.int32),  # [grid]
+    # Out:
+    frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
+):
+    row, cell = wp.tid()
+    grid = grid_of_row[row]
+    w = width[grid]
+    cells = w * height[grid]
+    found = wp.uint8(0)
+    if cell < cells:
+        if known[row, cell] == wp_free:
+            x = cell % w
+            if x > 0:
+                if known[row, cell - 1] == wp_unknown:
+                    found = wp.uint8(1)
+            if x + 1 < w:
+                if known[row, cell + 1] == wp_unknown:
+                    found = wp.uint8(1)
+            if cell >= w:
+                if known[row, cell - w] == wp_unknown:
+                    found = wp.uint8(1)
+            if cell + w < cells:
+                if known[row, cell + w] == wp_unknown:
+                    found = wp.uint8(1)
+    frontier[row, cell] = found
+
+
+def mark_frontier(
+    known: wp.array, grid_of_row: wp.array, width: wp.array, height: wp.array, frontier: wp.array
+):
+    """Marks the frontier cells of a batch of grids of different sizes.
+
+    Args:
+        known: uint8 [rows, cells], `UNKNOWN`, `FREE` or `OBSTACLE`; cell = iy * width + ix, own width.
+        grid_of_row: int32 [rows], which grid (map) a row has now.
+        width, height: int32 [grids], cells of each grid along x and y.
+        frontier: uint8 [rows, cells], out: 1 on frontier cells, 0 elsewhere.
+    """
+    wp.launch(
+        _mark_frontier,
+        known.shape,
+        inputs=[known, grid_of_row, width, height],
+        outputs=[frontier],
+        device=known.device,
+    )
+
+
+def frontier_cells(known_free: torch.Tensor, known_obstacle: torch.Tensor) -> torch.Tensor:
+    """Frontier cells of a batch of grids.
+
+    Args:
+        known_free: bool or integer [B, H, W] (rows along y), nonzero = seen and free.
+        known_obstacle: bool or integer [B, H, W], nonzero = seen and blocked; a cell that is both is blocked.
+
+    Returns:
+        bool [B, H, W]: free cells that share an edge with a cell neither free nor blocked.
+
+    Raises:
+        ValueError: shapes that differ or are not [B, H, W].
+    """
+    if known_free.dim() != 3 or known_free.shape != known_obstacle.shape:
+        raise ValueError(
+            "known_free and known_obstacle must have one shape [B, H, W], got "
+            f"{tuple(known_free.shape)} and {tuple(known_obstacle.shape)}"
+        )
+    batch, height, width = known_free.shape
+    if known_free.numel() == 0:
+        return torch.zeros(known_free.shape, dtype=torch.bool, device=known_free.device)
+    known = (known_free != 0).to(torch.uint8)
+    known[known_obstacle != 0] = OBSTACLE
+    known = known.view(batch, -1)
+    frontier = torch.empty_like(known)
+    device = wp.get_device(str(known.device))
+    mark_frontier(
+        wp.from_torch(known),
+        wp.zeros(batch, dtype=wp.int32, device=device),
+        wp.array([width], dtype=wp.int32, device=device),
+        wp.array([height], dtype=wp.int32, device=device),
+        wp.from_torch(frontier),
+    )
+    return frontier.view(batch, height, width) != 0

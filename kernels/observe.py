@@ -1,0 +1,218 @@
+"""What the policy sees: pictures, poses, region offsets (design 2, 4.2; paper, section IV-D).
+
+Picture: a square frame around the extent, x along the first axis, flattened to 125 * 125 pixels.
+Which points a pixel shows is fixed per map (`Maps.pixel_point`).
+"""
+
+import warp as wp
+
+from maexp.kernels.dynamics import rectangle_distance
+from maexp.kernels.types import PI, PIXELS, REGIONS, ROBOTS_PER_WORD, Maps, Robots, point_xy
+
+ON = wp.constant(wp.uint8(255))
+OFF = wp.constant(wp.uint8(0))
+OTHER = wp.constant(wp.uint8(128))
+FADE = wp.constant(0.99)
+
+
+@wp.func
+def pixel_of(maps: Maps, m: int, p: wp.vec2) -> wp.vec2i:
+    """Pixel whose centre is nearest, clamped to the picture."""
+    q = (p - maps.frame_origin[m]) / maps.pixel_size[m]
+    return wp.vec2i(
+        wp.clamp(int(wp.floor(q[0] + 0.5)), 0, PIXELS - 1), wp.clamp(int(wp.floor(q[1] + 0.5)), 0, PIXELS - 1)
+    )
+
+
+@wp.kernel
+def _draw_points(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    robot_count: int,
+    # State in:
+    draw_free: wp.array3d(dtype=wp.int32),
+    draw_boundary: wp.array3d(dtype=wp.int32),
+    seen_free: wp.array3d(dtype=wp.int32),
+    seen_boundary: wp.array3d(dtype=wp.int32),
+    # Out:
+    picture: wp.array4d(dtype=wp.uint8),
+    team: wp.array3d(dtype=wp.uint8),
+):
+    """Pixel p of every robot of env e: explored and obstacle; of the team: explored, obstacle, viewers.
+
+    ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map.
+    """
+    e, p = wp.tid()
+    m = map_id[e]
+    pixel = m * PIXELS * PIXELS + p
+    start = maps.pixel_begin[pixel]
+    stop = maps.pixel_begin[pixel + 1]
+    viewers = int(0)
+    explored = OFF
+    obstacle = OFF
+    for w in range(seen_free.shape[1]):
+        free_word = int(0)
+        wall_word = int(0)
+        team_free = int(0)
+        team_wall = int(0)
+        for k in range(start, stop):
+            j = maps.pixel_point[k]
+            if j >= 0:
+                free_word = free_word | draw_free[e, w, j]
+                team_free = team_free | seen_free[e, w, j]
+            else:
+                wall_word = wall_word | draw_boundary[e, w, -1 - j]
+                team_wall = team_wall | seen_boundary[e, w, -1 - j]
+        viewers += wp.bit_count(team_free)
+        if team_free != 0:
+            explored = ON
+        if team_wall != 0:
+            obstacle = ON
+        first = w * ROBOTS_PER_WORD
+        for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
+            bit = 1 << (i - first)
+            picture[e, i, 0, p] = wp.where((free_word & bit) != 0, ON, OFF)
+            picture[e, i, 1, p] = wp.where((wall_word & bit) != 0, ON, OFF)
+            picture[e, i, 2, p] = OFF
+            picture[e, i, 3, p] = OFF
+    team[e, 0, p] = explored
+    team[e, 1, p] = obstacle
+    team[e, 2, p] = wp.uint8(wp.min(viewers, 255))
+
+
+@wp.func
+def draw_body(
+    maps: Maps,
+    m: int,
+    e: int,
+    i: int,
+    at: wp.vec2,
+    theta: float,
+    length: float,
+    width: float,
+    value: wp.uint8,
+    picture: wp.array4d(dtype=wp.uint8),
+):
+    """Fill the pixels whose centres lie in a body, and the one nearest to its centre."""
+    reach = wp.vec2(1.0, 1.0) * (0.5 * (length + width))
+    low = pixel_of(maps, m, at - reach)
+    high = pixel_of(maps, m, at + reach)
+    for ix in range(low[0], high[0] + 1):
+        for iy in range(low[1], high[1] + 1):
+            p = maps.frame_origin[m] + maps.pixel_size[m] * wp.vec2(float(ix), float(iy))
+            if rectangle_distance(p, at, theta, length, width) == 0.0:
+                picture[e, i, 2, ix * PIXELS + iy] = value
+    middle = pixel_of(maps, m, at)
+    picture[e, i, 2, middle[0] * PIXELS + middle[1]] = value
+
+
+@wp.func
+def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.array4d(dtype=wp.uint8)):
+    """Draw from pixel p (excluded unless equal) to pixel q."""
+    dx = q / PIXELS - p / PIXELS
+    dy = q % PIXELS - p % PIXELS
+    steps = wp.max(wp.max(wp.abs(dx), wp.abs(dy)), 1)
+    for k in range(1, steps + 1):
+        t = float(k) / float(steps)
+        ix = p / PIXELS + int(wp.floor(float(dx) * t + 0.5))
+        iy = p % PIXELS + int(wp.floor(float(dy) * t + 0.5))
+        picture[e, i, 3, ix * PIXELS + iy] = value
+
+
+@wp.kernel
+def _draw_robots(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # Robots:
+    robots: Robots,
+    # State in:
+    pose: wp.array2d(dtype=wp.vec4),
+    center: wp.array2d(dtype=wp.vec3),
+    local_step: wp.array(dtype=wp.int32),
+    track: wp.array3d(dtype=wp.int32),
+    # Out:
+    picture: wp.array4d(dtype=wp.uint8),
+):
+    """Draw bodies (own 255, others 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
+    e, i = wp.tid()
+    m = map_id[e]
+    for other in range(pose.shape[1]):
+        if other != i:
+            draw_body(
+                maps, m, e, i, point_xy(center[e, other]), pose[e, other][3],
+                robots.length[e, other], robots.width[e, other], OTHER, picture,
+            )  # fmt: skip
+    draw_body(
+        maps, m, e, i, point_xy(center[e, i]), pose[e, i][3], robots.length[e, i], robots.width[e, i], ON, picture
+    )
+    last = local_step[e]
+    depth = track.shape[2]
+    oldest = wp.max(0, last - depth + 1)
+    value = 255.0 * wp.pow(FADE, float(last - oldest))
+    before = track[e, i, oldest % depth]
+    for step in range(oldest, last + 1):
+        here = track[e, i, step % depth]
+        draw_segment(before, here, wp.uint8(value + 0.5), e, i, picture)
+        before = here
+        value = value / FADE
+
+
+@wp.kernel
+def _record_track(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    center: wp.array2d(dtype=wp.vec3),
+    local_step: wp.array(dtype=wp.int32),
+    ahead: int,
+    # State out:
+    track: wp.array3d(dtype=wp.int32),
+):
+    """Note the pixel of robot (e, i) under the step that is being finished (``ahead`` = 1) or starts (0)."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    pixel = pixel_of(maps, map_id[e], point_xy(center[e, i]))
+    track[e, i, (local_step[e] + ahead) % track.shape[2]] = pixel[0] * PIXELS + pixel[1]
+
+
+@wp.kernel
+def _observe_pose(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # Robots:
+    robots: Robots,
+    # State in:
+    pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
+    center: wp.array2d(dtype=wp.vec3),
+    goal: wp.array2d(dtype=wp.vec2),
+    # Out:
+    scaled_pose: wp.array2d(dtype=wp.vec4),
+    grid: wp.array4d(dtype=wp.float32),
+):
+    """Pose scaled to about [-1, 1]; offsets of the region centres to the robot and to its last goal, in frame sides."""
+    e, i = wp.tid()
+    m = map_id[e]
+    middle = 0.5 * (maps.lower[m] + maps.upper[m])
+    side = maps.pixel_size[m] * float(PIXELS)
+    at = point_xy(center[e, i])
+    last = goal[e, i]
+    rel = (at - middle) * (2.0 / side)
+    speed = wp.length(wp.vec2(pose[e, i][2], slip[e, i]))
+    if pose[e, i][2] < 0.0 and slip[e, i] == 0.0:
+        speed = -speed
+    scaled_pose[e, i] = wp.vec4(rel[0], rel[1], speed / robots.max_speed[e, i], pose[e, i][3] / PI)
+    cell = (maps.upper[m] - maps.lower[m]) / float(REGIONS)
+    for r in range(REGIONS * REGIONS):
+        x = maps.lower[m][0] + cell[0] * (float(r / REGIONS) + 0.5)
+        y = maps.lower[m][1] + cell[1] * (float(r % REGIONS) + 0.5)
+        grid[e, i, 0, r] = (x - at[0]) / side
+        grid[e, i, 1, r] = (y - at[1]) / side
+        grid[e, i, 2, r] = (x - last[0]) / side
+        grid[e, i, 3, r] = (y - last[1]) / side

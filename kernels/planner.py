@@ -1,0 +1,250 @@
+"""Local planners: how to go (design 4.4). DWA, and direct controls from the policy."""
+
+import warp as wp
+
+from maexp.kernels.dynamics import advance, center_of, rectangle_distance, rectangles_gap
+from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span
+
+NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
+
+
+@wp.func
+def candidate(kind: int, k: int, num_turns: int, num_accels: int, accel: float, turn: float) -> wp.vec2:
+    """Candidate ``k``: accelerations outside, turns inside, both evenly spaced over their limits."""
+    a = k / num_turns
+    b = k % num_turns
+    first = float(0.0)
+    second = float(0.0)
+    if num_accels > 1:
+        first = -accel + 2.0 * accel * float(a) / float(num_accels - 1)
+    reach = turn
+    if kind == OMNIDIRECTIONAL:
+        reach = accel
+    if num_turns > 1:
+        second = -reach + 2.0 * reach * float(b) / float(num_turns - 1)
+    return wp.vec2(first, second)
+
+
+@wp.func
+def is_known(flags: wp.array3d(dtype=wp.int32), e: int, i: int, j: int, limited: int) -> bool:
+    """Whether robot i knows point j: its own flag where communication is limited, anybody's otherwise."""
+    if limited != 0:
+        return (flags[e, i / ROBOTS_PER_WORD, j] & (1 << (i % ROBOTS_PER_WORD))) != 0
+    for w in range(flags.shape[1]):
+        if flags[e, w, j] != 0:
+            return True
+    return False
+
+
+@wp.func
+def gather_obstacles(
+    maps: Maps,
+    m: int,
+    e: int,
+    i: int,
+    at: wp.vec2,
+    reach: float,
+    limited: int,
+    known_boundary: wp.array3d(dtype=wp.int32),
+    nearby: wp.array3d(dtype=wp.vec2),
+) -> int:
+    """List the known boundary points within ``reach`` of a robot; returns how many there are."""
+    count = int(0)
+    rows = row_range(maps, m, at, reach)
+    first = maps.boundary_begin[m]
+    for row in range(rows[0], rows[1] + 1):
+        span = row_span(maps, m, row, at, reach)
+        if span[0] <= span[1]:
+            base = maps.cell_begin[m] + row * maps.cells_x[m]
+            for j in range(maps.boundary_cell[base + span[0]], maps.boundary_cell[base + span[1] + 1]):
+                p = point_xy(maps.boundary[first + j])
+                if wp.length(p - at) <= reach and is_known(known_boundary, e, i, j, limited):
+                    if count < nearby.shape[2]:
+                        nearby[e, i, count] = p
+                    count += 1
+    return count
+
+
+@wp.func
+def body_distance(
+    robots: Robots,
+    e: int,
+    i: int,
+    at: wp.vec2,
+    theta: float,
+    footprint: int,
+    reach: float,
+    pose: wp.array2d(dtype=wp.vec4),
+    center: wp.array2d(dtype=wp.vec3),
+) -> float:
+    """Distance from a predicted body of robot i to the nearest other body within ``reach`` of its centre now."""
+    nearest = float(1.0e30)
+    here = point_xy(center[e, i])
+    for other in range(pose.shape[1]):
+        if other != i:
+            there = point_xy(center[e, other])
+            if wp.length(there - here) <= reach:
+                length = robots.length[e, other]
+                width = robots.width[e, other]
+                if footprint != 0:
+                    gap = rectangles_gap(
+                        at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
+                    )
+                else:
+                    gap = rectangle_distance(at, there, pose[e, other][3], length, width)
+                nearest = wp.min(nearest, gap)
+    return nearest
+
+
+@wp.func
+def obstacle_distance(
+    count: int,
+    e: int,
+    i: int,
+    at: wp.vec2,
+    theta: float,
+    length: float,
+    width: float,
+    footprint: int,
+    nearby: wp.array3d(dtype=wp.vec2),
+) -> float:
+    """Distance from a predicted body (its centre, or its footprint) to the nearest listed point."""
+    nearest = float(1.0e30)
+    if footprint != 0:
+        for k in range(count):
+            nearest = wp.min(nearest, rectangle_distance(nearby[e, i, k], at, theta, length, width))
+        return nearest
+    for k in range(count):
+        d = nearby[e, i, k] - at
+        nearest = wp.min(nearest, wp.dot(d, d))
+    return wp.sqrt(nearest)
+
+
+@wp.kernel
+def _plan_dwa(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # Robots:
+    robots: Robots,
+    num_accels: int,
+    num_turns: int,
+    horizon: int,
+    weight: float,
+    footprint: int,
+    limited: int,
+    dt: float,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    collided: wp.array2d(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
+    center: wp.array2d(dtype=wp.vec3),
+    target: wp.array2d(dtype=wp.vec2),
+    known_boundary: wp.array3d(dtype=wp.int32),
+    # Scratch:
+    nearby: wp.array3d(dtype=wp.vec2),
+    # Out:
+    control: wp.array2d(dtype=wp.vec2),
+    error: wp.array(dtype=wp.int32),
+):
+    """Dynamic window: the candidate with the best score after ``horizon`` steps; the first maximum wins.
+
+    score = -distance(target) + weight * log(d / clearance) where d < clearance, d the distance of the
+    predicted body to what is known to be in the way.
+    """
+    e, i = wp.tid()
+    if active[e] == 0 or collided[e, i] != 0:
+        return
+    m = map_id[e]
+    kind = robots.kind[e, i]
+    accel = robots.max_accel[e, i]
+    turn = robots.max_turn[e, i]
+    length = robots.length[e, i]
+    width = robots.width[e, i]
+    offset = robots.center_offset[e, i]
+    clearance = robots.clearance[e, i]
+    start = pose[e, i]
+    at = point_xy(center[e, i])
+    steps = float(horizon)
+    speed = wp.abs(start[2]) + wp.abs(slip[e, i])
+    travel = dt * steps * (speed + 1.5 * accel * dt * steps) + 2.0 * wp.abs(offset)
+    reach = travel + clearance + float(footprint) * (length + width)
+    in_range = robots.radar_range[e, i]
+    count = gather_obstacles(maps, m, e, i, at, wp.min(reach, in_range), limited, known_boundary, nearby)
+    if count > nearby.shape[2]:
+        wp.atomic_or(error, e, 4)
+        count = nearby.shape[2]
+    best = float(-1.0e30)
+    for k in range(num_accels * num_turns):
+        u = candidate(kind, k, num_turns, num_accels, accel, turn)
+        p = start
+        side = slip[e, i]
+        for _step in range(horizon):
+            p = advance(kind, p, side, u, robots.wheelbase[e, i], dt)
+            if kind == OMNIDIRECTIONAL:
+                side += u[1] * dt
+        c = center_of(p, offset)
+        d = obstacle_distance(count, e, i, c, p[3], length, width, footprint, nearby)
+        d = wp.min(d, body_distance(robots, e, i, c, p[3], footprint, in_range, pose, center))
+        score = -wp.length(target[e, i] - c)
+        if d < clearance:
+            score += weight * wp.log(wp.max(d, NEAREST) / clearance)
+        if score > best:
+            best = score
+            control[e, i] = u
+
+
+@wp.kernel
+def _plan_direct(
+    # Robots:
+    robots: Robots,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    command: wp.array2d(dtype=wp.vec2),
+    # Out:
+    control: wp.array2d(dtype=wp.vec2),
+):
+    """Take the controls from the policy: shares of the robot's limits in [-1, 1]."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    first = wp.clamp(command[e, i][0], -1.0, 1.0) * robots.max_accel[e, i]
+    second = wp.clamp(command[e, i][1], -1.0, 1.0)
+    if robots.kind[e, i] == OMNIDIRECTIONAL:
+        second = second * robots.max_accel[e, i]
+    else:
+        second = second * robots.max_turn[e, i]
+    control[e, i] = wp.vec2(first, second)
+
+
+@wp.kernel
+def _set_goal(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # Action:
+    region: wp.array2d(dtype=wp.int64),
+    offset: wp.array2d(dtype=wp.vec2),
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    # State out:
+    goal: wp.array2d(dtype=wp.vec2),
+    target: wp.array2d(dtype=wp.vec2),
+    error: wp.array(dtype=wp.int32),
+):
+    """Goal = region centre + offset * half a region (region = ix * 8 + iy); out of bounds is clamped."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    m = map_id[e]
+    o = offset[e, i]
+    if not (wp.isfinite(o[0]) and wp.isfinite(o[1])):
+        wp.atomic_or(error, e, 1)
+        return
+    r = int(wp.clamp(region[e, i], wp.int64(0), wp.int64(63)))
+    half = (maps.upper[m] - maps.lower[m]) / 16.0
+    x = maps.lower[m][0] + half[0] * (float(2 * (r / 8) + 1) + wp.clamp(o[0], -1.0, 1.0))
+    y = maps.lower[m][1] + half[1] * (float(2 * (r % 8) + 1) + wp.clamp(o[1], -1.0, 1.0))
+    goal[e, i] = wp.vec2(x, y)
+    target[e, i] = wp.vec2(x, y)

@@ -1,0 +1,177 @@
+"""Masked reset: choose the map, clear the flags, place the team (design 2, 4.3).
+
+Random numbers are keyed by (seed, env, episode), so env i plays the same episodes for any batch size.
+"""
+
+import warp as wp
+
+from maexp.kernels.types import PI, Maps, Robots, point_xy
+
+TRIES = wp.constant(64)
+START_CLEARANCE = wp.constant(3.0)
+"""Starts keep this many collision thresholds from the boundary and from other robots."""
+
+
+@wp.func
+def start_is_free(
+    maps: Maps, robots: Robots, e: int, i: int, point: int, p: wp.vec3, center: wp.array2d(dtype=wp.vec3)
+) -> bool:
+    """Whether robot i may start at free point ``point``, robots 0 .. i - 1 being placed."""
+    need = START_CLEARANCE * robots.threshold[e, i]
+    if maps.free_clearance[point] < need:
+        return False
+    for other in range(i):
+        room = wp.max(need, START_CLEARANCE * robots.threshold[e, other])
+        if wp.length(center[e, other] - p) < room:
+            return False
+    return True
+
+
+@wp.kernel
+def _place_team(
+    # Map:
+    maps: Maps,
+    num_maps: int,
+    # Robots:
+    robots: Robots,
+    seed: int,
+    # State in:
+    mask: wp.array(dtype=wp.int32),
+    env_id: wp.array(dtype=wp.int32),
+    episode: wp.array(dtype=wp.int32),
+    # State out:
+    map_id: wp.array(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.vec4),
+    center: wp.array2d(dtype=wp.vec3),
+    error: wp.array(dtype=wp.int32),
+):
+    """Draw the map of a new episode and a start for every robot: clear of walls and of the others, any heading."""
+    e = wp.tid()
+    if mask[e] == 0:
+        return
+    # rand_init mixes seed and offset; the first draw keeps episodes of neighbouring envs apart.
+    key = wp.rand_init(seed, env_id[e])
+    rng = wp.rand_init(wp.randi(key), episode[e])
+    m = wp.randi(rng, 0, num_maps)
+    map_id[e] = m
+    first = maps.free_begin[m]
+    count = maps.free_begin[m + 1] - first
+    for i in range(pose.shape[1]):
+        point = int(-1)
+        for _try in range(TRIES):
+            j = first + wp.randi(rng, 0, count)
+            if point < 0 and start_is_free(maps, robots, e, i, j, maps.free[j], center):
+                point = j
+        if point < 0:  # crowded: take the first free start after a random one
+            shift = wp.randi(rng, 0, count)
+            for k in range(count):
+                j = first + (k + shift) % count
+                if start_is_free(maps, robots, e, i, j, maps.free[j], center):
+                    point = j
+                    break
+        theta = PI * (2.0 * wp.randf(rng) - 1.0)
+        if point < 0:
+            wp.atomic_or(error, e, 2)
+            point = first
+        p = point_xy(maps.free[point])
+        back = robots.center_offset[e, i]
+        pose[e, i] = wp.vec4(p[0] - back * wp.cos(theta), p[1] - back * wp.sin(theta), 0.0, theta)
+        center[e, i] = wp.vec3(p[0], p[1], 0.0)
+
+
+@wp.kernel
+def _clear_flags(
+    # State in:
+    mask: wp.array(dtype=wp.int32),
+    # State out:
+    flags: wp.array3d(dtype=wp.int32),
+):
+    e, w, j = wp.tid()
+    if mask[e] != 0:
+        flags[e, w, j] = 0
+
+
+@wp.kernel
+def _clear_env(
+    # State in:
+    mask: wp.array(dtype=wp.int32),
+    # State out:
+    covered: wp.array(dtype=wp.int32),
+    covered_before: wp.array(dtype=wp.int32),
+    shared: wp.array(dtype=wp.int32),
+    local_step: wp.array(dtype=wp.int32),
+    macro_step: wp.array(dtype=wp.int32),
+    terminated: wp.array(dtype=wp.int32),
+    milestone_step: wp.array2d(dtype=wp.int32),
+    milestone_overlap: wp.array2d(dtype=wp.float32),
+):
+    e = wp.tid()
+    if mask[e] == 0:
+        return
+    covered[e] = 0
+    covered_before[e] = 0
+    shared[e] = 0
+    local_step[e] = 0
+    macro_step[e] = 0
+    terminated[e] = 0
+    for k in range(2):
+        milestone_step[e, k] = -1
+        milestone_overlap[e, k] = 0.0
+
+
+@wp.kernel
+def _clear_robots(
+    # State in:
+    mask: wp.array(dtype=wp.int32),
+    center: wp.array2d(dtype=wp.vec3),
+    # State out:
+    slip: wp.array2d(dtype=wp.float32),
+    control: wp.array2d(dtype=wp.vec2),
+    goal: wp.array2d(dtype=wp.vec2),
+    target: wp.array2d(dtype=wp.vec2),
+    collided: wp.array2d(dtype=wp.int32),
+    crashed: wp.array2d(dtype=wp.int32),
+    path_length: wp.array2d(dtype=wp.float32),
+    milestone_path: wp.array3d(dtype=wp.float32),
+    terms: wp.array3d(dtype=wp.float32),
+    raw: wp.array3d(dtype=wp.float32),
+    episode_reward: wp.array2d(dtype=wp.float32),
+):
+    e, i = wp.tid()
+    if mask[e] == 0:
+        return
+    slip[e, i] = 0.0
+    control[e, i] = wp.vec2(0.0, 0.0)
+    goal[e, i] = point_xy(center[e, i])
+    target[e, i] = point_xy(center[e, i])
+    collided[e, i] = 0
+    crashed[e, i] = 0
+    path_length[e, i] = 0.0
+    episode_reward[e, i] = 0.0
+    for k in range(2):
+        milestone_path[e, i, k] = 0.0
+    for k in range(terms.shape[2]):
+        terms[e, i, k] = 0.0
+        raw[e, i, k] = 0.0
+
+
+@wp.kernel
+def _start_env(
+    # State in:
+    mask: wp.array(dtype=wp.int32),
+    covered: wp.array(dtype=wp.int32),
+    # State out:
+    covered_before: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),
+    fresh: wp.array2d(dtype=wp.int32),
+    overlap: wp.array2d(dtype=wp.int32),
+):
+    """The scan at reset counts in coverage and earns nothing."""
+    e = wp.tid()
+    if mask[e] == 0:
+        return
+    covered_before[e] = covered[e]
+    active[e] = 1
+    for i in range(fresh.shape[1]):
+        fresh[e, i] = 0
+        overlap[e, i] = 0

@@ -1,0 +1,128 @@
+"""Reward terms, milestones and the end of an episode (design 4.5, 4.6; paper, section III-D)."""
+
+import warp as wp
+
+from maexp.kernels.types import Maps
+
+EXPLORE = wp.constant(0)
+OVERLAP = wp.constant(1)
+TIME = wp.constant(2)
+SUCCESS = wp.constant(3)
+COLLISION = wp.constant(4)
+TERMS = wp.constant(5)
+"""Number of reward terms; the names above index the last axis of ``terms`` and ``raw``."""
+
+
+@wp.struct
+class RewardWeights:
+    """Coefficients of the reward (configuration)."""
+
+    explore: float
+    overlap: float
+    time: float
+    success: float
+    collision: float
+    points: float  # w = points / total weight scales explore and overlap
+    events: float  # v = events scales time, success, collision; 0 takes w there too (the paper's way)
+    time_sign: float  # 0: -(1 - coverage) as in the code, 1: -coverage as the paper prints
+    goal_coverage: float
+
+
+@wp.func
+def add_term(
+    terms: wp.array3d(dtype=wp.float32),
+    raw: wp.array3d(dtype=wp.float32),
+    e: int,
+    i: int,
+    term: int,
+    value: float,
+    scale: float,
+):
+    terms[e, i, term] = terms[e, i, term] + scale * value
+    raw[e, i, term] = raw[e, i, term] + value
+
+
+@wp.kernel
+def _reward_robots(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    weights: RewardWeights,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    fresh: wp.array2d(dtype=wp.int32),
+    overlap: wp.array2d(dtype=wp.int32),
+    crashed: wp.array2d(dtype=wp.int32),
+    covered: wp.array(dtype=wp.int32),
+    covered_before: wp.array(dtype=wp.int32),
+    # Out:
+    terms: wp.array3d(dtype=wp.float32),
+    raw: wp.array3d(dtype=wp.float32),
+):
+    """Add this local step's reward terms of robot (e, i): weighted in ``terms`` (macro step), plain in ``raw`` (episode)."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    total = float(maps.total_weight[map_id[e]])
+    w = weights.points / total
+    v = weights.events
+    if v <= 0.0:
+        v = w
+    before = float(covered_before[e]) / total
+    after = float(covered[e]) / total
+    lapse = -(1.0 - before)
+    if weights.time_sign != 0.0:
+        lapse = -before
+    add_term(terms, raw, e, i, EXPLORE, weights.explore * float(fresh[e, i]), w)
+    add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]), w)
+    add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
+    if before < weights.goal_coverage and after >= weights.goal_coverage:
+        add_term(terms, raw, e, i, SUCCESS, weights.success, v)
+    if crashed[e, i] != 0:
+        add_term(terms, raw, e, i, COLLISION, -weights.collision, v)
+
+
+@wp.kernel
+def _close_step(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    goal_coverage: float,
+    # State in:
+    collided: wp.array2d(dtype=wp.int32),
+    covered: wp.array(dtype=wp.int32),
+    shared: wp.array(dtype=wp.int32),
+    path_length: wp.array2d(dtype=wp.float32),
+    # State in and out:
+    active: wp.array(dtype=wp.int32),
+    covered_before: wp.array(dtype=wp.int32),
+    local_step: wp.array(dtype=wp.int32),
+    milestone_step: wp.array2d(dtype=wp.int32),
+    milestone_overlap: wp.array2d(dtype=wp.float32),
+    milestone_path: wp.array3d(dtype=wp.float32),
+    terminated: wp.array(dtype=wp.int32),
+):
+    """Count the local step, note when 85 % and 95 % are reached, end the episode on success or when all collided."""
+    e = wp.tid()
+    if active[e] == 0:
+        return
+    step = local_step[e] + 1
+    local_step[e] = step
+    coverage = float(covered[e]) / float(maps.total_weight[map_id[e]])
+    covered_before[e] = covered[e]
+    for k in range(2):
+        mark = float(0.85)
+        if k == 1:
+            mark = 0.95
+        if milestone_step[e, k] < 0 and coverage >= mark:
+            milestone_step[e, k] = step
+            milestone_overlap[e, k] = float(shared[e]) / float(covered[e])
+            for i in range(collided.shape[1]):
+                milestone_path[e, i, k] = path_length[e, i]
+    alive = int(0)
+    for i in range(collided.shape[1]):
+        if collided[e, i] == 0:
+            alive += 1
+    if coverage >= goal_coverage or alive == 0:
+        terminated[e] = 1
+        active[e] = 0

@@ -1,0 +1,134 @@
+"""Static data that every kernel reads: maps and robots, as structs of Warp arrays.
+
+Three kinds of arrays are kept apart: static (here), state (`kernels.state`) and scratch (ibid.).
+
+Maps of a batch differ in size. Their points are concatenated; ``x_begin[m]`` is the first point of
+map ``m``. Within a map the points are sorted by cell of a regular grid (row-major, x fastest), so
+the points of a row of cells are one contiguous run; ``x_cell`` holds the start of every cell's run,
+relative to ``x_begin[m]``. Indices of points are relative to their map everywhere else.
+"""
+
+import warp as wp
+
+ROBOTS_PER_WORD = 32
+"""Robots that share one int32 of flags: robot ``i`` owns bit ``i % 32`` of word ``i // 32``."""
+
+ACKERMANN = wp.constant(0)
+DIFFERENTIAL = wp.constant(1)
+OMNIDIRECTIONAL = wp.constant(2)
+
+REGIONS = wp.constant(8)
+"""Regions along one side of the map's extent (L in the paper)."""
+
+PIXELS = wp.constant(125)
+"""Pixels along one side of the picture of a map."""
+
+PI = wp.constant(3.14159265358979)
+
+ERROR_ACTION = wp.constant(1)
+"""Bit of the error word: an action was NaN or infinite."""
+ERROR_START = wp.constant(2)
+"""Bit of the error word: no free start was found for a robot."""
+ERROR_CAPACITY = wp.constant(4)
+"""Bit of the error word: a scratch buffer overflowed."""
+
+
+@wp.struct
+class Maps:
+    """Maps of the batch. Lengths in metres; M maps."""
+
+    # Free points: position, weight (spacing squared, in units of the map), distance to the next boundary point.
+    free: wp.array(dtype=wp.vec3)
+    free_weight: wp.array(dtype=wp.int32)
+    free_clearance: wp.array(dtype=wp.float32)
+    free_begin: wp.array(dtype=wp.int32)  # [M + 1]
+    free_cell: wp.array(dtype=wp.int32)
+    total_weight: wp.array(dtype=wp.int32)  # [M]
+
+    # Boundary points (obstacles that touch free space) and their free neighbours within 1.5 spacings.
+    boundary: wp.array(dtype=wp.vec3)
+    boundary_begin: wp.array(dtype=wp.int32)  # [M + 1]
+    boundary_cell: wp.array(dtype=wp.int32)
+    neighbour_begin: wp.array(dtype=wp.int32)  # [all boundary points + 1]
+    neighbour: wp.array(dtype=wp.int32)
+
+    # Points that mask the radar: the boundary, or all obstacles where the radius leaves gaps.
+    occluder: wp.array(dtype=wp.vec3)
+    occluder_radius: wp.array(dtype=wp.float32)
+    occluder_begin: wp.array(dtype=wp.int32)  # [M + 1]
+    occluder_cell: wp.array(dtype=wp.int32)
+
+    resolution: wp.array(dtype=wp.float32)  # [M], spacing at which outlines of robots are sampled
+    outline_radius_max: wp.array(dtype=wp.float32)  # [M], upper bound of their obstacle radius
+
+    # The grid of cells: lower corner, edge length, cells along x and y, first entry in the *_cell arrays.
+    cell_origin: wp.array(dtype=wp.vec2)
+    cell_size: wp.array(dtype=wp.float32)
+    cells_x: wp.array(dtype=wp.int32)
+    cells_y: wp.array(dtype=wp.int32)
+    cell_begin: wp.array(dtype=wp.int32)
+
+    # Extent, and the square frame of the picture: centre of pixel (0, 0) and pixel size.
+    lower: wp.array(dtype=wp.vec2)
+    upper: wp.array(dtype=wp.vec2)
+    frame_origin: wp.array(dtype=wp.vec2)
+    pixel_size: wp.array(dtype=wp.float32)
+    # Points shown by each pixel: free point j as j, boundary point j as -1 - j.
+    pixel_begin: wp.array(dtype=wp.int32)  # [M * 125 * 125 + 1]
+    pixel_point: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class Robots:
+    """Parameters of every robot, arrays [env, robot]."""
+
+    kind: wp.array2d(dtype=wp.int32)
+    length: wp.array2d(dtype=wp.float32)  # [m]
+    width: wp.array2d(dtype=wp.float32)  # [m]
+    wheelbase: wp.array2d(dtype=wp.float32)  # [m]
+    center_offset: wp.array2d(dtype=wp.float32)  # reference point to body centre [m]
+    max_speed: wp.array2d(dtype=wp.float32)  # [m/s]
+    max_accel: wp.array2d(dtype=wp.float32)  # [m/s^2]
+    max_turn: wp.array2d(dtype=wp.float32)  # steering angle [rad] or yaw rate [rad/s]
+    threshold: wp.array2d(dtype=wp.float32)  # collision threshold [m]
+    clearance: wp.array2d(dtype=wp.float32)  # distance at which DWA begins to care, k * threshold [m]
+    radar_range: wp.array2d(dtype=wp.float32)  # [m]
+    radar_cos_fov: wp.array2d(dtype=wp.float32)  # cosine of half the field of view; -2 sees all round
+    radar_cos_beam: wp.array2d(dtype=wp.float32)  # 1 - alpha1
+    radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
+
+
+@wp.func
+def point_xy(p: wp.vec3) -> wp.vec2:
+    return wp.vec2(p[0], p[1])
+
+
+@wp.func
+def cell_index(value: float, origin: float, size: float, count: int) -> int:
+    """Cell of a coordinate, clamped to the grid."""
+    return wp.clamp(int(wp.floor((value - origin) / size)), 0, count - 1)
+
+
+@wp.func
+def row_span(maps: Maps, m: int, row: int, center: wp.vec2, radius: float) -> wp.vec2i:
+    """First and last column of cells in ``row`` that a disc can touch (first > last: none)."""
+    size = maps.cell_size[m]
+    origin = maps.cell_origin[m]
+    low = origin[1] + float(row) * size
+    gap = wp.max(wp.max(low - center[1], center[1] - low - size), 0.0)
+    half = wp.sqrt(wp.max(radius * radius - gap * gap, 0.0)) + 1.0e-3 * size
+    count = maps.cells_x[m]
+    first = int(wp.floor((center[0] - half - origin[0]) / size))
+    last = int(wp.floor((center[0] + half - origin[0]) / size))
+    return wp.vec2i(wp.max(first, 0), wp.min(last, count - 1))
+
+
+@wp.func
+def row_range(maps: Maps, m: int, center: wp.vec2, radius: float) -> wp.vec2i:
+    """First and last row of cells that a disc can touch (first > last: none)."""
+    size = maps.cell_size[m]
+    origin = maps.cell_origin[m]
+    reach = radius + 1.0e-3 * size
+    first = int(wp.floor((center[1] - reach - origin[1]) / size))
+    last = int(wp.floor((center[1] + reach - origin[1]) / size))
+    return wp.vec2i(wp.max(first, 0), wp.min(last, maps.cells_y[m] - 1))
