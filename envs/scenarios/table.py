@@ -9,6 +9,7 @@ from numbers import Integral
 from maexp.envs.map import PointCloudMap
 
 from .maze import build_maze
+from .random_obstacles import build_adaptive, build_random_obstacles
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,16 @@ _CAR = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=
 _MAZE = dict(
     _CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20
 )
-
+_RANDOM = dict(
+    _CAR, count=32, resolution=1.0, size=125.0, radar_range=10.0, max_speed=6.0, clearance_factor=3.0,
+    local_steps=40, macro_steps=15,
+)  # fmt: skip
 
 _ROWS = [
+    Scenario("random_obstacles", **_RANDOM,
+             build=partial(build_random_obstacles, scenario="random_obstacles", resolution=1.0)),
+    Scenario("random_obstacles_adaptive", **_RANDOM,
+             build=partial(build_adaptive, scenario="random_obstacles_adaptive", resolution=1.0, near=2.0)),
     Scenario("maze", size=125.0, macro_steps=30, **_MAZE,
              build=partial(build_maze, scenario="maze", cells=12, corridor=5, wall=5, resolution=1.0)),
     Scenario("maze_small", size=37.0, macro_steps=15, **_MAZE,
