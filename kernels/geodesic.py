@@ -5,9 +5,9 @@ Cells are numbered ``cell = iy * width + ix``. A step to a straight neighbour we
 (no cutting of corners). Distances are integers, so every run and every device gives the same bits.
 
 The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance, so
-what a queue takes in by steps of weight 10 alone is in order too; the same holds for weight 14. The nearer of
-the two heads is the next cell. A cell enters each queue at most once (a later step of the same weight is never shorter), so
-`cells` entries a queue never overflow.
+what steps of weight 10 add to one queue is in order too, and so is what steps of weight 14 add to the other.
+The nearer of the two heads is the next cell. A cell enters each queue at most once (a later step of the same
+weight is never shorter): queues as long as the grid never overflow.
 """
 
 import torch
