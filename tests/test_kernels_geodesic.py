@@ -126,6 +126,7 @@ def test_mixed_grid_sizes_and_early_stop():
         settled = full[item] <= full[item, stop]
         np.testing.assert_array_equal(early[item, settled], full[item, settled])
         assert (early[item, ~settled] > full[item, stop]).all()
+        assert (early[item] == UNREACHED).sum() > (full[item] == UNREACHED).sum()
 
 
 def test_large_open_grid_takes_less_than_the_promised_time():
