@@ -167,7 +167,7 @@ class PointCloudMap:
 
 
 def find_boundary(free: np.ndarray, obstacles: np.ndarray, spacing: np.ndarray) -> np.ndarray:
-    """Obstacle points that touch free space: within 1.5 `spacing` [m] of a free one; bool [obstacle_count]."""
+    """Obstacle points that touch free space: within 1.5 `spacing` [m] of a free one; bool [count]."""
     if not len(obstacles):
         return np.zeros(0, dtype=bool)
     reach = BOUNDARY_REACH * np.asarray(spacing, dtype=np.float64) * (1 + 1e-6)  # float32 may round up
@@ -264,7 +264,7 @@ def _check_cloud(name: str, points, resolution: float) -> tuple[np.ndarray, np.n
     largest = float(np.abs(points).max())
     if largest * 2.0**-23 > 0.1 * resolution:
         raise MapError(
-            f"{name} has coordinates up to {largest:g} m, too large for float32 at {resolution:g} m resolution; "
+            f"{name} has coordinates up to {largest:g} m, too large for float32 at {resolution:g} m; "
             "subtract an offset from all points"
         )
     cloud = np.zeros((len(points), 3), dtype=np.float32)
