@@ -12,7 +12,7 @@ from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
 @wp.func
 def many_bits(word: int) -> bool:
-    return (word & (word - 1)) != 0
+    return wp.bit_count(word) > 1
 
 
 @wp.kernel
@@ -43,6 +43,7 @@ def _count_points(
     first = maps.free_begin[map_id[e]]
     word = i / ROBOTS_PER_WORD
     bit = 1 << (i % ROBOTS_PER_WORD)
+    below = ~(-1 << (i % ROBOTS_PER_WORD))
     words = now_free.shape[1]
     fresh_sum = int(0)
     overlap_sum = int(0)
@@ -61,7 +62,7 @@ def _count_points(
             if now != 0:
                 if w != word or (now & ~bit) != 0:
                     others = 1
-                if w < word or (w == word and (now & (bit - 1)) != 0):
+                if w < word or (w == word and (now & below) != 0):
                     lowest = 0
             if old != 0:
                 before = wp.where(before > 0 or many_bits(old), 2, 1)
@@ -177,3 +178,17 @@ def _share_points(
                     if (hears[e, i, v] & (seen[e, v, j] | told[e, v, j])) != 0:
                         result = result | (1 << b)
         known[e, w, j] = result | seen[e, w, j] | told[e, w, j]
+
+
+@wp.kernel
+def _copy_flags(
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    flags: wp.array3d(dtype=wp.int32),
+    # Scratch out:
+    copy: wp.array3d(dtype=wp.int32),
+):
+    """Freeze flags, so that news travels one hop a step whatever the order of threads."""
+    e, w, j = wp.tid()
+    if active[e] != 0:
+        copy[e, w, j] = flags[e, w, j]

@@ -30,6 +30,7 @@ def _draw_points(
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),
     robot_count: int,
+    team_bits: int,
     # State in:
     draw_free: wp.array3d(dtype=wp.int32),
     draw_boundary: wp.array3d(dtype=wp.int32),
@@ -41,7 +42,8 @@ def _draw_points(
 ):
     """Pixel p of every robot of env e: explored and obstacle; of the team: explored, obstacle, viewers.
 
-    ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map.
+    ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map;
+    with ``team_bits`` every robot is drawn the team's map (what it knows under perfect communication).
     """
     e, p = wp.tid()
     m = map_id[e]
@@ -76,6 +78,10 @@ def _draw_points(
             picture[e, i, 1, p] = wp.where((wall_word & bit) != 0, ON, OFF)
             picture[e, i, 2, p] = OFF
             picture[e, i, 3, p] = OFF
+    if team_bits != 0:
+        for i in range(robot_count):
+            picture[e, i, 0, p] = explored
+            picture[e, i, 1, p] = obstacle
     team[e, 0, p] = explored
     team[e, 1, p] = obstacle
     team[e, 2, p] = wp.uint8(wp.min(viewers, 255))

@@ -1,0 +1,190 @@
+"""Single kernels as functions of torch tensors: the radar and map merging."""
+
+import math
+
+import torch
+import warp as wp
+
+from maexp.kernels import merge, visibility
+from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
+
+
+def visible_points(
+    free: torch.Tensor,
+    obstacles: torch.Tensor,
+    origin: torch.Tensor,
+    radar_range: float = 10.0,
+    alpha1: float = 1e-3,
+    alpha2: float = 1e-6,
+    obstacle_radius: float | torch.Tensor = 0.0,
+    heading: float = 0.0,
+    field_of_view: float = 2.0 * math.pi,
+) -> torch.Tensor:
+    """Free points that a radar at ``origin`` sees (ray-masked point filtering; design 4.1, paper section IV-A).
+
+    Args:
+        free: free points [m], shape [n_free, 3] (or [n_free, 2], taken as z = 0).
+        obstacles: obstacle points [m], shape [n_obstacles, 3] or [n_obstacles, 2].
+        origin: sensor position [m], shape [3] or [2].
+        radar_range: range [m], inclusive.
+        alpha1: 1 - cos(angular half-width) of the shadow of a point.
+        alpha2: by how much an obstacle must not be farther than the free point it masks [m].
+        obstacle_radius: radius [m] of the obstacles, one value or shape [n_obstacles].
+        heading: direction of the sensor in the xy plane [rad]; matters for a limited field of view.
+        field_of_view: full opening angle [rad], 2 pi for all round.
+
+    Returns:
+        bool tensor [n_free] on the device of ``free``.
+
+    Raises:
+        ValueError: a shape does not fit, or a value is not finite or out of its range.
+    """
+    origin = _points("origin", torch.as_tensor(origin).reshape(1, -1)).to(free.device)[0]
+    free = _points("free", free)
+    obstacles = _points("obstacles", obstacles).to(free.device)
+    radius = torch.as_tensor(obstacle_radius, dtype=torch.float32, device=free.device)
+    if radius.dim() > 1 or (radius.dim() == 1 and radius.shape[0] != obstacles.shape[0]):
+        raise ValueError(
+            f"obstacle_radius has shape {tuple(radius.shape)}; give one number or one per obstacle ({obstacles.shape[0]})"
+        )
+    for name, value in (("radar_range", radar_range), ("alpha1", alpha1), ("field_of_view", field_of_view)):
+        if not value >= 0.0:
+            raise ValueError(f"{name}={value} must not be negative or NaN")
+    if not (math.isfinite(alpha2) and math.isfinite(heading)):
+        raise ValueError(f"alpha2={alpha2} and heading={heading} must be finite")
+    if not bool(torch.isfinite(radius).all()) or bool((radius < 0).any()):
+        raise ValueError("obstacle_radius must be finite and not negative")
+    if free.shape[0] == 0:
+        return torch.zeros(0, dtype=torch.bool, device=free.device)
+    near = (free - origin).float().contiguous()
+    block = (obstacles - origin).float().contiguous()
+    # An infinite range is the largest finite one, so that distances stay comparable.
+    reach = min(float(radar_range), 1e15)
+    return _scan_once(
+        near, block, radius.expand(block.shape[0]).contiguous(), reach, alpha1, alpha2, heading, field_of_view
+    )
+
+
+def _points(name: str, points: torch.Tensor) -> torch.Tensor:
+    """Points as float64 [n, 3], so that subtracting the origin loses nothing."""
+    points = torch.as_tensor(points)
+    if points.dim() != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"{name} has shape {tuple(points.shape)}; points have shape [n, 3]")
+    points = points.detach().double()
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError(f"{name} holds NaN or infinite coordinates; remove them first")
+    if points.shape[1] == 2:
+        points = torch.nn.functional.pad(points, (0, 1))
+    return points
+
+
+def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of_view) -> torch.Tensor:
+    """One env, one robot at zero, one cell that holds every point: the kernels of the step, as they are."""
+    device = free.device
+    count, blocks = free.shape[0], max(occluders.shape[0], 1)
+
+    def ints(*values):
+        return wp.from_torch(torch.tensor(values, dtype=torch.int32, device=device), dtype=wp.int32)
+
+    def zeros(*shape, dtype=torch.int32):
+        return torch.zeros(shape, dtype=dtype, device=device)
+
+    def full(value):
+        return wp.from_torch(torch.full((1, 1), value, dtype=torch.float32, device=device))
+
+    everything = torch.cat([free[:, :2], occluders[:, :2]])
+    low = everything.amin(0) - 1.0
+    size = (everything.amax(0) - low).amax() + 1.0
+    maps = Maps()
+    maps.free = wp.from_torch(free, dtype=wp.vec3)
+    maps.free_begin, maps.free_cell = ints(0, count), ints(0, count)
+    padded = torch.zeros((blocks, 3), device=device)
+    padded[: occluders.shape[0]] = occluders
+    radii = torch.zeros(blocks, device=device)
+    radii[: occluders.shape[0]] = radius
+    maps.occluder, maps.occluder_radius = wp.from_torch(padded, dtype=wp.vec3), wp.from_torch(radii)
+    maps.occluder_begin = maps.occluder_cell = ints(0, occluders.shape[0])
+    maps.cells_x, maps.cells_y, maps.cell_begin = ints(1), ints(1), ints(0)
+    maps.cell_origin = wp.from_torch(low.reshape(1, 2).contiguous(), dtype=wp.vec2)
+    maps.cell_size = wp.from_torch(size.reshape(1))
+    maps.resolution = maps.outline_radius_max = wp.from_torch(torch.ones(1, device=device))
+    robots = Robots()
+    robots.radar_range, robots.radar_cos_beam, robots.radar_alpha2 = full(reach), full(1.0 - alpha1), full(alpha2)
+    robots.radar_cos_fov = full(math.cos(0.5 * field_of_view) if field_of_view < 2.0 * math.pi else -2.0)
+    one = ints(1)
+    pose_t, center_t = zeros(1, 1, 4, dtype=torch.float32), zeros(1, 1, 3, dtype=torch.float32)
+    pose_t[..., 3] = heading
+    pose, center = wp.from_torch(pose_t, dtype=wp.vec4), wp.from_torch(center_t, dtype=wp.vec3)
+    bins = wp.from_torch(zeros(1, 1, 2 * int(visibility.BINS), dtype=torch.float32))
+    direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
+    limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
+    counts = [wp.from_torch(zeros(1, 1)) for _ in range(2)]
+    flags = zeros(1, 1, count)
+    listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
+    launch = wp.from_torch(free, dtype=wp.vec3).device
+    lanes = 1 if launch.is_cpu else 4096
+    map_id = ints(0)
+    wp.launch(
+        visibility._collect_occluders, dim=(1, 1), device=launch,
+        inputs=[maps, map_id, robots, one, pose, center],
+        outputs=[bins, direction, limit, *counts, error],
+    )  # fmt: skip
+    wp.launch(
+        visibility._scan_free, dim=(1, 1, lanes), device=launch,
+        inputs=[maps, map_id, robots, lanes, one, pose, center, bins, direction, limit, counts[0]],
+        outputs=[wp.from_torch(flags), listed, counts[1], error],
+    )  # fmt: skip
+    return flags[0, 0] != 0
+
+
+def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
+    """What every robot knows once each has heard the others it can hear (design 4.2).
+
+    Args:
+        seen: bool [E, N, n], which points each robot has seen.
+        comm: bool [E, N, N], ``comm[e, i, j]``: robot i hears robot j. Every robot hears itself.
+
+    Returns:
+        bool [E, N, n]: the union of a robot's own points and those of the robots it hears.
+
+    Raises:
+        ValueError: shapes do not fit together.
+    """
+    if seen.dim() != 3 or tuple(comm.shape) != (seen.shape[0], seen.shape[1], seen.shape[1]):
+        raise ValueError(
+            f"seen {tuple(seen.shape)} and comm {tuple(comm.shape)} do not fit: give [E, N, n] and [E, N, N]"
+        )
+    if seen.numel() == 0:
+        return seen.bool()
+    robots = seen.shape[1]
+    hears = _pack(comm.bool().to(seen.device), 2)
+    flags = _pack(seen.bool(), 1)
+    known = torch.zeros_like(flags)
+    active = torch.ones(seen.shape[0], dtype=torch.int32, device=seen.device)
+    words, told = wp.from_torch(flags), wp.from_torch(torch.zeros_like(flags))
+    wp.launch(
+        merge._share_points, dim=(seen.shape[0], seen.shape[2]), device=words.device,
+        inputs=[wp.from_torch(active), wp.from_torch(hears), words, told], outputs=[wp.from_torch(known)],
+    )  # fmt: skip
+    return unpack_flags(known, robots)
+
+
+def _pack(flags: torch.Tensor, axis: int) -> torch.Tensor:
+    """Pack a bool axis of robots into words of 32 bits (int32)."""
+    count = flags.shape[axis]
+    words = []
+    for start in range(0, count, ROBOTS_PER_WORD):
+        part = flags.narrow(axis, start, min(ROBOTS_PER_WORD, count - start)).long()
+        shape = [1] * flags.dim()
+        shape[axis] = part.shape[axis]
+        bits = (1 << torch.arange(part.shape[axis], device=flags.device)).reshape(shape)
+        word = (part * bits).sum(axis)
+        words.append(torch.where(word >= 2**31, word - 2**32, word).int())
+    return torch.stack(words, axis)
+
+
+def unpack_flags(words: torch.Tensor, robots: int) -> torch.Tensor:
+    """Flags of robots from words of 32: int32 [E, W, n] -> bool [E, robots, n]."""
+    index = torch.arange(robots, device=words.device)
+    picked = words[:, index // ROBOTS_PER_WORD]
+    return (picked >> (index % ROBOTS_PER_WORD)[None, :, None]) & 1 != 0

@@ -1,0 +1,226 @@
+"""Navigation grids: what a team (or each robot) knows of its map, cell by cell, and where its robots fit.
+
+Rows: `rows_per_env` consecutive rows belong to one env, one row where knowledge is shared, one per robot
+where communication is limited. Cells are numbered ``iy * width + ix`` with the width of the env's map.
+"""
+
+import warp as wp
+
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.planner import is_known
+from maexp.kernels.types import Maps
+
+wp_unknown = wp.constant(wp.uint8(UNKNOWN))
+wp_free = wp.constant(wp.uint8(FREE))
+wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
+
+
+@wp.struct
+class NavGrids:
+    """One grid per map of `Maps`, static; M maps."""
+
+    origin: wp.array(dtype=wp.vec2)  # [M], lower corner of cell (0, 0) [m]
+    cell: wp.array(dtype=wp.float32)  # [M], edge length [m]
+    width: wp.array(dtype=wp.int32)  # [M], cells along x
+    height: wp.array(dtype=wp.int32)  # [M], cells along y
+    free_cell: wp.array(dtype=wp.int32)  # cell of every free point, in the order of Maps.free
+    boundary_cell: wp.array(dtype=wp.int32)  # cell of every boundary point, in the order of Maps.boundary
+    cell_begin: wp.array(dtype=wp.int32)  # [M + 1], where a map's cells start in `stand_in`
+    stand_in: wp.array(dtype=wp.int32)  # cell whose state a cell takes: itself where it holds points; -1 = none
+
+
+@wp.func
+def nav_cell(grids: NavGrids, m: int, at: wp.vec2) -> int:
+    """Cell of a point, clamped to the grid."""
+    p = (at - grids.origin[m]) / grids.cell[m]
+    x = wp.clamp(int(wp.floor(p[0])), 0, grids.width[m] - 1)
+    y = wp.clamp(int(wp.floor(p[1])), 0, grids.height[m] - 1)
+    return y * grids.width[m] + x
+
+
+@wp.func
+def nav_center(grids: NavGrids, m: int, cell: int) -> wp.vec2:
+    """Centre of a cell [m]."""
+    w = grids.width[m]
+    return grids.origin[m] + grids.cell[m] * wp.vec2(float(cell % w) + 0.5, float(cell / w) + 0.5)
+
+
+@wp.kernel(enable_backward=False)
+def _assign_grids(
+    # State in:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    rows_per_env: int,
+    # Out:
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+):
+    row = wp.tid()
+    grid_of_row[row] = map_id[row / rows_per_env]
+
+
+@wp.kernel(enable_backward=False)
+def _clear_known(
+    # Out:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+):
+    row, cell = wp.tid()
+    known[row, cell] = wp_unknown
+
+
+@wp.kernel(enable_backward=False)
+def _paint_points(
+    # Map:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    point_begin: wp.array(dtype=wp.int32),  # [map + 1]
+    point_cell: wp.array(dtype=wp.int32),  # [points of all maps]
+    # State in:
+    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    rows_per_env: int,
+    value: wp.uint8,
+    # Out:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+):
+    """Gives `value` to the cells of known points; with one row an env, what any robot knows counts."""
+    row, point = wp.tid()
+    e = row / rows_per_env
+    m = map_id[e]
+    if point < point_begin[m + 1] - point_begin[m]:
+        if is_known(flags, e, row % rows_per_env, point, wp.where(rows_per_env > 1, 1, 0)):
+            known[row, point_cell[point_begin[m] + point]] = value
+
+
+@wp.kernel(enable_backward=False)
+def _fill_voids(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    # State in and out:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+):
+    """Cells without a point of their own (a cloud is no lattice) take the state of their stand-in."""
+    row, cell = wp.tid()
+    m = grid_of_row[row]
+    if cell < grids.width[m] * grids.height[m]:
+        other = grids.stand_in[grids.cell_begin[m] + cell]
+        if other >= 0 and other != cell:
+            known[row, cell] = known[row, other]
+
+
+@wp.kernel(enable_backward=False)
+def _mask_passable(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # State in:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    radius: wp.array(dtype=wp.float32),  # [mask row], distance to keep from known obstacle cells [m]
+    through_unknown: int,
+    # Out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    row, cell = wp.tid()
+    m = grid_of_row[row]
+    w = grids.width[m]
+    h = grids.height[m]
+    ok = wp.uint8(0)
+    if cell < w * h:
+        source = known_of_row[row]
+        state = known[source, cell]
+        if state == wp_free or (state == wp_unknown and through_unknown != 0):
+            ok = wp.uint8(1)
+            r = radius[row] / grids.cell[m]
+            reach = int(wp.ceil(r))
+            x = cell % w
+            y = cell / w
+            for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+                for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+                    gap = float((v - y) * (v - y) + (u - x) * (u - x))
+                    if gap < r * r and known[source, v * w + u] == wp_obstacle:
+                        ok = wp.uint8(0)
+    passable[row, cell] = ok
+
+
+class KnownGrids:
+    """Grids of a run of envs, painted from the flags of seen points.
+
+    Args:
+        maps, grids: static data of the maps.
+        map_id: int32 [E], the map of each env.
+        free_flags, boundary_flags: int32 [E, W, points], bit i % 32 of word i // 32 for robot i.
+        rows_per_env: 1 (the team's knowledge) or the number of robots (each robot's own).
+        cells: cells of the largest grid.
+
+    Attributes:
+        known: uint8 [E * rows_per_env, cells]: `UNKNOWN`, `FREE` or `OBSTACLE`.
+        grid_of_row: int32 [E * rows_per_env], the map of each row; set by `paint`.
+    """
+
+    def __init__(
+        self,
+        maps: Maps,
+        grids: NavGrids,
+        map_id: wp.array,
+        free_flags: wp.array,
+        boundary_flags: wp.array,
+        rows_per_env: int,
+        cells: int,
+    ):
+        self.maps, self.grids, self.map_id = maps, grids, map_id
+        self.free_flags, self.boundary_flags = free_flags, boundary_flags
+        self.rows_per_env = rows_per_env
+        rows = map_id.shape[0] * rows_per_env
+        self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=map_id.device)
+        self.grid_of_row = wp.zeros(rows, dtype=wp.int32, device=map_id.device)
+
+    def paint(self, launch) -> None:
+        """Brings `known` up to date; ``launch(kernel, dim, inputs, outputs)`` launches or records."""
+        rows, cells = self.known.shape
+        launch(_assign_grids, rows, [self.map_id, self.rows_per_env], [self.grid_of_row])
+        launch(_clear_known, (rows, cells), [], [self.known])
+        layers = [
+            (self.maps.free_begin, self.grids.free_cell, self.free_flags, FREE),
+            (self.maps.boundary_begin, self.grids.boundary_cell, self.boundary_flags, OBSTACLE),
+        ]
+        for begin, cell, flags, value in layers:
+            launch(
+                _paint_points, (rows, flags.shape[2]),
+                [self.map_id, begin, cell, flags, self.rows_per_env, wp.uint8(value)], [self.known],
+            )  # fmt: skip
+        launch(_fill_voids, (rows, cells), [self.grids, self.grid_of_row], [self.known])
+
+
+class PassableGrids:
+    """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep.
+
+    Args:
+        known: the grids to read.
+        radius: float32 [E, K], distance to keep from known obstacles [m]; K masks per env. Where every robot
+            has a known row of its own, K must be the number of robots.
+        through_unknown: whether unknown cells count as passable.
+
+    Attributes:
+        passable: uint8 [E * K, cells].
+        grid_of_row: int32 [E * K], the map of each row; set by `paint`.
+    """
+
+    def __init__(self, known: KnownGrids, radius, through_unknown: bool):
+        envs, masks = radius.shape
+        if known.rows_per_env not in (1, masks):
+            raise ValueError(f"{known.rows_per_env} known rows per env need as many masks, got {masks}")
+        device = known.known.device
+        self.known, self.masks, self.through_unknown = known, masks, int(through_unknown)
+        self.radius = wp.array(radius.reshape(-1), dtype=wp.float32, device=device)
+        rows = range(envs * masks)
+        source = [row if known.rows_per_env == masks else row // masks for row in rows]
+        self.known_of_row = wp.array(source, dtype=wp.int32, device=device)
+        self.grid_of_row = wp.zeros(len(rows), dtype=wp.int32, device=device)
+        self.passable = wp.zeros((len(rows), known.known.shape[1]), dtype=wp.uint8, device=device)
+
+    def paint(self, launch) -> None:
+        """Brings `passable` up to date with `known`."""
+        launch(_assign_grids, self.grid_of_row.shape, [self.known.map_id, self.masks], [self.grid_of_row])
+        launch(
+            _mask_passable, self.passable.shape,
+            [self.known.grids, self.grid_of_row, self.known.known, self.known_of_row, self.radius,
+             self.through_unknown], [self.passable],
+        )  # fmt: skip

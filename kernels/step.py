@@ -1,0 +1,314 @@
+"""The order of launches: a local step, a reset, an observation; nothing else.
+
+A `Simulation` owns state and scratch, split into shards of envs. The launches of every shard are
+recorded once and replayed; on the CPU each shard runs in a thread of its own (native code releases
+the interpreter lock), and results do not depend on the number of shards.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+import warp as wp
+
+from maexp.kernels import collision, dynamics, merge, observe, planner, reset, reward, visibility
+from maexp.kernels.state import SCRATCH, STATE, allocate, robots_struct, warp_views
+from maexp.kernels.types import Maps
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a local step does; units in metres and seconds."""
+
+    planner: str  # "dwa", "wavefront" or "direct"
+    num_accels: int
+    num_turns: int
+    horizon: int
+    clearance_weight: float
+    replan_steps: int
+    footprint: bool
+    comm_limited: bool
+    comm_range: float
+    line_of_sight: bool
+    draw_known: bool
+    goal_coverage: float
+    dt: float = 0.1
+
+
+class Shard:
+    """Envs ``first`` to ``last`` of a simulation: Warp views and recorded launches."""
+
+    def __init__(self, sim: "Simulation", first: int, last: int):
+        self.first, self.last = first, last
+        self.sim = sim
+        self.device = wp.device_from_torch(sim.device)
+        self.view = warp_views(sim.tensors, first, last)
+        self.robots = robots_struct(sim.robot_tensors, first, last)
+        self.shape = (last - first, sim.sizes["N"])
+        self.lanes = 1 if self.device.is_cpu else 32
+        self.wavefront = None
+        self.goal_launches = self.record(self.set_goals)
+        self.step_launches = self.record(self.local_step)
+        self.reset_launches = self.record(self.place)
+
+    def record(self, stage: Callable) -> list[wp.Launch]:
+        """Record the launches that ``stage(launch)`` makes."""
+        launches: list[wp.Launch] = []
+
+        def launch(kernel, dim, inputs, outputs):
+            launches.append(
+                wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, record_cmd=True)
+            )
+
+        stage(launch)
+        return launches
+
+    def set_goals(self, launch: Callable) -> None:
+        """Turn the policy's region and offset into goals."""
+        s, maps = self.view, self.sim.maps
+        if self.sim.settings.planner != "direct":
+            launch(
+                planner._set_goal, self.shape,
+                [maps, s.map_id, s.region, s.offset, s.active], [s.goal, s.target, s.error],
+            )  # fmt: skip
+
+    def plan(self, launch: Callable) -> None:
+        """How to go: controls of every robot."""
+        s, maps, cfg = self.view, self.sim.maps, self.sim.settings
+        if cfg.planner == "direct":
+            launch(planner._plan_direct, self.shape, [self.robots, s.active, s.command], [s.control])
+            return
+        launch(
+            planner._plan_dwa, self.shape,
+            [maps, s.map_id, self.robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
+             int(cfg.footprint), int(cfg.comm_limited), cfg.dt,
+             s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby],
+            [s.control, s.error],
+        )  # fmt: skip
+
+    def known(self, what: str) -> wp.array:
+        """Flags of what each robot knows: those of the team under perfect communication."""
+        prefix = "known" if self.sim.settings.comm_limited else "seen"
+        return getattr(self.view, f"{prefix}_{what}")
+
+    def move(self, launch: Callable) -> None:
+        """Move, then collide."""
+        s, maps, cfg = self.view, self.sim.maps, self.sim.settings
+        launch(
+            dynamics._move_robots, self.shape,
+            [self.robots, cfg.dt, s.active, s.collided, s.control], [s.pose, s.slip, s.center, s.path_length],
+        )  # fmt: skip
+        launch(
+            collision._detect_collisions, self.shape,
+            [maps, s.map_id, self.robots, int(cfg.footprint), s.active, s.pose, s.center], [s.collided, s.crashed],
+        )  # fmt: skip
+
+    def scan(self, launch: Callable, running: wp.array) -> None:
+        """Scan, count, merge, and share, in the envs where ``running`` is set."""
+        s, maps, cfg = self.view, self.sim.maps, self.sim.settings
+        launch(
+            visibility._collect_occluders, self.shape,
+            [maps, s.map_id, self.robots, running, s.pose, s.center],
+            [s.bins, s.direction, s.limit, s.occluder_count, s.visible_count, s.error],
+        )  # fmt: skip
+        launch(
+            visibility._scan_free, (*self.shape, self.lanes),
+            [maps, s.map_id, self.robots, self.lanes, running, s.pose, s.center,
+             s.bins, s.direction, s.limit, s.occluder_count],
+            [s.now_free, s.visible, s.visible_count, s.error],
+        )  # fmt: skip
+        launch(
+            visibility._scan_boundary, (*self.shape, self.lanes),
+            [maps, s.map_id, self.robots, self.lanes, running, s.center, s.now_free], [s.seen_boundary],
+        )  # fmt: skip
+        launch(
+            merge._count_points, self.shape,
+            [maps, s.map_id, running, s.now_free, s.seen_free, s.visible, s.visible_count],
+            [s.fresh, s.overlap, s.covered, s.shared],
+        )  # fmt: skip
+        launch(
+            merge._merge_scan, self.shape, [running, s.visible, s.visible_count], [s.now_free, s.seen_free]
+        )
+        if cfg.comm_limited:
+            launch(
+                merge._hear_robots, self.shape,
+                [maps, s.map_id, running, s.center, cfg.comm_range, int(cfg.line_of_sight)], [s.comm, s.hears],
+            )  # fmt: skip
+            for what in ("free", "boundary"):
+                seen, known, told = (getattr(s, f"{k}_{what}") for k in ("seen", "known", "told"))
+                launch(merge._copy_flags, known.shape, [running, known], [told])
+                launch(
+                    merge._share_points, (known.shape[0], known.shape[2]), [running, s.hears, seen, told], [known]
+                )
+
+    def local_step(self, launch: Callable) -> None:
+        """Plan, move, collide, scan, merge, reward, terminate (design 4.2)."""
+        s, maps = self.view, self.sim.maps
+        self.plan(launch)
+        self.move(launch)
+        self.scan(launch, s.active)
+        launch(
+            reward._reward_robots, self.shape,
+            [maps, s.map_id, self.sim.weights, s.active, s.fresh, s.overlap, s.crashed, s.covered, s.covered_before],
+            [s.terms, s.raw],
+        )  # fmt: skip
+        launch(
+            observe._record_track, self.shape, [maps, s.map_id, s.active, s.center, s.local_step, 1], [s.track]
+        )
+        launch(
+            reward._close_step, self.shape[0],
+            [maps, s.map_id, self.sim.settings.goal_coverage, s.collided, s.covered, s.shared, s.path_length],
+            [s.active, s.covered_before, s.local_step, s.milestone_step, s.milestone_overlap, s.milestone_path,
+             s.terminated],
+        )  # fmt: skip
+
+    def place(self, launch: Callable) -> None:
+        """Reset the envs of ``mask``: clear, place the team, take the first scan."""
+        s, maps, cfg = self.view, self.sim.maps, self.sim.settings
+        envs, n = self.shape
+        flags = [s.seen_free, s.seen_boundary, s.now_free]
+        if cfg.comm_limited:
+            flags += [s.known_free, s.known_boundary]
+        for f in flags:
+            launch(reset._clear_flags, f.shape, [s.mask], [f])
+        launch(
+            reset._clear_env, envs, [s.mask],
+            [s.covered, s.covered_before, s.shared, s.local_step, s.macro_step, s.terminated,
+             s.milestone_step, s.milestone_overlap],
+        )  # fmt: skip
+        launch(
+            reset._place_team, envs,
+            [maps, self.sim.num_maps, self.robots, self.sim.seed, s.mask, s.env_id, s.episode],
+            [s.map_id, s.pose, s.center, s.error],
+        )  # fmt: skip
+        launch(
+            reset._clear_robots, (envs, n), [s.mask, s.center],
+            [s.slip, s.control, s.goal, s.target, s.collided, s.crashed, s.path_length, s.milestone_path,
+             s.terms, s.raw, s.episode_reward],
+        )  # fmt: skip
+        self.scan(launch, s.mask)
+        launch(observe._record_track, (envs, n), [maps, s.map_id, s.mask, s.center, s.local_step, 0], [s.track])
+        launch(
+            reset._start_env, envs, [s.mask, s.covered], [s.covered_before, s.active, s.fresh, s.overlap]
+        )
+
+    def replay(self, launches: list[wp.Launch]) -> None:
+        stream = None if self.device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.sim.device))
+        for command in launches:
+            command.launch(stream)
+
+    def run(self, start: int, count: int) -> None:
+        """Local steps ``start`` to ``start + count`` of a macro step."""
+        for k in range(start, start + count):
+            if self.wavefront is not None and k % self.sim.settings.replan_steps == 0:
+                self.replay(self.wavefront.field_launches)
+            if self.wavefront is not None:
+                self.replay(self.wavefront.waypoint_launches)
+            self.replay(self.step_launches)
+
+    def observe(self, picture, team, pose, grid) -> None:
+        """Draw into fresh tensors of all envs (design 6.1: what leaves the env is never reused)."""
+        s, maps = self.view, self.sim.maps
+        part = slice(self.first, self.last)
+        out = [
+            wp.from_torch(picture[part].flatten(3), dtype=wp.uint8),
+            wp.from_torch(team[part].flatten(2), dtype=wp.uint8),
+        ]
+        free, boundary = s.seen_free, s.seen_boundary
+        if self.sim.settings.draw_known and self.sim.settings.comm_limited:
+            free, boundary = s.known_free, s.known_boundary
+        draw = partial(wp.launch, device=self.device)
+        draw(
+            observe._draw_points, dim=(self.shape[0], out[1].shape[2]),
+            inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, free, boundary, s.seen_free, s.seen_boundary],
+            outputs=out,
+        )  # fmt: skip
+        draw(
+            observe._draw_robots, dim=self.shape,
+            inputs=[maps, s.map_id, self.robots, s.pose, s.center, s.local_step, s.track], outputs=[out[0]],
+        )  # fmt: skip
+        draw(
+            observe._observe_pose, dim=self.shape,
+            inputs=[maps, s.map_id, self.robots, s.pose, s.slip, s.center, s.goal],
+            outputs=[wp.from_torch(pose[part], dtype=wp.vec4), wp.from_torch(grid[part].flatten(3))],
+        )  # fmt: skip
+
+
+class Simulation:
+    """Thousands of teams, step by step.
+
+    Args:
+        maps: static data, every field of `Maps` as a torch tensor on ``device``.
+        num_maps: how many maps those are.
+        robots: one [E, N] tensor per field of `Robots`.
+        weights: reward coefficients.
+        settings: what a step does.
+        sizes: lengths of the axes (`kernels.state.axis_sizes`).
+        device: where it runs.
+        seed: key of the random numbers.
+        num_shards: runs of envs, each with a thread of its own on the CPU.
+    """
+
+    def __init__(
+        self,
+        maps: dict[str, torch.Tensor],
+        num_maps: int,
+        robots: dict[str, torch.Tensor],
+        weights: reward.RewardWeights,
+        settings: Settings,
+        sizes: dict[str, int],
+        device: torch.device,
+        seed: int,
+        num_shards: int = 1,
+    ):
+        self.map_tensors, self.num_maps, self.robot_tensors = maps, num_maps, robots
+        self.weights, self.settings, self.sizes = weights, settings, sizes
+        self.device, self.seed = torch.device(device), seed
+        self.maps = maps_struct(maps)
+        self.team_bits = int(settings.draw_known and not settings.comm_limited)
+        self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
+        self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
+        self.tensors["comm"].fill_(True)
+        count = max(1, min(num_shards, sizes["E"]))
+        cuts = [sizes["E"] * k // count for k in range(count + 1)]
+        self.shards = [Shard(self, a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+        self.pool = ThreadPoolExecutor(count) if count > 1 else None
+
+    def each_shard(self, task: Callable[[Shard], None]) -> None:
+        """Run ``task`` on every shard, in threads where there are several."""
+        if self.pool is None:
+            task(self.shards[0])
+        else:
+            list(self.pool.map(task, self.shards))
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Start a new episode in the envs where ``mask`` [E] is true."""
+        self.tensors["mask"].copy_(mask)
+        self.each_shard(lambda shard: shard.replay(shard.reset_launches))
+
+    def set_goals(self) -> None:
+        """Take ``region`` and ``offset`` (or ``command``), and start the macro step's reward at zero."""
+        self.tensors["terms"].zero_()
+        self.each_shard(lambda shard: shard.replay(shard.goal_launches))
+
+    def step(self, start: int, count: int) -> None:
+        """Run ``count`` local steps, the first being number ``start`` of the macro step."""
+        self.each_shard(lambda shard: shard.run(start, count))
+
+    def observe(self, picture, team, pose, grid) -> None:
+        """Fill the observation tensors: [E, N, 4, 125, 125] and [E, 3, 125, 125] uint8, [E, N, 4], [E, N, 4, 8, 8]."""
+        self.each_shard(lambda shard: shard.observe(picture, team, pose, grid))
+
+
+def maps_struct(tensors: dict[str, torch.Tensor]) -> Maps:
+    """`Maps` over torch tensors (one per field)."""
+    maps = Maps()
+    for name, tensor in tensors.items():
+        if tensor.dtype == torch.int32:
+            kind = wp.int32
+        else:
+            kind = {1: wp.float32, 2: {2: wp.vec2, 3: wp.vec3}.get(tensor.shape[-1])}[tensor.dim()]
+        setattr(maps, name, wp.from_torch(tensor, dtype=kind))
+    return maps
