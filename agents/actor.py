@@ -1,0 +1,86 @@
+"""`make_policy`: the target generator as a TorchRL actor that fits an environment's specs."""
+
+from dataclasses import dataclass
+
+from maexp.agents.model import ModelConfig, model_config
+from maexp.agents.networks import TargetGenerator
+from tensordict.nn import CompositeDistribution, InteractionType, TensorDictModule
+from torch import distributions
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
+MAP = ("agents", "observation", "map")
+POSE = ("agents", "observation", "pose")
+GRID = ("agents", "observation", "grid")
+COMM = ("agents", "observation", "comm")
+OBSERVATION = (MAP, POSE, GRID, COMM)
+PARAMS = ("agents", "params")
+ACTION = ("agents", "action")
+REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
+CONTROL_HEADS = {"control": IndependentNormal}
+PARAM_NAMES = {distributions.Categorical: ("logits",), IndependentNormal: ("loc", "scale")}
+
+
+@dataclass(frozen=True)
+class ObservationShape:
+    """What the networks need to know about an environment.
+
+    Attributes:
+        channels: channels of each robot's picture
+        side: regions along one axis (L)
+        regions: whether the action is a region and an offset, or else a control vector (planner=direct)
+    """
+
+    channels: int
+    side: int
+    regions: bool
+
+
+def observation_shape(env) -> ObservationShape:
+    """Read the sizes from an environment's specs.
+
+    Raises:
+        ValueError: a key of the contract is missing.
+    """
+    spec = env.observation_spec
+    missing = [key for key in OBSERVATION if key not in spec.keys(True, True)]
+    if missing:
+        raise ValueError(f"The environment's observation lacks {missing}; give the keys of ExplorationEnv.")
+    actions = env.full_action_spec.keys(True, True)
+    return ObservationShape(
+        channels=spec[MAP].shape[-3], side=spec[GRID].shape[-1], regions=(*ACTION, "region") in actions
+    )
+
+
+def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
+    """The trainable policy of a team, for the action that `env` takes.
+
+    It reads ("agents", "observation", ...) and writes ("agents", "params", ...), ("agents", "action", ...)
+    and one log-probability per robot and head, ("agents", "action", "<head>_log_prob") of shape [*, robots].
+    Offsets are stored as drawn, so that their probability can be computed again; the environment clamps them.
+
+    Args:
+        env: gives the specs and the device; not kept
+        model: a preset's name or a ModelConfig
+    """
+    shape = observation_shape(env)
+    network = TargetGenerator(model_config(model), shape.channels, shape.side, shape.regions)
+    heads = REGION_HEADS if shape.regions else CONTROL_HEADS
+    module = TensorDictModule(
+        network,
+        in_keys=list(OBSERVATION),
+        out_keys=[(*PARAMS, head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]],
+    )
+    actor = ProbabilisticActor(
+        module,
+        in_keys=[PARAMS],
+        spec=None,
+        distribution_class=CompositeDistribution,
+        distribution_kwargs={
+            "distribution_map": heads,
+            "name_map": {head: (*ACTION, head) for head in heads},
+            "extra_kwargs": {head: {"validate_args": False} for head in heads},
+        },
+        return_log_prob=True,
+        default_interaction_type=InteractionType.RANDOM,
+    )
+    return actor.to(env.device) if env.device is not None else actor

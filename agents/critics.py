@@ -1,0 +1,104 @@
+"""Critics: what a robot may look at when its state is valued, and how a team's value is put together.
+
+local: own observation only. team: the observations of all robots, whoever hears whom (training is
+centralised). mixed: local values, mixed to one value of the team.
+"""
+
+import torch
+from maexp.agents.actor import COMM, GRID, MAP, POSE, observation_shape
+from maexp.agents.encoder import CellEncoder
+from maexp.agents.mixers import make_mixer
+from maexp.agents.model import ModelConfig, model_config
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+VALUE = ("agents", "state_value")
+TEAM_VALUE = ("team", "state_value")
+KINDS = ("local", "team", "mixed")
+
+
+class RobotEncoder(nn.Module):
+    """Each robot's observation as one vector.
+
+    Args:
+        config: sizes; the encoder of the cells is the policy's, without weights in common
+        channels: channels of the picture
+        side: regions along one axis
+        team: look at all robots' pictures (merged) instead of the own one alone
+    """
+
+    def __init__(self, config: ModelConfig, channels: int, side: int, team: bool):
+        super().__init__()
+        self.team = team
+        self.cells = CellEncoder(config, channels, merge=team)
+        self.side = side
+        self.narrow = nn.Sequential(
+            nn.Conv2d(config.width, config.width, 3, stride=2, padding=1), nn.ReLU(), nn.Flatten()
+        )
+        self.wide = nn.Sequential(
+            nn.Linear(config.width * ((side + 1) // 2) ** 2, config.critic_hidden), nn.ReLU()
+        )
+
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
+        """Batch of teams [batch, robots, ...] to [batch, robots, critic_hidden]."""
+        heard = torch.full_like(comm, self.team)
+        cells = self.cells(picture, pose, grid, heard).transpose(-1, -2).unflatten(-1, (self.side, self.side))
+        return self.wide(self.narrow(cells.flatten(0, 1))).unflatten(0, comm.shape[:2])
+
+
+class Critic(nn.Module):
+    """Values of every robot's state, shape [*, robots, 1], and for `mixed` also the team's, shape [*, 1].
+
+    Args:
+        config: sizes
+        channels: channels of the picture
+        side: regions along one axis
+        kind: local, team or mixed
+        mixer: vdn or qmix, for mixed
+    """
+
+    def __init__(self, config: ModelConfig, channels: int, side: int, kind: str, mixer: str = "qmix"):
+        super().__init__()
+        self.team = kind == "team"
+        self.encoder = RobotEncoder(config, channels, side, self.team)
+        hidden = config.critic_hidden
+        inputs = 3 * hidden if self.team else hidden
+        self.value = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
+        nn.init.orthogonal_(self.value[-1].weight, 0.1)
+        nn.init.zeros_(self.value[-1].bias)
+        self.mixer = make_mixer(mixer, hidden) if kind == "mixed" else None
+
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor):
+        """Shapes as in TargetGenerator.forward."""
+        lead = comm.shape[:-2]
+        parts = (value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid, comm))
+        features = robots = self.encoder(*parts)
+        if self.team:
+            around = torch.cat((robots.mean(1, keepdim=True), robots.amax(1, keepdim=True)), dim=-1)
+            features = torch.cat((robots, around.expand(-1, robots.shape[1], -1)), dim=-1)
+        values = self.value(features)
+        if self.mixer is None:
+            return values.unflatten(0, lead)
+        return values.unflatten(0, lead), self.mixer(values, robots).unflatten(0, lead)
+
+
+def build_critic(
+    kind: str, env, model: "str | ModelConfig" = "small", mixer: str = "qmix"
+) -> TensorDictModule:
+    """A critic of the given kind for the specs of `env`.
+
+    It writes ("agents", "state_value") [*, robots, 1] and, for mixed, ("team", "state_value") [*, 1].
+
+    Args:
+        kind: local, team or mixed
+        env: gives the specs and the device; not kept
+        model: a preset's name or a ModelConfig
+        mixer: vdn or qmix
+    """
+    if kind not in KINDS:
+        raise ValueError(f"critic kind {kind!r} is unknown; choose one of {', '.join(KINDS)}.")
+    shape = observation_shape(env)
+    network = Critic(model_config(model), shape.channels, shape.side, kind, mixer)
+    keys = [VALUE, TEAM_VALUE] if kind == "mixed" else [VALUE]
+    critic = TensorDictModule(network, in_keys=[MAP, POSE, GRID, COMM], out_keys=keys)
+    return critic.to(env.device) if env.device is not None else critic

@@ -1,0 +1,164 @@
+"""From one robot's observation to features of the L x L regions: picture, CNN, grid features."""
+
+import torch
+from maexp.agents.model import ModelConfig
+from torch import Tensor, nn
+
+STRIDE = 4  # both stems shrink the picture by this factor
+SUBCELLS = 4  # cells a side that the CNN sees of one region
+
+
+def add_rows(picture: Tensor) -> Tensor:
+    """Average every four rows of a uint8 picture, values 0 to 1.
+
+    Rows are added as int16: converting 62,500 pixels to float first would cost more than the whole network.
+
+    Args:
+        picture: uint8, shape [*, rows, columns]
+
+    Returns:
+        float32, shape [*, ceil(rows / 4), columns]; rows beyond the edge count as 0
+    """
+    total = picture[..., 0::STRIDE, :].to(torch.int16)
+    for start in range(1, STRIDE):
+        rows = picture[..., start::STRIDE, :]
+        total[..., : rows.shape[-2], :] += rows
+    return total.float() / (255 * STRIDE)
+
+
+def region_centres(pose: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
+    """Where the regions' centres lie in the picture, in [-1, 1] along each axis.
+
+    The observation gives each region's offset from the robot in units of the picture's half side, and the
+    robot's position in the same units.
+
+    Args:
+        pose: shape [batch, 4]
+        grid: shape [batch, 4, L, L]
+
+    Returns:
+        centres along x and along y, each of shape [batch, L]
+    """
+    return pose[:, 0, None] + grid[:, 0, :, 0], pose[:, 1, None] + grid[:, 1, 0, :]
+
+
+def resampling(centres: Tensor, first: float, step: float, cells: int) -> Tensor:
+    """Weights that resample a line of cells to SUBCELLS cells per region.
+
+    Args:
+        centres: the regions' centres, shape [batch, L]
+        first: where the first cell lies in [-1, 1]
+        step: distance between cells
+        cells: how many there are
+
+    Returns:
+        shape [batch, cells, L * SUBCELLS]; triangular kernels, each column sums to 1
+    """
+    count = centres.shape[-1]
+    pitch = (centres[:, -1:] - centres[:, :1]) / max(count - 1, 1) / SUBCELLS
+    steps = torch.arange(count * SUBCELLS, device=centres.device) - (count * SUBCELLS - 1) / 2
+    targets = (centres[:, :1] + centres[:, -1:]) / 2 + steps * pitch
+    source = torch.arange(cells, device=centres.device) * step + first
+    reach = pitch.abs().clamp_min(step).unsqueeze(1)
+    weights = (1 - (targets.unsqueeze(1) - source.unsqueeze(-1)).abs() / reach).clamp_min(0)
+    return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
+
+
+def resample(cells: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Resample [batch, channels, x, y] with the weights of each batch element.
+
+    Returns:
+        shape [batch, channels, y, x]: transposed, so that neither product needs a copy of the weights
+    """
+    by_column = torch.bmm(cells.flatten(1, 2), columns).unflatten(1, cells.shape[1:3]).transpose(-1, -2)
+    return torch.bmm(by_column.flatten(1, 2), rows).unflatten(1, (cells.shape[1], -1))
+
+
+def grid_inputs(pose: Tensor, grid: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
+    """What each region is told about its robot: offsets and distances to it and to its last goal, the pose,
+    and where the region lies. Shape [batch, L * L, 12]."""
+    side = grid.shape[-1]
+    distances = [grid[:, start : start + 2].square().sum(1, keepdim=True).sqrt() for start in (0, 2)]
+    place = torch.stack(
+        (along_x[:, :, None].expand(-1, -1, side), along_y[:, None, :].expand(-1, side, -1)), dim=1
+    )
+    cells = torch.cat((grid, *distances, place), dim=1).flatten(2).transpose(1, 2)
+    return torch.cat((cells, pose.unsqueeze(1).expand(-1, side * side, -1)), dim=-1)
+
+
+class CellEncoder(nn.Module):
+    """Features of every region as one robot sees it: CNN features and grid features side by side.
+
+    The picture is resampled so that region (ix, iy) is exactly cell (ix, iy), whatever the map's shape.
+
+    Args:
+        config: sizes
+        channels: channels of the picture
+        merge: add what the robots in contact have explored together (channels 0 and 1 of their pictures)
+    """
+
+    def __init__(self, config: ModelConfig, channels: int, merge: bool):
+        super().__init__()
+        self.merge = merge
+        width = config.channels
+        self.stem = None
+        if config.stem == "conv":
+            self.stem = nn.Sequential(
+                nn.Conv2d(channels, width // 2, 3, stride=2, padding=1), nn.ReLU(),
+                nn.Conv2d(width // 2, width, 3, stride=2, padding=1), nn.ReLU(),
+            )  # fmt: skip
+        inputs = (channels if self.stem is None else width) + 2 * merge
+        self.cnn = nn.Sequential(
+            nn.Conv2d(inputs, width, 3, stride=2, padding=1), nn.ReLU(),
+            nn.Conv2d(width, width, 3, stride=2, padding=1), nn.ReLU(),
+        )  # fmt: skip
+        self.grid = nn.Sequential(nn.Linear(12, config.grid_features), nn.ReLU())
+
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
+        """Encode each robot's observation once.
+
+        Args:
+            picture: uint8, shape [batch, robots, channels, pixels, pixels]
+            pose: shape [batch, robots, 4]
+            grid: shape [batch, robots, 4, L, L]
+            comm: who hears whom, bool [batch, robots, robots]
+
+        Returns:
+            shape [batch, robots, L * L, features]
+        """
+        team = comm.shape[:2]
+        picture, pose, grid = picture.flatten(0, 1), pose.flatten(0, 1), grid.flatten(0, 1)
+        along_x, along_y = region_centres(pose, grid)
+        if self.stem is None:
+            cells = pooled = pool_regions(picture, along_x, along_y)
+        else:
+            cells = self._convolve(picture, along_x, along_y)
+            pooled = pool_regions(picture[:, :2], along_x, along_y) if self.merge else None
+        if self.merge:
+            merged = merged_maps(pooled[:, :2].unflatten(0, team), comm)
+            cells = torch.cat((cells, merged.flatten(0, 1)), dim=1)
+        features = self.cnn(cells).transpose(2, 3).flatten(2).transpose(1, 2)
+        features = torch.cat((features, self.grid(grid_inputs(pose, grid, along_x, along_y))), dim=-1)
+        return features.unflatten(0, team)
+
+    def _convolve(self, picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
+        """The learned stem, resampled to the regions; strided convolutions sit on every 4th pixel."""
+        cells = self.stem(picture.float() / 255)
+        rows, columns = picture.shape[-2:]
+        by_row = resampling(along_x, 1 / rows - 1, 2 * STRIDE / rows, cells.shape[-2])
+        by_column = resampling(along_y, 1 / columns - 1, 2 * STRIDE / columns, cells.shape[-1])
+        return resample(cells, by_row, by_column)
+
+
+def pool_regions(picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
+    """Average a uint8 picture [batch, channels, x, y] to SUBCELLS^2 cells per region, transposed."""
+    rows, columns = picture.shape[-2:]
+    lines = add_rows(picture)
+    by_row = resampling(along_x, STRIDE / rows - 1, 2 * STRIDE / rows, lines.shape[-2])
+    return resample(lines, by_row, resampling(along_y, 1 / columns - 1, 2 / columns, columns))
+
+
+def merged_maps(maps: Tensor, comm: Tensor) -> Tensor:
+    """What the robots that robot i hears have seen together, shapes [batch, robots, channels, y, x]."""
+    heard = comm | torch.eye(comm.shape[-1], dtype=torch.bool, device=comm.device)
+    return torch.where(heard[..., None, None, None], maps.unsqueeze(1), 0.0).amax(2)

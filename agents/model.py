@@ -1,0 +1,69 @@
+"""Sizes of the networks: the dataclass and its presets."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes shared by the policy and the critics.
+
+    Attributes:
+        stem: how the picture becomes small. "pool" averages blocks of 4 x 4 pixels (no weights, fast on a
+            CPU); "conv" learns two strided convolutions on the full picture, as in the paper.
+        channels: feature maps of the convolutions.
+        grid_features: features made from the pose and the previous goal, per cell.
+        depth: Spatial-TeamFormer blocks.
+        heads: attention heads; must divide `channels + grid_features`.
+        feedforward: width of the feed-forward layers as a multiple of the cell's features.
+        merge_maps: show each cell what the robots in contact have explored together, as two more input
+            channels. The attention can find that out by itself, only later.
+        critic_hidden: width of the critic's hidden layers.
+    """
+
+    stem: str = "pool"
+    channels: int = 16
+    grid_features: int = 16
+    depth: int = 1
+    heads: int = 1
+    feedforward: int = 2
+    merge_maps: bool = True
+    critic_hidden: int = 64
+
+    def __post_init__(self):
+        if self.stem not in ("pool", "conv"):
+            raise ValueError(f"model.stem={self.stem!r} is unknown; choose pool or conv.")
+        for name in ("channels", "grid_features", "depth", "heads", "feedforward", "critic_hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"model.{name}={getattr(self, name)} must be at least 1.")
+        if self.width % self.heads:
+            raise ValueError(
+                f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; "
+                "choose a divisor."
+            )
+
+    @property
+    def width(self) -> int:
+        """Features per cell (D in the paper)."""
+        return self.channels + self.grid_features
+
+
+PRESETS = {
+    "small": ModelConfig(),
+    "paper": ModelConfig(
+        stem="conv", channels=32, grid_features=16, depth=2, heads=4, merge_maps=False, critic_hidden=128
+    ),
+}
+
+
+def model_config(model: "str | ModelConfig") -> ModelConfig:
+    """The configuration behind a preset's name (or the configuration itself).
+
+    Raises:
+        ValueError: the name is not a preset.
+    """
+    if isinstance(model, ModelConfig):
+        return model
+    if model not in PRESETS:
+        names = ", ".join(PRESETS)
+        raise ValueError(f"model={model!r} is unknown; choose one of {names} or give a ModelConfig.")
+    return PRESETS[model]
