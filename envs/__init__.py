@@ -1,0 +1,28 @@
+"""Maps, scenarios and the TorchRL env."""
+
+from maexp.envs.config import (
+    CommConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+)
+from maexp.envs.environment import ExplorationEnv
+from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.scenarios import SCENARIOS, make_map, split
+
+__all__ = [
+    "SCENARIOS",
+    "CommConfig",
+    "ExplorationEnv",
+    "MapError",
+    "ObservationConfig",
+    "PlannerConfig",
+    "PointCloudMap",
+    "RadarConfig",
+    "RewardConfig",
+    "RobotConfig",
+    "make_map",
+    "split",
+]

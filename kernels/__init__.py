@@ -6,7 +6,7 @@ first run waits.
 
 import warp as wp
 
-wp.config.quiet = True  # its banner would stand in every table and pipe
+wp.config.log_level = wp.LOG_WARNING  # its banner would stand in every table and pipe
 wp.init()
 
 from maexp.kernels.api import merge_maps, unpack_flags, visible_points  # noqa: E402

@@ -4,11 +4,14 @@ Cells are numbered ``cell = iy * width + ix``. A step to a straight neighbour we
 (chamfer weights: 8 % from Euclid at worst), and a diagonal step needs both straight cells beside it passable
 (no cutting of corners). Distances are integers, so every run and every device gives the same bits.
 
-The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance, and
-so is what steps of weight 10 add to one queue, and so is what steps of weight 14 add to the other.
+The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance, so
+what steps of weight 10 add to one queue is ordered too, and likewise what steps of weight 14 add to the other.
 The nearer of the two heads is the next cell. A cell enters each queue at most once (a later step of the same
 weight is never shorter): queues as long as the grid never overflow.
 """
+
+from collections.abc import Callable
+from functools import partial
 
 import torch
 import warp as wp
@@ -21,14 +24,20 @@ wp_straight = wp.constant(wp.int32(STRAIGHT))
 wp_diagonal = wp.constant(wp.int32(DIAGONAL))
 wp_unreached = wp.constant(wp.int32(UNREACHED))
 
+SKIP = -2  # as the stop of a search: leave its distances as they are
+wp_skip = wp.constant(wp.int32(SKIP))
+
 
 @wp.kernel(enable_backward=False)
 def _clear_distance(
+    # Query:
+    stop: wp.array(dtype=wp.int32),  # [item]
     # Out:
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
 ):
     item, cell = wp.tid()
-    distance[item, cell] = wp_unreached
+    if stop[item] != wp_skip:
+        distance[item, cell] = wp_unreached
 
 
 @wp.func
@@ -58,7 +67,7 @@ def _flood_distance(
     height: wp.array(dtype=wp.int32),  # [grid]
     # Query:
     sources: wp.array2d(dtype=wp.int32),  # [item, source], -1 = none
-    stop: wp.array(dtype=wp.int32),  # [item], the search ends once this cell is settled; -1 = never
+    stop: wp.array(dtype=wp.int32),  # [item], the search ends once this cell is settled; -1 = never; SKIP
     # Scratch:
     straight_queue: wp.array2d(dtype=wp.int32),  # [item, cell]
     diagonal_queue: wp.array2d(dtype=wp.int32),  # [item, cell]
@@ -66,6 +75,9 @@ def _flood_distance(
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
 ):
     item = wp.tid()
+    stop_cell = stop[item]
+    if stop_cell == wp_skip:
+        return
     row = row_of_item[item]
     grid = grid_of_row[row]
     w = width[grid]
@@ -74,7 +86,6 @@ def _flood_distance(
     dist = distance[item]
     near = straight_queue[item]
     far = diagonal_queue[item]
-    stop_cell = stop[item]
 
     near_head = wp.int32(0)
     near_tail = wp.int32(0)
@@ -156,42 +167,41 @@ class DistanceSearch:
     Attributes:
         sources: int32 [items, num_sources], cell numbers, -1 = none. Fill before `launch`.
         stop: int32 [items], end each search once this cell is settled (farther labels are then upper
-            bounds); -1 = search all.
+            bounds); -1 = search all; `SKIP` = do not search, leave the distances as they are.
         distance: int32 [items, cells], 10 a straight step; `UNREACHED` elsewhere.
     """
 
     def __init__(self, items: int, cells: int, num_sources: int = 1, device: str | wp.Device = "cpu"):
-        self.device = device
         self.sources = wp.full((items, num_sources), -1, dtype=wp.int32, device=device)
         self.stop = wp.full(items, -1, dtype=wp.int32, device=device)
         self.distance = wp.empty((items, cells), dtype=wp.int32, device=device)
         self.straight_queue = wp.empty((items, cells), dtype=wp.int32, device=device)
         self.diagonal_queue = wp.empty((items, cells), dtype=wp.int32, device=device)
 
-    def launch(
+    def search(
         self,
+        launch: Callable,
         passable: wp.array,
         row_of_item: wp.array,
         grid_of_row: wp.array,
         width: wp.array,
         height: wp.array,
-    ):
+    ) -> None:
         """Fills `distance`.
 
         Args:
+            launch: ``launch(kernel, dim, inputs, outputs)`` launches or records.
             passable: uint8 [rows, cells], 0 = blocked; cell = iy * width + ix with the grid's own width.
             row_of_item: int32 [items], the row of `passable` that a search runs on.
             grid_of_row: int32 [rows], which grid (map) a row has now.
             width, height: int32 [grids], cells of each grid along x and y.
         """
-        wp.launch(_clear_distance, self.distance.shape, outputs=[self.distance], device=self.device)
-        wp.launch(
-            _flood_distance,
-            self.distance.shape[0],
-            inputs=[passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
-            outputs=[self.straight_queue, self.diagonal_queue, self.distance],
-            device=self.device,
-        )
+        launch(_clear_distance, self.distance.shape, [self.stop], [self.distance])
+        launch(
+            _flood_distance, self.distance.shape[0],
+            [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
+            [self.straight_queue, self.diagonal_queue, self.distance],
+        )  # fmt: skip
 
 
 def geodesic_distance(passable: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:
@@ -226,7 +236,8 @@ def geodesic_distance(passable: torch.Tensor, sources: torch.Tensor) -> torch.Te
     if sources.numel():
         search.sources = wp.from_torch(sources)
     mask = (passable != 0).to(torch.uint8).reshape(batch, -1).contiguous()
-    search.launch(
+    search.search(
+        partial(wp.launch, device=device),
         wp.from_torch(mask),
         wp.array(range(batch), dtype=wp.int32, device=device),
         wp.zeros(batch, dtype=wp.int32, device=device),

@@ -4,8 +4,8 @@ Rows: `rows_per_env` consecutive rows belong to one env, one row where knowledge
 where communication is limited. Cells are numbered ``iy * width + ix`` with the width of the env's map.
 """
 
+import numpy as np
 import warp as wp
-
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.planner import is_known
 from maexp.kernels.types import Maps
@@ -26,7 +26,9 @@ class NavGrids:
     free_cell: wp.array(dtype=wp.int32)  # cell of every free point, in the order of Maps.free
     boundary_cell: wp.array(dtype=wp.int32)  # cell of every boundary point, in the order of Maps.boundary
     cell_begin: wp.array(dtype=wp.int32)  # [M + 1], where a map's cells start in `stand_in`
-    stand_in: wp.array(dtype=wp.int32)  # cell whose state a cell takes: itself where it holds points; -1 = none
+    stand_in: wp.array(
+        dtype=wp.int32
+    )  # cell whose state a cell takes: itself where it holds points; -1 = none
 
 
 @wp.func
@@ -114,6 +116,7 @@ def _mask_passable(
     known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
     radius: wp.array(dtype=wp.float32),  # [mask row], distance to keep from known obstacle cells [m]
+    margin: float,  # the same, on top, in cells
     through_unknown: int,
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
@@ -128,7 +131,7 @@ def _mask_passable(
         state = known[source, cell]
         if state == wp_free or (state == wp_unknown and through_unknown != 0):
             ok = wp.uint8(1)
-            r = radius[row] / grids.cell[m]
+            r = radius[row] / grids.cell[m] + margin
             reach = int(wp.ceil(r))
             x = cell % w
             y = cell / w
@@ -196,6 +199,7 @@ class PassableGrids:
         known: the grids to read.
         radius: float32 [E, K], distance to keep from known obstacles [m]; K masks per env. Where every robot
             has a known row of its own, K must be the number of robots.
+        margin: the same on top, in cells, for what the grid rounds away.
         through_unknown: whether unknown cells count as passable.
 
     Attributes:
@@ -203,12 +207,13 @@ class PassableGrids:
         grid_of_row: int32 [E * K], the map of each row; set by `paint`.
     """
 
-    def __init__(self, known: KnownGrids, radius, through_unknown: bool):
+    def __init__(self, known: KnownGrids, radius: np.ndarray, margin: float, through_unknown: bool):
         envs, masks = radius.shape
         if known.rows_per_env not in (1, masks):
             raise ValueError(f"{known.rows_per_env} known rows per env need as many masks, got {masks}")
         device = known.known.device
-        self.known, self.masks, self.through_unknown = known, masks, int(through_unknown)
+        self.known, self.masks = known, masks
+        self.margin, self.through_unknown = float(margin), int(through_unknown)
         self.radius = wp.array(radius.reshape(-1), dtype=wp.float32, device=device)
         rows = range(envs * masks)
         source = [row if known.rows_per_env == masks else row // masks for row in rows]
@@ -222,5 +227,5 @@ class PassableGrids:
         launch(
             _mask_passable, self.passable.shape,
             [self.known.grids, self.grid_of_row, self.known.known, self.known_of_row, self.radius,
-             self.through_unknown], [self.passable],
+             self.margin, self.through_unknown], [self.passable],
         )  # fmt: skip

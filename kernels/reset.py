@@ -34,8 +34,8 @@ def _place_team(
     num_maps: int,
     # Robots:
     robots: Robots,
-    seed: int,
     # State in:
+    seed: wp.array(dtype=wp.int32),
     mask: wp.array(dtype=wp.int32),
     env_id: wp.array(dtype=wp.int32),
     episode: wp.array(dtype=wp.int32),
@@ -50,7 +50,7 @@ def _place_team(
     if mask[e] == 0:
         return
     # rand_init mixes seed and offset; the first draw keeps episodes of neighbouring envs apart.
-    key = wp.rand_init(seed, env_id[e])
+    key = wp.rand_init(seed[0], env_id[e])
     rng = wp.rand_init(wp.randi(key), episode[e])
     m = wp.randi(rng, 0, num_maps)
     map_id[e] = m

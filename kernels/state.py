@@ -18,6 +18,7 @@ from maexp.kernels.visibility import BINS
 # of the largest map; H, P, Q are W, F, B where communication is limited and 1 elsewhere; T track length,
 # V visible points, K occluders, O boundary points in range; digits are literal.
 STATE = {
+    "seed": ("1", torch.int32, wp.int32),
     "map_id": ("E", torch.int32, wp.int32),
     "env_id": ("E", torch.int32, wp.int32),
     "episode": ("E", torch.int32, wp.int32),
@@ -118,9 +119,11 @@ def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
 def warp_views(tensors: dict[str, torch.Tensor], first: int, last: int) -> SimpleNamespace:
     """Warp arrays over envs ``first`` to ``last`` of all state and scratch tensors."""
     fields = STATE | SCRATCH
-    return SimpleNamespace(
-        **{name: wp.from_torch(t[first:last], dtype=fields[name][2]) for name, t in tensors.items()}
-    )
+    views = {}
+    for name, tensor in tensors.items():
+        axes, _, kind = fields[name]
+        views[name] = wp.from_torch(tensor[first:last] if axes.startswith("E") else tensor, dtype=kind)
+    return SimpleNamespace(**views)
 
 
 def robots_struct(tensors: dict[str, torch.Tensor], first: int, last: int) -> Robots:

@@ -180,7 +180,7 @@ class Shard:
         )  # fmt: skip
         launch(
             reset._place_team, envs,
-            [maps, self.sim.num_maps, self.robots, self.sim.seed, s.mask, s.env_id, s.episode],
+            [maps, self.sim.num_maps, self.robots, s.seed, s.mask, s.env_id, s.episode],
             [s.map_id, s.pose, s.center, s.error],
         )  # fmt: skip
         launch(
@@ -265,11 +265,13 @@ class Simulation:
     ):
         self.map_tensors, self.num_maps, self.robot_tensors = maps, num_maps, robots
         self.weights, self.settings, self.sizes = weights, settings, sizes
-        self.device, self.seed = torch.device(device), seed
+        self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.team_bits = int(settings.draw_known and not settings.comm_limited)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
+        self.tensors["seed"].fill_(seed & 0x7FFFFFFF)
+        self.tensors["episode"].fill_(-1)
         self.tensors["comm"].fill_(True)
         count = max(1, min(num_shards, sizes["E"]))
         cuts = [sizes["E"] * k // count for k in range(count + 1)]

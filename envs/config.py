@@ -1,0 +1,179 @@
+"""Settings of the env as dataclasses; every default that a scenario fixes comes from its row of the table."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+from maexp.envs.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """One robot. Lengths in metres, speeds in m/s, angles in radians; None takes the scenario's value.
+
+    ``max_yaw_rate`` [rad/s] is the turn limit of a differential drive, ``max_steer`` that of a car.
+    ``wheelbase`` None is the body's length.
+    """
+
+    kind: Literal["ackermann", "differential", "omnidirectional"] = "ackermann"
+    length: float | None = None
+    width: float | None = None
+    wheelbase: float | None = None
+    max_speed: float | None = None
+    max_accel: float | None = None
+    max_steer: float | None = None
+    max_yaw_rate: float = math.pi / 2
+    collision_threshold: float | None = None
+
+
+@dataclass(frozen=True)
+class RadarConfig:
+    """A robot's range sensor (design 4.1). ``obstacle_radius`` "auto" is each obstacle's spacing / sqrt(2)."""
+
+    range: float | None = None
+    fov: float = 2.0 * math.pi
+    alpha1: float = 1e-3
+    alpha2: float = 1e-6
+    obstacle_radius: float | Literal["auto"] = "auto"
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """How a robot drives to its goal (design 4.4)."""
+
+    name: Literal["dwa", "wavefront", "direct"] = "dwa"
+    num_accel: int = 3
+    num_steering: int | None = None
+    horizon: int = 3
+    clearance_factor: float | None = None
+    clearance_weight: float = 100.0
+    replan_steps: int = 5
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward (design 4.5).
+
+    ``points`` / |free| scales explore and overlap, ``events`` the other terms; ``events`` 0 takes
+    ``points`` / |free| there too, as the paper does. ``time_on`` "uncovered" pays -(1 - coverage),
+    "covered" pays -coverage as the paper prints.
+    """
+
+    explore: float = 0.3
+    overlap: float = 0.01
+    time: float = 1.0
+    success: float = 100.0
+    collision: float = 200.0
+    points: float = 60.0
+    events: float = 60.0 / 7000.0
+    time_on: Literal["uncovered", "covered"] = "uncovered"
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """What the picture of a robot shows: what it has ``seen`` itself, or what it ``known`` through communication."""
+
+    map: Literal["seen", "known"] = "seen"
+
+
+@dataclass(frozen=True)
+class CommConfig:
+    """Who hears whom: robots within ``range`` [m], and in line of sight if asked. Infinite: everyone (the paper)."""
+
+    range: float = math.inf
+    line_of_sight: bool = False
+
+    @property
+    def limited(self) -> bool:
+        return self.line_of_sight or math.isfinite(self.range)
+
+
+ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
+
+
+def _complete(config, **defaults):
+    """``config`` with its None fields filled in."""
+    return replace(config, **{k: v for k, v in defaults.items() if getattr(config, k) is None})
+
+
+def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
+    """Fill in what the scenario fixes and check every value."""
+    config = _complete(
+        config,
+        length=scenario.body_length,
+        width=scenario.body_width,
+        max_speed=scenario.max_speed,
+        max_accel=scenario.max_accel,
+        max_steer=scenario.max_steer,
+        collision_threshold=scenario.collision_threshold,
+    )
+    config = _complete(config, wheelbase=config.length)
+    _check_choice("robot.kind", config.kind, ROBOT_KINDS)
+    _check_positive("robot", config, skip=("kind",))
+    if config.max_steer >= math.pi / 2:
+        raise ValueError(f"robot.max_steer={config.max_steer} must stay below pi/2 = 1.5708 rad")
+    return config
+
+
+def complete_radar(config: RadarConfig, scenario: Scenario) -> RadarConfig:
+    """Fill in the scenario's range and check every value."""
+    config = _complete(config, range=scenario.radar_range)
+    _check_positive("radar", config, skip=("obstacle_radius", "alpha1", "alpha2"))
+    radius = config.obstacle_radius
+    if radius != "auto" and not (isinstance(radius, int | float) and 0.0 <= radius < math.inf):
+        raise ValueError(f'radar.obstacle_radius={radius!r} must be "auto" or a number of metres, 0 or more')
+    if not 0.0 <= config.alpha1 <= 2.0 or not math.isfinite(config.alpha2):
+        raise ValueError(f"radar.alpha1={config.alpha1} must lie in [0, 2] and radar.alpha2={config.alpha2} be finite")
+    return config
+
+
+def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig:
+    """Fill in the scenario's candidates and clearance and check every value."""
+    config = _complete(
+        config, num_steering=scenario.num_steering, clearance_factor=scenario.clearance_factor
+    )
+    _check_choice("planner.name", config.name, ("dwa", "wavefront", "direct"))
+    _check_positive("planner", config, skip=("name",))
+    return config
+
+
+def check_reward(config: RewardConfig) -> RewardConfig:
+    """Every weight must be a finite number; signs are fixed by the meaning of the terms."""
+    _check_choice("reward.time_on", config.time_on, ("uncovered", "covered"))
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if f.name != "time_on" and not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+            raise ValueError(f"reward.{f.name}={value!r} must be a finite number, 0 or more")
+    return config
+
+
+def check_comm(config: CommConfig) -> CommConfig:
+    """The range may be infinite but not negative."""
+    if not config.range >= 0.0:
+        raise ValueError(f"comm.range={config.range} must be 0 or more metres (inf: everyone hears everyone)")
+    return config
+
+
+def per_robot(what: str, config, kind: type, count: int) -> list:
+    """One config per robot from a single one or a list of ``count``."""
+    if config is None:
+        return [kind()] * count
+    if isinstance(config, kind):
+        return [config] * count
+    if isinstance(config, Sequence) and len(config) == count and all(isinstance(c, kind) for c in config):
+        return list(config)
+    size = f"a list of {len(config)}" if isinstance(config, Sequence) else repr(config)
+    raise ValueError(f"{what}={size}: give one {kind.__name__} or a list of num_robots={count} of them")
+
+
+def _check_choice(name: str, value, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
+
+
+def _check_positive(group: str, config, skip: tuple[str, ...]) -> None:
+    for f in fields(config):
+        value = getattr(config, f.name)
+        if f.name not in skip and not (isinstance(value, int | float) and 0.0 < value < math.inf):
+            raise ValueError(f"{group}.{f.name}={value!r} must be a positive finite number")

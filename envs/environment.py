@@ -1,0 +1,357 @@
+"""The TorchRL env: a batch of teams that explore point-cloud maps (design 2)."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+
+from maexp.envs.bank import build_bank
+from maexp.envs.config import (
+    CommConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    check_comm,
+    check_reward,
+    complete_planner,
+    complete_radar,
+    complete_robot,
+    per_robot,
+)
+from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.simulation import build_simulation, check_memory
+from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
+from maexp.kernels import unpack_flags
+from maexp.kernels.reset import START_CLEARANCE
+from maexp.kernels.state import STATE
+from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
+
+DEFAULT_MACRO_STEPS_MIN = 10
+SWEEPS = 2.0
+"""A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
+
+
+class ExplorationEnv(EnvBase):
+    """``num_envs`` teams of ``num_robots`` robots, each on one of ``maps``, chosen anew at every reset.
+
+    Settings left None take the values of the scenario of the first map. ``robot`` and ``radar`` may be
+    lists with one config per robot.
+
+    Args:
+        maps: one map or several; they may differ in size.
+        num_envs: teams in the batch, E.
+        num_robots: robots in a team, N.
+        device: "cpu" or "cuda".
+        seed: key of all random numbers: env i's episode k depends on (seed, i, k) alone.
+        robot, radar, planner, reward, observation, comm: see `maexp.envs.config`.
+        local_steps: control steps of 0.1 s in one ``env.step``.
+        macro_steps: ``env.step`` calls in an episode before it is truncated.
+        collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
+        success_coverage: coverage that ends an episode as a success.
+        num_threads: CPU threads of the simulation; results do not depend on it.
+
+    Raises:
+        ValueError: a setting is out of its range (named, with its value).
+        MapError: a map has no room for the team.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        maps: PointCloudMap | Sequence[PointCloudMap],
+        num_envs: int = 1,
+        num_robots: int = 3,
+        device: str | torch.device = "cpu",
+        seed: int = 0,
+        *,
+        robot: RobotConfig | Sequence[RobotConfig] | None = None,
+        radar: RadarConfig | Sequence[RadarConfig] | None = None,
+        planner: PlannerConfig | None = None,
+        reward: RewardConfig | None = None,
+        observation: ObservationConfig | None = None,
+        comm: CommConfig | None = None,
+        local_steps: int | None = None,
+        macro_steps: int | None = None,
+        collision: str = "centre",
+        success_coverage: float = 0.95,
+        num_threads: int | None = None,
+    ):
+        maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
+        if not maps:
+            raise ValueError("maps=[] is empty: give at least one map")
+        num_envs, num_robots = _count("num_envs", num_envs), _count("num_robots", num_robots)
+        scenario = find_scenario(maps[0].scenario)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.num_envs, self.num_robots = num_envs, num_robots
+        self.scenario = scenario
+        self.local_steps = _count("local_steps", scenario.local_steps if local_steps is None else local_steps)
+        macro_steps = macro_steps or scenario.macro_steps or default_macro_steps(maps, scenario)
+        self.macro_steps = _count("macro_steps", macro_steps)
+        if collision not in ("centre", "footprint"):
+            raise ValueError(f"collision={collision!r} is unknown: choose centre or footprint")
+        if not 0.0 < success_coverage <= 1.0:
+            raise ValueError(f"success_coverage={success_coverage} must lie in (0, 1]")
+        self.collision, self.success_coverage = collision, float(success_coverage)
+        self.robot_configs = [complete_robot(r, scenario) for r in per_robot("robot", robot, RobotConfig, num_robots)]
+        self.radar_configs = [complete_radar(r, scenario) for r in per_robot("radar", radar, RadarConfig, num_robots)]
+        self.planner_config = complete_planner(planner or PlannerConfig(), scenario)
+        self.reward_config = check_reward(reward or RewardConfig())
+        self.observation_config = observation or ObservationConfig()
+        if self.observation_config.map not in ("seen", "known"):
+            raise ValueError(f"observation.map={self.observation_config.map!r} is unknown: choose seen or known")
+        self.comm_config = check_comm(comm or CommConfig())
+        for m in maps:
+            check_room(m, [r.collision_threshold for r in self.robot_configs])
+        self.bank = build_bank(maps, self.radar_configs)
+        self.maps = self.bank.maps
+        check_memory(self)
+        threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
+        self.simulation = build_simulation(self, seed, threads if self.device.type == "cpu" else 1)
+        self._hook: tuple[Callable, int] | None = None
+        direct = self.planner_config.name == "direct"
+        self.observation_spec = observation_spec(num_envs, num_robots, self.device)
+        self.action_spec = action_spec(num_envs, num_robots, direct, self.device)
+        self.reward_spec = reward_spec(num_envs, num_robots, self.device)
+        self.done_spec = done_spec(num_envs, self.device)
+
+    # Reset and step
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
+        state = self.simulation.tensors
+        mask = torch.ones(self.num_envs, dtype=torch.int32, device=self.device)
+        if tensordict is not None and "_reset" in tensordict.keys():
+            mask = tensordict["_reset"].reshape(self.num_envs).to(torch.int32)
+        state["episode"] += mask
+        self.simulation.reset(mask)
+        self._raise_errors()
+        if self._hook is not None:
+            self._hook[0](self)
+        done = self._done()
+        out = self._observe()
+        info = out["info"]
+        for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a fresh episode has made none
+            keep = mask.reshape(-1, 1) == 0
+            blank = -1 if name.startswith("coverage_step") else 0
+            info[name] = torch.where(keep, info[name], torch.full_like(info[name], blank))
+        return out.update(done)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        state, sim = self.simulation.tensors, self.simulation
+        running = state["active"].clone()
+        self._take_action(tensordict["agents", "action"])
+        sim.set_goals()
+        if self._hook is None:
+            sim.step(0, self.local_steps)
+        else:
+            hook, every = self._hook
+            for start in range(0, self.local_steps, every):
+                sim.step(start, min(every, self.local_steps - start))
+                hook(self)
+        self._raise_errors()
+        state["macro_step"] += running
+        reward = state["terms"].sum(-1)
+        state["episode_reward"] += reward
+        done = self._done()
+        state["active"] *= 1 - done["done"].reshape(-1).to(torch.int32)
+        out = self._observe()
+        out["agents", "reward"] = reward.unsqueeze(-1)
+        return out.update(done)
+
+    def _take_action(self, action: TensorDictBase) -> None:
+        state = self.simulation.tensors
+        if self.planner_config.name == "direct":
+            control = action["control"]
+            bad = ~torch.isfinite(control).flatten(1).all(1)
+            state["error"] |= bad.to(torch.int32) * int(ERROR_ACTION)
+            state["command"].copy_(torch.nan_to_num(control))
+        else:
+            state["region"].copy_(action["region"])
+            state["offset"].copy_(action["offset"])
+
+    def _done(self) -> dict[str, torch.Tensor]:
+        state = self.simulation.tensors
+        terminated = (state["terminated"] != 0).unsqueeze(-1)
+        truncated = (state["macro_step"] >= self.macro_steps).unsqueeze(-1) & ~terminated
+        return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+
+    def _observe(self) -> TensorDict:
+        """Fresh tensors, never the simulation's own: collectors keep what they get (design 6.1)."""
+        e, n, p, r = self.num_envs, self.num_robots, int(PIXELS), int(REGIONS)
+        picture = torch.empty((e, n, 4, p, p), dtype=torch.uint8, device=self.device)
+        team = torch.empty((e, 3, p, p), dtype=torch.uint8, device=self.device)
+        pose = torch.empty((e, n, 4), device=self.device)
+        grid = torch.empty((e, n, 4, r, r), device=self.device)
+        self.simulation.observe(picture, team, pose, grid)
+        comm = self.simulation.tensors["comm"].clone()
+        observation = {"map": picture, "pose": pose, "grid": grid, "comm": comm}
+        agents = TensorDict(
+            {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},
+            batch_size=[e, n], device=self.device,
+        )  # fmt: skip
+        parts = {
+            "agents": agents,
+            "team": TensorDict({"map": team}, batch_size=[e], device=self.device),
+            "info": TensorDict(self._info(), batch_size=[e], device=self.device),
+        }
+        return TensorDict(parts, batch_size=[e], device=self.device)
+
+    def _info(self) -> dict[str, torch.Tensor]:
+        s = self.simulation.tensors
+        total = self.simulation.map_tensors["total_weight"][s["map_id"].long()]
+        info = {
+            "coverage": (s["covered"] / total).unsqueeze(-1),
+            "local_steps": s["local_step"].unsqueeze(-1).clone(),
+            "collided": s["collided"] != 0,
+            "path_length": s["path_length"].clone(),
+            "episode_reward": s["episode_reward"].clone(),
+            "episode_reward_raw": s["raw"].sum(-1),
+        }
+        for k, mark in enumerate(("85", "95")):
+            info[f"coverage_step_{mark}"] = s["milestone_step"][:, k : k + 1].clone()
+            info[f"mutual_overlap_{mark}"] = s["milestone_overlap"][:, k : k + 1].clone()
+            info[f"path_length_{mark}"] = s["milestone_path"][:, :, k].clone()
+        for k, term in enumerate(REWARD_TERMS):
+            info[f"reward_{term}"] = s["terms"][:, :, k].clone()
+        return info
+
+    def _raise_errors(self) -> None:
+        error = self.simulation.tensors["error"]
+        if not bool(error.any()):
+            return
+        code = int(torch.bitwise_and(error, 7).max())
+        env = int(error.argmax())
+        error.zero_()
+        if code & int(ERROR_CAPACITY):
+            raise RuntimeError(f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/bank.py")
+        if code & int(ERROR_START):
+            raise MapError(
+                f"no free start was left for num_robots={self.num_robots} robots (env {env}): use fewer robots, "
+                "a smaller robot.collision_threshold or a larger map"
+            )
+        raise ValueError(f"the action of env {env} is NaN or infinite: the policy has diverged or was fed wrongly")
+
+    # Seeds, evaluation, state
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.simulation.tensors["seed"].fill_(int(seed or 0) & 0x7FFFFFFF)
+        self.simulation.tensors["episode"].fill_(-1)
+
+    def set_episodes(self, ids: torch.Tensor) -> None:
+        """Let env i play evaluation episode ``ids[i]`` at the next reset: map and starts from (seed, id) alone."""
+        self.simulation.tensors["env_id"].copy_(ids)
+        self.simulation.tensors["episode"].fill_(-1)
+
+    def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
+        """The simulator's state, copied: loading it continues bit for bit on the same device."""
+        return {name: self.simulation.tensors[name].clone() for name in STATE}
+
+    def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
+        """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
+        own = self.simulation.tensors
+        wrong = [n for n in STATE if n not in state_dict or state_dict[n].shape != own[n].shape]
+        if wrong:
+            raise ValueError(
+                f"the saved simulator state does not fit this env ({', '.join(wrong[:3])}): "
+                "use the maps, num_envs and num_robots it was saved with"
+            )
+        for name in STATE:
+            own[name].copy_(state_dict[name])
+
+    # Looking in
+
+    def set_step_hook(self, hook: Callable[["ExplorationEnv"], None] | None, every: int = 1) -> None:
+        """Call ``hook(env)`` after every reset and every ``every``-th local step; None stops that."""
+        self._hook = None if hook is None else (hook, _count("every", every))
+
+    def snapshot(self, index: int = 0) -> dict:
+        """What env ``index`` looks like now, as NumPy arrays, points in the order of its map (for drawing)."""
+        s = self.simulation.tensors
+        m = int(s["map_id"][index])
+        step = int(s["local_step"][index])
+        place = self.maps[m]
+
+        def flags(name: str, order: np.ndarray) -> np.ndarray:
+            count = len(order)
+            sorted_flags = unpack_flags(s[name][index : index + 1, :, :count], self.num_robots)[0].cpu().numpy()
+            result = np.empty_like(sorted_flags)
+            result[:, order] = sorted_flags
+            return result
+
+        visible = np.zeros((self.num_robots, len(place.free)), dtype=bool)
+        for i in range(self.num_robots):
+            listed = s["visible"][index, i, : int(s["visible_count"][index, i])].cpu().numpy()
+            visible[i, self.bank.order_free[m][listed]] = True
+        total = int(self.simulation.map_tensors["total_weight"][m])
+        return {
+            "map": place,
+            "pose": s["pose"][index].cpu().numpy().copy(),
+            "center": s["center"][index, :, :2].cpu().numpy().copy(),
+            "body": np.array([[r.length, r.width] for r in self.robot_configs], dtype=np.float32),
+            "goal": s["goal"][index].cpu().numpy().copy(),
+            "target": s["target"][index].cpu().numpy().copy(),
+            "radar_range": np.array([r.range for r in self.radar_configs], dtype=np.float32),
+            "seen_free": flags("seen_free", self.bank.order_free[m]),
+            "seen_boundary": flags("seen_boundary", self.bank.order_boundary[m]),
+            "visible": visible,
+            "coverage": int(s["covered"][index]) / total,
+            "local_step": step,
+            "collided": (s["collided"][index] != 0).cpu().numpy(),
+            "trail": self._trail(index, m, step),
+        }
+
+    def _trail(self, index: int, m: int, step: int) -> np.ndarray:
+        """Past centres of the robots at the picture's resolution, oldest first, [T, N, 2] [m]."""
+        track = self.simulation.tensors["track"][index].cpu().numpy()
+        depth = track.shape[1]
+        pixels = track[:, np.arange(max(0, step - depth + 1), step + 1) % depth].T
+        origin = self.bank.arrays["frame_origin"][m]
+        size = self.bank.arrays["pixel_size"][m]
+        side = int(PIXELS)
+        return origin + size * np.stack([pixels // side, pixels % side], axis=-1)
+
+    def render(self, index: int = 0, size: int = 512) -> np.ndarray:
+        """A picture of env ``index``: uint8 [size or more, size, 3]."""
+        from maexp.envs.render import draw_frame
+
+        return draw_frame(self.snapshot(index), size=size)
+
+
+def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
+    """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
+    area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
+    swept = 3 * scenario.max_speed * 0.1 * scenario.local_steps * scenario.radar_range
+    return max(DEFAULT_MACRO_STEPS_MIN, math.ceil(SWEEPS * area / swept))
+
+
+def check_room(m: PointCloudMap, thresholds: list[float]) -> None:
+    """MapError unless the team fits: every start ``3 * threshold`` from the boundary and from the others."""
+    need = float(START_CLEARANCE) * max(thresholds)
+    far = cKDTree(m.boundary).query(m.free)[0] if len(m.boundary) else np.full(len(m.free), np.inf)
+    candidates = m.free[far >= need]
+    room = 0
+    tree = cKDTree(candidates) if len(candidates) else None
+    free = np.ones(len(candidates), dtype=bool)
+    while room < len(thresholds) and free.any():
+        start = int(np.argmax(free))
+        free[tree.query_ball_point(candidates[start], need)] = False
+        room += 1
+    if room < len(thresholds):
+        raise MapError(
+            f"map {m.name} has room for {room} of num_robots={len(thresholds)} robots with {need:g} m of clearance: "
+            "use fewer robots, a smaller robot.collision_threshold or a larger map"
+        )
+
+
+def _count(name: str, value) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name}={value!r} must be a whole number, 1 or more")
+    return int(value)

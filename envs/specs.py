@@ -1,0 +1,95 @@
+"""Shapes, types and bounds of what enters and leaves the env (design 2)."""
+
+import torch
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+
+from maexp.kernels.types import PIXELS, REGIONS
+
+INFO_ENV = {
+    "coverage": torch.float32,
+    "coverage_step_85": torch.int32,
+    "coverage_step_95": torch.int32,
+    "mutual_overlap_85": torch.float32,
+    "mutual_overlap_95": torch.float32,
+    "local_steps": torch.int32,
+}
+"""Entries of ``info`` of shape [E, 1]."""
+
+REWARD_TERMS = ("explore", "overlap", "time", "success", "collision")
+"""Order of the last axis of the kernels' reward terms."""
+
+INFO_ROBOT = {
+    **{f"reward_{term}": torch.float32 for term in REWARD_TERMS},
+    "collided": torch.bool,
+    "path_length": torch.float32,
+    "path_length_85": torch.float32,
+    "path_length_95": torch.float32,
+    "episode_reward": torch.float32,
+    "episode_reward_raw": torch.float32,
+}
+"""Entries of ``info`` of shape [E, N]; ``episode_reward_raw`` is the sum of terms before scaling by w and v."""
+
+
+def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
+    """Observation of every robot, the team's map, and info."""
+    pixels, regions = int(PIXELS), int(REGIONS)
+
+    def picture(*shape):
+        return Bounded(0, 255, shape=(*shape, pixels, pixels), dtype=torch.uint8, device=device)
+
+    def real(*shape):
+        return Unbounded(shape=shape, dtype=torch.float32, device=device)
+
+    observation = Composite(
+        map=picture(envs, robots, 4),
+        pose=real(envs, robots, 4),
+        grid=real(envs, robots, 4, regions, regions),
+        comm=Binary(robots, shape=(envs, robots, robots), dtype=torch.bool, device=device),
+        shape=(envs, robots),
+        device=device,
+    )
+    info = {name: _value((envs, 1), dtype, device) for name, dtype in INFO_ENV.items()}
+    info |= {name: _value((envs, robots), dtype, device) for name, dtype in INFO_ROBOT.items()}
+    return Composite(
+        agents=Composite(observation=observation, shape=(envs, robots), device=device),
+        team=Composite(map=picture(envs, 3), shape=(envs,), device=device),
+        info=Composite(info, shape=(envs,), device=device),
+        shape=(envs,),
+        device=device,
+    )
+
+
+def _value(shape, dtype, device):
+    if dtype == torch.bool:
+        return Binary(shape[-1], shape=shape, dtype=dtype, device=device)
+    return Unbounded(shape=shape, dtype=dtype, device=device)
+
+
+def action_spec(envs: int, robots: int, direct: bool, device: torch.device) -> Composite:
+    """Region and offset of every robot's goal, or its controls where the planner is ``direct``."""
+    if direct:
+        action = {"control": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device)}
+    else:
+        action = {
+            "region": Categorical(int(REGIONS) ** 2, shape=(envs, robots), dtype=torch.int64, device=device),
+            "offset": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device),
+        }
+    inner = Composite(action, shape=(envs, robots), device=device)
+    group = Composite(action=inner, shape=(envs, robots), device=device)
+    return Composite(agents=group, shape=(envs,), device=device)
+
+
+def reward_spec(envs: int, robots: int, device: torch.device) -> Composite:
+    """One reward per robot."""
+    reward = Unbounded(shape=(envs, robots, 1), dtype=torch.float32, device=device)
+    group = Composite(reward=reward, shape=(envs, robots), device=device)
+    return Composite(agents=group, shape=(envs,), device=device)
+
+
+def done_spec(envs: int, device: torch.device) -> Composite:
+    """Termination (success, all collided) apart from truncation (out of macro steps)."""
+    flags = {
+        name: Categorical(2, shape=(envs, 1), dtype=torch.bool, device=device)
+        for name in ("done", "terminated", "truncated")
+    }
+    return Composite(flags, shape=(envs,), device=device)
