@@ -21,3 +21,13 @@ def data_dir() -> Path:
     if not (folder / "manifest.csv").is_file():
         pytest.skip(f"REAL DATA ABSENT: no manifest.csv in {folder}; set MAEXP_DATA to the folder of scans")
     return folder
+
+
+@pytest.fixture(scope="session")
+def oracle_dir() -> Path:
+    """Folder of arrays recorded from the original platform; tests that need it skip where it is absent."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "oracle"
+    folder = Path(os.environ.get("MAEXP_ORACLE", default))
+    if not (folder / "masking_maze.npz").is_file():
+        pytest.skip(f"RECORDED ARRAYS ABSENT: no masking_maze.npz in {folder}; set MAEXP_ORACLE to the folder")
+    return folder

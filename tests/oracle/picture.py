@@ -1,0 +1,75 @@
+"""The picture of a map (design 4.2): 125 x 125 pixels over a square frame around the extent."""
+
+import math
+
+import numpy as np
+
+from oracle.motion import point_to_body
+
+PIXELS = 125
+
+
+def frame(extent, margin: float = 0.05, pixels: int = PIXELS) -> tuple[np.ndarray, float]:
+    """`(corner, size)`: lower corner [m] of the square frame and edge of a pixel [m].
+
+    The frame is centred on the extent ((xmin, ymin), (xmax, ymax)); its side is the longer side of the extent
+    with `margin` of it on either side.
+    """
+    (x0, y0), (x1, y1) = ((float(a), float(b)) for a, b in extent)
+    side = max(x1 - x0, y1 - y0) * (1.0 + 2.0 * margin)
+    return np.asarray([0.5 * (x0 + x1 - side), 0.5 * (y0 + y1 - side)]), side / pixels
+
+
+def pixel_center(ix: int, iy: int, corner, size: float) -> tuple[float, float]:
+    """World position [m] of the centre of pixel (ix, iy); x along the first axis."""
+    return corner[0] + (ix + 0.5) * size, corner[1] + (iy + 0.5) * size
+
+
+def nearest_pixel(point, corner, size: float) -> tuple[int, int]:
+    """The pixel whose centre is nearest to a world point."""
+    return math.floor((float(point[0]) - corner[0]) / size), math.floor((float(point[1]) - corner[1]) / size)
+
+
+def pixel_margin(point, corner, size: float) -> float:
+    """Distance of a point to the nearest edge of its pixel [pixels]: tiny, and it may fall either way."""
+    gaps = []
+    for axis in range(2):
+        t = (float(point[axis]) - corner[axis]) / size
+        gaps.append(abs(t - round(t)))
+    return min(gaps)
+
+
+def shown_points(points, reach, corner, size: float, pixels: int = PIXELS) -> dict[tuple[int, int], list]:
+    """Which points each pixel shows: those whose nearest pixel centre it is; where there are none, the
+    nearest point whose `reach` (n,) [m] extends to the pixel's centre (no holes between points)."""
+    shown: dict[tuple[int, int], list[int]] = {}
+    for index, point in enumerate(points):
+        shown.setdefault(nearest_pixel(point, corner, size), []).append(index)
+    for ix in range(pixels):
+        for iy in range(pixels):
+            if (ix, iy) in shown:
+                continue
+            x, y = pixel_center(ix, iy, corner, size)
+            best, gap = -1, math.inf
+            for index, point in enumerate(points):
+                away = math.hypot(float(point[0]) - x, float(point[1]) - y)
+                if away <= reach[index] and away < gap:
+                    best, gap = index, away
+            if best >= 0:
+                shown[ix, iy] = [best]
+    return shown
+
+
+def footprint(state, length: float, width: float, corner, size: float, pixels: int = PIXELS) -> np.ndarray:
+    """Bool (pixels, pixels): pixels whose centre lies in the body."""
+    drawn = np.zeros((pixels, pixels), bool)
+    for ix in range(pixels):
+        for iy in range(pixels):
+            inside = point_to_body(pixel_center(ix, iy, corner, size), state, length, width) <= 0.0
+            drawn[ix, iy] = inside
+    return drawn
+
+
+def fade(age: int) -> float:
+    """Grey value of a trajectory pixel last visited `age` local steps ago."""
+    return 255.0 * 0.99**age

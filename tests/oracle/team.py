@@ -1,0 +1,95 @@
+"""Maps of the robots and of the team (design 4.2), reward and end of an episode (4.5), by counting."""
+
+import math
+
+import numpy as np
+
+
+def merge_maps(seen, comm) -> np.ndarray:
+    """(E, N, n) bool: what each robot knows after hearing once: its own flags and those of each j it hears.
+
+    seen (E, N, n), comm (E, N, N) bool; comm[e, i, j]: i hears j. A robot always has its own.
+    One exchange: what j heard from others in the same step does not travel on.
+    """
+    seen, comm = np.asarray(seen, bool), np.asarray(comm, bool)
+    known = np.zeros_like(seen)
+    for e in range(seen.shape[0]):
+        for i in range(seen.shape[1]):
+            for j in range(seen.shape[1]):
+                if i == j or comm[e, i, j]:
+                    for p in range(seen.shape[2]):
+                        if seen[e, j, p]:
+                            known[e, i, p] = True
+    return known
+
+
+def area_weights(spacing) -> np.ndarray:
+    """Weight of each free point: spacing squared [m^2]."""
+    return np.asarray([float(s) ** 2 for s in spacing])
+
+
+def coverage(seen, weights) -> float:
+    """Seen area of the team / all area; seen (N, n) bool."""
+    covered = math.fsum(weights[p] for p in range(len(weights)) if any(row[p] for row in seen))
+    return covered / math.fsum(weights)
+
+
+def counts(seen_before, visible, weights) -> tuple[np.ndarray, np.ndarray]:
+    """`(new, overlap)` (N,): weight that i sees now and the team never had; that i and another see now."""
+    robots, points = np.shape(visible)
+    new, overlap = np.zeros(robots), np.zeros(robots)
+    for i in range(robots):
+        for p in range(points):
+            if visible[i][p]:
+                if not any(seen_before[j][p] for j in range(robots)):
+                    new[i] += weights[p]
+                if any(visible[j][p] for j in range(robots) if j != i):
+                    overlap[i] += weights[p]
+    return new, overlap
+
+
+def mutual_overlap(seen, weights) -> float:
+    """Weight of the points seen by two or more robots / weight of the points seen; 0 when nothing is seen."""
+    times = [sum(bool(row[p]) for row in seen) for p in range(len(weights))]
+    total = math.fsum(w for w, t in zip(weights, times, strict=True) if t >= 1)
+    return math.fsum(w for w, t in zip(weights, times, strict=True) if t >= 2) / total if total else 0.0
+
+
+def reward_terms(
+    new,
+    overlap,
+    coverage_before: float,
+    succeeded: bool,
+    collided_now,
+    num_free: float,
+    *,
+    explore: float = 0.3,
+    overlap_weight: float = 0.01,
+    success: float = 100.0,
+    collision: float = 200.0,
+    paper: bool = False,
+) -> dict[str, np.ndarray]:
+    """The terms of one local step, each (N,), signed and weighted as they enter the reward (design 4.5).
+
+    succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step.
+    """
+    w = 60.0 / num_free
+    v = w if paper else 60.0 / 7000.0
+    robots = len(new)
+    return {
+        "explore": np.asarray([w * explore * new[i] for i in range(robots)]),
+        "overlap": np.asarray([-w * overlap_weight * overlap[i] for i in range(robots)]),
+        "time": np.asarray([-v * (1.0 - coverage_before)] * robots),
+        "success": np.asarray([v * success * bool(succeeded)] * robots),
+        "collision": np.asarray([-v * collision * bool(collided_now[i]) for i in range(robots)]),
+    }
+
+
+def terminated(coverage_now: float, collided, success_coverage: float = 0.95) -> bool:
+    """Coverage reached, or no robot left."""
+    return coverage_now >= success_coverage or all(bool(c) for c in collided)
+
+
+def truncated(macro_step: int, macro_steps: int) -> bool:
+    """Out of macro steps."""
+    return macro_step >= macro_steps
