@@ -29,8 +29,8 @@ def add_rows(picture: Tensor) -> Tensor:
 def region_centres(pose: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     """Where the regions' centres lie in the picture, in [-1, 1] along each axis.
 
-    The observation gives each region's offset from the robot in units of the picture's half side, and the
-    robot's position in the same units.
+    The observation gives the robot's position in half sides of the picture and each region's offset from
+    the robot in sides (`kernels/observe.py`).
 
     Args:
         pose: shape [batch, 4]
@@ -39,7 +39,7 @@ def region_centres(pose: Tensor, grid: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         centres along x and along y, each of shape [batch, L]
     """
-    return pose[:, 0, None] + grid[:, 0, :, 0], pose[:, 1, None] + grid[:, 1, 0, :]
+    return pose[:, 0, None] + 2 * grid[:, 0, :, 0], pose[:, 1, None] + 2 * grid[:, 1, 0, :]
 
 
 def resampling(centres: Tensor, first: float, step: float, cells: int) -> Tensor:
@@ -75,14 +75,16 @@ def resample(cells: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
 
 
 def grid_inputs(pose: Tensor, grid: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
-    """What each region is told about its robot: offsets and distances to it and to its last goal, the pose,
-    and where the region lies. Shape [batch, L * L, 12]."""
+    """What each region is told about its robot: offsets and distances to it and to its last goal, the pose
+    with its heading as sine and cosine, and where the region lies. Shape [batch, L * L, 13]."""
     side = grid.shape[-1]
     distances = [grid[:, start : start + 2].square().sum(1, keepdim=True).sqrt() for start in (0, 2)]
     place = torch.stack(
         (along_x[:, :, None].expand(-1, -1, side), along_y[:, None, :].expand(-1, side, -1)), dim=1
     )
     cells = torch.cat((grid, *distances, place), dim=1).flatten(2).transpose(1, 2)
+    heading = pose[:, 3:] * torch.pi
+    pose = torch.cat((pose[:, :3], heading.sin(), heading.cos()), dim=-1)
     return torch.cat((cells, pose.unsqueeze(1).expand(-1, side * side, -1)), dim=-1)
 
 
@@ -112,7 +114,7 @@ class CellEncoder(nn.Module):
             nn.Conv2d(inputs, width, 3, stride=2, padding=1), nn.ReLU(),
             nn.Conv2d(width, width, 3, stride=2, padding=1), nn.ReLU(),
         )  # fmt: skip
-        self.grid = nn.Sequential(nn.Linear(12, config.grid_features), nn.ReLU())
+        self.grid = nn.Sequential(nn.Linear(13, config.grid_features), nn.ReLU())
 
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
         """Encode each robot's observation once.

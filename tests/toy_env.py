@@ -97,7 +97,7 @@ class ToyEnv(EnvBase):
         pose[..., 0] = torch.linspace(-0.5, 0.5, self.num_robots)
         line = (torch.arange(self.side) * 2 + 1) / self.side - 1
         place = torch.stack(torch.meshgrid(line, line, indexing="ij"))
-        offsets = place - pose[..., :2, None, None]
+        offsets = (place - pose[..., :2, None, None]) / 2
         maps = torch.stack((picture, picture // 2, torch.zeros_like(picture), torch.zeros_like(picture)), dim=2)
         return TensorDict(
             {

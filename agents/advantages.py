@@ -1,0 +1,82 @@
+"""Generalised advantages for teams: per robot, or one for the whole team, from one look at each state."""
+
+import torch
+from maexp.agents.actor import COMM, GRID, MAP, POSE
+from maexp.agents.critics import TEAM_VALUE, VALUE
+from tensordict import TensorDictBase
+from torchrl.objectives.value import GAE, MultiAgentGAE
+
+REWARD = ("agents", "reward")
+ADVANTAGE = ("agents", "advantage")
+TARGET = ("agents", "value_target")
+TEAM_TARGET = ("team", "value_target")
+
+
+class TeamGAE(GAE):
+    """GAE of the team's value on the sum of the robots' rewards, given to every robot as its advantage.
+
+    The advantage is written per robot, [*, T, robots, 1]: with one of shape [*, T, 1] TorchRL's losses would
+    form the probability ratio of the joint action without a word.
+    """
+
+    def _prepare_signals(self, reward, done, terminated, value):
+        return reward.sum(-2), done, terminated
+
+    def forward(self, tensordict: TensorDictBase, **kwargs) -> TensorDictBase:
+        tensordict = super().forward(tensordict, **kwargs)
+        key = self.tensor_keys.advantage
+        robots = tensordict.get(("next", self.tensor_keys.reward)).shape[-2]
+        advantage = tensordict.get(key).unsqueeze(-2)
+        return tensordict.set(key, advantage.expand(*advantage.shape[:-2], robots, 1))
+
+
+def estimator_for(loss, gamma: float, lmbda: float, critic) -> GAE:
+    """The estimator that fits a loss: TeamGAE where its critic values the team, else MultiAgentGAE.
+
+    Args:
+        loss: names the keys
+        gamma: discount per macro step
+        lmbda: trace decay
+        critic: network to call, or None to read the values from the batch
+    """
+    kind = TeamGAE if loss.team_value else MultiAgentGAE
+    estimator = kind(gamma=gamma, lmbda=lmbda, value_network=critic, deactivate_vmap=True)
+    names = ("advantage", "value", "value_target", "reward")
+    estimator.set_keys(**{name: getattr(loss.tensor_keys, name) for name in names})
+    return estimator
+
+
+@torch.no_grad()
+def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDictBase:
+    """Write values, advantages and value targets into a Collector batch.
+
+    The state after step t is the state before step t + 1 unless the episode ended there, so each state is
+    valued once; only truncated ends and the last step need another look. (TorchRL values every state twice.)
+
+    Args:
+        loss: holds the critic and the discount
+        batch: shape [envs, T] with "next"
+        chunk: team steps valued at a time; bounds the memory
+
+    Returns:
+        the batch itself
+    """
+    team = loss.team_value
+    key = TEAM_VALUE if team else VALUE
+
+    def values(states: TensorDictBase) -> torch.Tensor:
+        with loss.critic_network_params.to_module(loss.critic_network):
+            return torch.cat([loss.critic_network(part.copy()).get(key) for part in states.split(chunk)])
+
+    inputs = (MAP, POSE, GRID, COMM)
+    value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
+    done, terminated = (batch["next", name].squeeze(-1) for name in ("done", "terminated"))
+    ends = done.clone()
+    ends[:, -1] = True
+    ends &= ~terminated  # what follows a termination is worth 0 and never read
+    following = torch.cat((value[:, 1:], torch.zeros_like(value[:, :1])), dim=1)
+    if ends.any():
+        following[ends] = values(batch["next"].select(*inputs)[ends])
+    batch.set(key, value)
+    batch.set(("next", *key), following)
+    return loss.bare_estimator(batch)

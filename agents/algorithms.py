@@ -1,0 +1,234 @@
+"""The six algorithms: for each its loss, critic, updater and settings. An algorithm is only its difference."""
+
+from dataclasses import dataclass, fields, replace
+
+from maexp.agents import losses
+from maexp.agents.critics import build_critic
+from maexp.agents.model import ModelConfig
+from maexp.agents.updaters import GradientUpdater, TrustRegionUpdater, Updater
+from torchrl.modules import PopArtValueNorm
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings that all algorithms share. A team step is one macro step of one team.
+
+    Attributes:
+        gamma: discount per macro step
+        lmbda: trace decay of the generalised advantages
+        lr: learning rate of the policy
+        critic_lr: learning rate of the critic
+        final_lr_share: both decay linearly to this share at the end of the training
+        entropy_coeff: weight of the summed entropy of the action's heads
+        critic_coeff: weight of the critic's loss
+        value_norm: measure the critic's error in units of the returns' running spread
+        normalize_advantage: standardise advantages per minibatch
+        minibatch_size: team steps per gradient step
+        max_grad_norm: bound on the gradient of the policy, and on the critic's
+    """
+
+    gamma: float = 0.99
+    lmbda: float = 0.95
+    lr: float = 7e-4
+    critic_lr: float = 1e-3
+    final_lr_share: float = 1.0
+    entropy_coeff: float = 3e-3
+    critic_coeff: float = 1.0
+    value_norm: bool = True
+    normalize_advantage: bool = True
+    minibatch_size: int = 128
+    max_grad_norm: float = 1.0
+
+    def loss_arguments(self) -> dict:
+        """What the loss's constructor takes from these settings."""
+        names = ("entropy_coeff", "critic_coeff", "normalize_advantage")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True)
+class ClippedSettings(Settings):
+    """Settings of the clipped algorithms.
+
+    Attributes:
+        epochs: passes over each batch
+        clip_epsilon: bound on each robot's probability ratio
+        clip_value: bound on the change of a value, in the critic's units; 0 for none
+        kl_coeff: first weight of the penalty on the divergence; 0 for none
+        kl_target: divergence at which that weight stays
+    """
+
+    epochs: int = 3
+    clip_epsilon: float = 0.2
+    clip_value: float = 0.0
+    kl_coeff: float = 0.0
+    kl_target: float = 0.01
+
+    def loss_arguments(self) -> dict:
+        names = ("clip_epsilon", "kl_coeff", "kl_target")
+        own = {name: getattr(self, name) for name in names}
+        return super().loss_arguments() | own | {"clip_value": self.clip_value or None}
+
+
+@dataclass(frozen=True)
+class MixedClippedSettings(ClippedSettings):
+    """ClippedSettings and the `mixer` that makes the team's value: vdn or qmix."""
+
+    mixer: str = "qmix"
+
+
+@dataclass(frozen=True)
+class TrustRegionSettings(Settings):
+    """Settings of the trust-region algorithms.
+
+    Attributes:
+        max_kl: bound on the mean divergence of a policy step
+        accept_ratio: least share of the promised improvement
+        damping: added to the Fisher matrix's diagonal
+        cg_steps: conjugate-gradient steps
+        backtracks: lengths tried
+        backtrack_factor: each over the one before
+        policy_minibatch_size: team steps per policy step
+        fisher_size: team steps of these that make the Fisher matrix
+        critic_epochs: passes of the critic over each batch
+    """
+
+    max_kl: float = 0.03
+    accept_ratio: float = 0.1
+    damping: float = 0.1
+    cg_steps: int = 10
+    backtracks: int = 15
+    backtrack_factor: float = 0.8
+    policy_minibatch_size: int = 512
+    fisher_size: int = 128
+    critic_epochs: int = 3
+
+
+@dataclass(frozen=True)
+class ActorCriticSettings(Settings):
+    """Settings of advantage actor-critic: one pass, for its gradient is that of the acting policy.
+
+    Attributes:
+        epochs: passes over each batch
+        mixer: how the robots' values make the team's, vdn or qmix
+    """
+
+    epochs: int = 1
+    mixer: str = "qmix"
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One row of the table.
+
+    Attributes:
+        name: as on the command line
+        critic: local, team or mixed (`critics.py`)
+        loss: class of the loss
+        updater: class of the updater
+        settings: defaults
+        reference: the settings of the original platform
+    """
+
+    name: str
+    critic: str
+    loss: type
+    updater: type[Updater]
+    settings: Settings
+    reference: Settings
+
+    def configure(self, preset: str = "default", **overrides) -> Settings:
+        """The settings of a preset ("default" or "reference") with some replaced.
+
+        Raises:
+            ValueError: unknown preset or setting.
+        """
+        presets = {"default": self.settings, "reference": self.reference}
+        if preset not in presets:
+            raise ValueError(f"algorithm.preset={preset!r} is unknown; choose default or reference.")
+        known = [field.name for field in fields(self.settings)]
+        unknown = [name for name in overrides if name not in known]
+        if unknown:
+            raise ValueError(f"{self.name} has no setting {unknown[0]!r}; choose one of {', '.join(known)}.")
+        return replace(presets[preset], **overrides)
+
+    def make_critic(self, env, model: "str | ModelConfig", settings: Settings | None = None):
+        """The critic of this algorithm for the specs of `env`."""
+        mixer = getattr(settings or self.settings, "mixer", "qmix")
+        return build_critic(self.critic, env, model, mixer)
+
+    def make_loss(self, policy, critic, settings: Settings | None = None):
+        """The loss for a policy and critic, with its estimator of advantages."""
+        settings = settings or self.settings
+        loss = self.loss(policy, critic, **settings.loss_arguments())
+        loss.value_norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
+        loss.setup(settings.gamma, settings.lmbda)
+        return loss.to(next(policy.parameters()).device)
+
+    def make_updater(self, loss, settings: Settings | None = None) -> Updater:
+        """The updater that trains the networks behind `loss`."""
+        return self.updater(loss, settings or self.settings)
+
+
+def _reference(settings: Settings, **others) -> Settings:
+    """The original platform's settings (MARLlib's), where they differ from `settings`."""
+    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False)
+    return replace(settings, **shared, **others)
+
+
+_CLIPPED = dict(lr=1e-4, critic_lr=1e-4, epochs=2, clip_value=10.0, kl_coeff=0.2)
+_TRUST = dict(max_kl=0.06, accept_ratio=0.5, max_grad_norm=10.0)
+
+
+def _row(name: str, critic: str, loss: type, updater: type[Updater], settings: Settings, **reference) -> Algorithm:
+    return Algorithm(name, critic, loss, updater, settings, _reference(settings, **reference))
+
+
+ALGORITHMS = {
+    row.name: row
+    for row in (
+        _row("ippo", "local", losses.IPPO, GradientUpdater, ClippedSettings(), **_CLIPPED),
+        _row("mappo", "team", losses.MAPPO, GradientUpdater, ClippedSettings(), **_CLIPPED),
+        _row("itrpo", "local", losses.TRPOLoss, TrustRegionUpdater, TrustRegionSettings(), **_TRUST),
+        _row("matrpo", "team", losses.TRPOLoss, TrustRegionUpdater, TrustRegionSettings(), **_TRUST),
+        _row("vdppo", "mixed", losses.VDPPO, GradientUpdater, MixedClippedSettings(), **_CLIPPED),
+        _row("vda2c", "mixed", losses.VDA2C, GradientUpdater, ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
+    )
+}
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The row of the table.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    if name not in ALGORITHMS:
+        raise ValueError(f"algorithm={name!r} is unknown; choose one of {', '.join(ALGORITHMS)}.")
+    return ALGORITHMS[name]
+
+
+def make_critic(algorithm: str, env, model: "str | ModelConfig" = "small", **settings):
+    """The critic that an algorithm trains, writing ("agents", "state_value") [*, robots, 1].
+
+    Args:
+        algorithm: a name of the table
+        env: gives the specs and the device; not kept
+        model: a preset's name or a ModelConfig
+        settings: of the algorithm; only `mixer` matters here
+    """
+    row = find_algorithm(algorithm)
+    return row.make_critic(env, model, row.configure(**settings))
+
+
+def make_loss(algorithm: str, policy, critic, preset: str = "default", **settings):
+    """A TorchRL LossModule fed by one Collector batch [envs, T]; estimates advantages that are absent.
+
+    Args:
+        algorithm: a name of the table
+        policy: from make_policy
+        critic: from make_critic with the same name
+        preset: default or reference
+        settings: replace the preset's
+    """
+    row = find_algorithm(algorithm)
+    return row.make_loss(policy, critic, row.configure(preset, **settings))

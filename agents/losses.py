@@ -1,0 +1,183 @@
+"""The losses of the six algorithms: TorchRL's, each with only what our teams need to differ.
+
+All read a Collector batch [envs, T], or its flattened team steps once advantages are in it. They keep robots
+apart (one probability ratio per robot, over its two heads) and write loss_objective, loss_entropy,
+loss_critic (and loss_kl), plus what one likes to log.
+"""
+
+import torch
+from maexp.agents.actor import PARAM_NAMES, PARAMS
+from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
+from maexp.agents.critics import TEAM_VALUE, VALUE
+from tensordict import TensorDictBase
+from tensordict.nn import CompositeDistribution, set_composite_lp_aggregate
+from torch import Tensor
+from torch.distributions import kl_divergence
+from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
+from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
+from torchrl.objectives.utils import distance_loss
+
+
+def policy_divergence(batch: TensorDictBase, dist: CompositeDistribution) -> Tensor:
+    """KL(policy that acted || dist), summed over the heads, shape [*, robots].
+
+    Raises:
+        KeyError: the batch holds no ("agents", "params") of the policy that acted.
+    """
+    total = 0.0
+    for name, new in dist.dists.items():
+        kind = type(new)
+        params = {key: batch.get((*PARAMS, name[-1], key)) for key in PARAM_NAMES[kind]}
+        if any(value is None for value in params.values()):
+            raise KeyError(f"The batch lacks {(*PARAMS, name[-1])}; keep what the policy wrote while it acted.")
+        total = total + kl_divergence(kind(**params, validate_args=False), new)
+    return total
+
+
+class RobotValues:
+    """A value per robot: keys and estimator of a loss with a local or a team critic."""
+
+    team_value = False
+
+    def setup(self, gamma: float, lmbda: float) -> None:
+        """Name the keys and build the estimators; the bare one is told the values instead of the network."""
+        self.set_keys(
+            advantage=ADVANTAGE,
+            value_target=TEAM_TARGET if self.team_value else TARGET,
+            value=TEAM_VALUE if self.team_value else VALUE,
+            reward=REWARD,
+        )
+        self.make_value_estimator(estimator_for(self, gamma, lmbda, self.critic_network))
+        self.__dict__["bare_estimator"] = estimator_for(self, gamma, lmbda, None)
+
+
+class TeamValues(RobotValues):
+    """One value for the team, from a mixed critic; every robot gets the team's advantage."""
+
+    team_value = True
+
+
+class KLPenalty:
+    """Adds `loss_kl` = kl_coeff * KL(acting policy || policy) to a PPO loss; kl_coeff 0 leaves it out."""
+
+    def __init__(self, *args, kl_coeff: float = 0.0, kl_target: float = 0.01, **settings):
+        super().__init__(*args, **settings)
+        self.register_buffer("kl_coeff", torch.tensor(float(kl_coeff)))
+        self.kl_target = kl_target
+
+    def _log_weight(self, tensordict, adv_shape):
+        terms = super()._log_weight(tensordict, adv_shape)
+        self.__dict__["_divergence"] = policy_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
+        return terms
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = super().forward(tensordict)
+        if self._divergence is not None:
+            terms.set("loss_kl", self.kl_coeff * self._divergence.mean())
+        return terms
+
+    def adapt_penalty(self, divergence: float) -> None:
+        """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""
+        if divergence > 2 * self.kl_target:
+            self.kl_coeff.mul_(1.5)
+        elif divergence < 0.5 * self.kl_target:
+            self.kl_coeff.mul_(0.5)
+
+
+class IPPO(RobotValues, KLPenalty, IPPOLoss):
+    """TorchRL's IPPO with the optional KL penalty."""
+
+
+class MAPPO(RobotValues, KLPenalty, MAPPOLoss):
+    """TorchRL's MAPPO with the optional KL penalty."""
+
+
+class VDPPO(TeamValues, KLPenalty, MAPPOLoss):
+    """Clipped policy steps on the advantage of the mixed team value (Ma et al. 2022)."""
+
+
+class NormalisedValues:
+    """Critic error in units of the returns' running spread, as TorchRL's MAPPO has it."""
+
+    value_norm = None
+
+    def _critic_loss_inputs(self, target: Tensor, value: Tensor, old: Tensor | None):
+        norm = self.value_norm
+        if norm is None:
+            return target, value, old
+        norm.update(target)
+        return norm.normalize(target), norm.normalize(value), None if old is None else norm.normalize(old)
+
+
+class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
+    """Unclipped surrogate with its divergence from the acting policy, for a trust-region step.
+
+    `surrogate` gives the two terms a trust-region step needs; `forward` adds the critic's, so that any loop
+    may use the loss.
+    """
+
+    default_value_estimator = ValueEstimators.MAGAE
+
+    def surrogate(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Mean loss to lower (objective and entropy bonus) and mean divergence, each a scalar with its graph."""
+        advantage = batch.get(self.tensor_keys.advantage)
+        advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
+        log_weight, dist, _, _ = self._log_weight(batch, adv_shape=advantage.shape[:-1])
+        entropy = self._weighted_loss_entropy(self._get_entropy(dist, adv_shape=advantage.shape[:-1]))
+        loss = (entropy - log_weight.exp() * advantage).mean()
+        return loss, policy_divergence(batch, dist).mean()
+
+    def divergence(self, batch: TensorDictBase) -> Tensor:
+        """Mean divergence from the acting policy, a scalar with its graph."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+        return policy_divergence(batch, dist).mean()
+
+
+class VDA2C(TeamValues, NormalisedValues, A2CLoss):
+    """Advantage actor-critic on the mixed team value (Su et al. 2021), for actions of two heads."""
+
+    def __init__(self, *args, normalize_advantage: bool = True, **settings):
+        super().__init__(*args, **settings)
+        self.normalize_advantage = normalize_advantage
+
+    @property
+    def in_keys(self) -> list:
+        """A2CLoss expects one action key; here each head has its own."""
+        ends = [("next", self.tensor_keys.reward), ("next", "done"), ("next", "terminated")]
+        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys}
+        following = [("next", *key) for key in self.critic_network.in_keys]
+        return [*self.tensor_keys.action, *ends, *seen, *following]
+
+    def get_entropy_bonus(self, dist: CompositeDistribution) -> Tensor:
+        return sum(head.entropy() for head in dist.dists.values()).unsqueeze(-1)
+
+    @set_composite_lp_aggregate(False)
+    def _log_probs(self, tensordict: TensorDictBase):
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            dist = self.actor_network.get_dist(tensordict.select(*self.actor_network.in_keys))
+        log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
+        with torch.no_grad():
+            self.__dict__["_divergence"] = policy_divergence(tensordict, dist).mean()
+        return sum(log_probs.values(True, True)).unsqueeze(-1), dist
+
+    def loss_critic(self, tensordict: TensorDictBase):
+        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+            value = self.critic_network(tensordict.select(*self.critic_network.in_keys))
+        target = tensordict.get(self.tensor_keys.value_target)
+        target, value, _ = self._critic_loss_inputs(target, value.get(self.tensor_keys.value), None)
+        return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.copy()
+        if self.tensor_keys.advantage not in tensordict.keys(True):
+            self.value_estimator(
+                tensordict,
+                params=self.critic_network_params.detach(),
+                target_params=self.target_critic_network_params,
+            )
+        advantage = tensordict.get(self.tensor_keys.advantage)
+        if self.normalize_advantage:
+            advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
+        tensordict.set(self.tensor_keys.advantage, advantage)
+        return super().forward(tensordict).set("kl", self._divergence)

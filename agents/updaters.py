@@ -1,0 +1,235 @@
+"""Updaters: turn Collector batches into better networks, one call a batch.
+
+An updater estimates advantages, then takes its policy and critic steps on minibatches of team steps. It
+holds the optimizers; its state_dict continues a run bit for bit.
+"""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+
+import torch
+from maexp.agents.actor import PARAMS
+from maexp.agents.advantages import write_advantages
+from maexp.agents.trust_region import TRPO
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
+QUIET = ("composite_entropy", "max_ratio", "mean_ratio", "value_clip_fraction")
+
+
+class NonFiniteLoss(ArithmeticError):
+    """A loss term or gradient is NaN or infinite; the message names it."""
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """Raise NonFiniteLoss if `value` holds a NaN or an infinity."""
+    if not torch.isfinite(value).all():
+        raise NonFiniteLoss(
+            f"{name} became {value.detach().sum().item()}; lower lr or max_grad_norm, or look for such values in "
+            "the rewards and observations."
+        )
+
+
+class Meter:
+    """Means of what is logged over an update."""
+
+    def __init__(self):
+        self.sums = defaultdict(float)
+        self.counts = defaultdict(int)
+
+    def add(self, values: dict[str, float]) -> None:
+        for name, value in values.items():
+            self.sums[name] += value
+            self.counts[name] += 1
+
+    def means(self) -> dict[str, float]:
+        return {name: total / self.counts[name] for name, total in self.sums.items()}
+
+
+class Updater:
+    """What all updaters share: advantages, minibatches, the critic's optimizer, saving.
+
+    Args:
+        loss: made by make_loss
+        settings: the algorithm's settings
+    """
+
+    def __init__(self, loss, settings):
+        self.loss = loss
+        self.settings = settings
+        self.policy_params = [p for p in loss.actor_network_params.parameters()]
+        self.critic_params = [p for p in loss.critic_network_params.parameters()]
+        self.critic_optimizer = torch.optim.Adam(self.critic_params, lr=settings.critic_lr, eps=1e-5)
+        self.policy_optimizer = self.make_policy_optimizer()
+
+    def make_policy_optimizer(self) -> torch.optim.Optimizer:
+        """Adam for gradient steps; a trust region has its own."""
+        return torch.optim.Adam(self.policy_params, lr=self.settings.lr, eps=1e-5)
+
+    def update(self, *batches: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
+        """Learn from Collector batches of shape [envs, T]; several for teams of several sizes.
+
+        The losses of teams of different sizes are averaged, each batch counting alike.
+
+        Args:
+            batches: with "next" and all that the policy wrote
+            progress: share of the training done, for settings that decay
+
+        Returns:
+            means of what the algorithm logs, and the seconds of its two stages, "advantage" and "update"
+
+        Raises:
+            NonFiniteLoss: a term became NaN or infinite; the message names it
+        """
+        begin = time.perf_counter()
+        self.set_progress(progress)
+        steps = [self.prepare(batch) for batch in batches]
+        between = time.perf_counter()
+        meter = Meter()
+        self.learn(steps, meter)
+        timings = {"advantage": between - begin, "update": time.perf_counter() - between}
+        return meter.means() | timings
+
+    def set_progress(self, progress: float) -> None:
+        """Lower the learning rates linearly to `final_lr_share` at the end of the training."""
+        share = 1 - (1 - self.settings.final_lr_share) * progress
+        for group in self.critic_optimizer.param_groups:
+            group["lr"] = self.settings.critic_lr * share
+        if not isinstance(self.policy_optimizer, TRPO):
+            for group in self.policy_optimizer.param_groups:
+                group["lr"] = self.settings.lr * share
+
+    def prepare(self, batch: TensorDictBase) -> TensorDictBase:
+        """Write advantages; return the team steps with what the losses read, flattened."""
+        batch = write_advantages(self.loss, batch.copy())
+        keys = self.loss.tensor_keys
+        needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys, PARAMS]
+        needed += [keys.advantage, keys.value_target, keys.value, *keys.action, *keys.sample_log_prob]
+        check_finite("the advantage", batch.get(keys.advantage))
+        return batch.select(*needed).flatten()
+
+    def minibatches(self, steps: list[TensorDictBase], size: int) -> Iterator[list[TensorDictBase]]:
+        """Random parts of every batch, together about `size` team steps, each step once."""
+        total = sum(part.shape[0] for part in steps)
+        count = min(max(1, round(total / size)), *(part.shape[0] for part in steps))
+        orders = [torch.randperm(part.shape[0]).tensor_split(count) for part in steps]
+        for chosen in zip(*orders, strict=True):
+            yield [part[index] for part, index in zip(steps, chosen, strict=True)]
+
+    def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
+        """Take the algorithm's optimisation steps."""
+        raise NotImplementedError
+
+    def clip(self, params: list[Tensor], name: str) -> float:
+        """Clip a group's gradients to `max_grad_norm`; returns the norm before."""
+        norm = torch.nn.utils.clip_grad_norm_(params, self.settings.max_grad_norm)
+        check_finite(f"the {name}'s gradient", norm)
+        return norm.item()
+
+    def state_dict(self) -> dict:
+        """Networks, running statistics and optimizers."""
+        return {
+            "loss": self.loss.state_dict(),
+            "policy_optimizer": self.policy_optimizer.state_dict(),
+            "critic_optimizer": self.critic_optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """Restore what state_dict gave; the policy and critic given to make_loss change with it."""
+        self.loss.load_state_dict(state["loss"])
+        self.policy_optimizer.load_state_dict(state["policy_optimizer"])
+        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+
+
+class GradientUpdater(Updater):
+    """Epochs of Adam on minibatches: clipped algorithms (several epochs) and A2C (one)."""
+
+    def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
+        for _ in range(self.settings.epochs):
+            for parts in self.minibatches(steps, self.settings.minibatch_size):
+                meter.add(self._step([self.loss(part) for part in parts]))
+        if getattr(self.loss, "kl_coeff", 0) > 0:
+            self.loss.adapt_penalty(meter.means()["kl"])
+
+    def _step(self, outputs: list[TensorDict]) -> dict[str, float]:
+        losses = {
+            name: sum(out[name] for out in outputs) / len(outputs)
+            for name in outputs[0].keys()
+            if name.startswith("loss_")
+        }
+        for name, value in losses.items():
+            check_finite(name, value)
+        self.policy_optimizer.zero_grad()
+        self.critic_optimizer.zero_grad()
+        sum(losses.values()).backward()
+        norms = {
+            "gradient_norm": self.clip(self.policy_params, "policy"),
+            "critic_gradient_norm": self.clip(self.critic_params, "critic"),
+        }
+        self.policy_optimizer.step()
+        self.critic_optimizer.step()
+        return summary(outputs) | norms
+
+
+class TrustRegionUpdater(Updater):
+    """Constrained policy steps, each on its own part of the batch, then epochs of Adam for the critic."""
+
+    def make_policy_optimizer(self) -> TRPO:
+        names = ("max_kl", "accept_ratio", "damping", "cg_steps", "backtracks", "backtrack_factor")
+        return TRPO(self.policy_params, **{name: getattr(self.settings, name) for name in names})
+
+    def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
+        for number, parts in enumerate(self.minibatches(steps, self.settings.policy_minibatch_size)):
+            if number:
+                self._act_again(parts)
+            meter.add(self.policy_optimizer.step(*self._closures(parts)))
+        for _ in range(self.settings.critic_epochs):
+            for parts in self.minibatches(steps, self.settings.minibatch_size):
+                meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))
+
+    @torch.no_grad()
+    def _act_again(self, parts: list[TensorDictBase]) -> None:
+        """Measure the next step's divergence from the policy as it now is, not from the one that acted."""
+        actor = self.loss.actor_network
+        for part in parts:
+            with self.loss.actor_network_params.to_module(actor):
+                part.update(actor.get_dist_params(part.select(*actor.in_keys)).select(PARAMS))
+
+    def _closures(self, parts: list[TensorDictBase]):
+        """Loss and divergence on all of `parts`; divergence alone on the few states of the Fisher matrix."""
+        total = sum(part.shape[0] for part in parts)
+        share = min(1.0, self.settings.fisher_size / total)
+        few = [part[: max(1, round(share * part.shape[0]))] for part in parts]
+
+        def closure() -> tuple[Tensor, Tensor]:
+            losses, divergences = zip(*(self.loss.surrogate(part) for part in parts), strict=True)
+            loss = sum(losses) / len(parts)
+            if torch.is_grad_enabled():
+                check_finite("loss_objective", loss)
+            return loss, sum(divergences) / len(parts)
+
+        def fisher_closure() -> Tensor:
+            return sum(self.loss.divergence(part) for part in few) / len(few)
+
+        return closure, fisher_closure
+
+    def _step_critic(self, terms: list[tuple]) -> dict[str, float]:
+        loss = sum(term[0].mean() for term in terms) / len(terms)
+        check_finite("loss_critic", loss)
+        self.critic_optimizer.zero_grad()
+        loss.backward()
+        norm = self.clip(self.critic_params, "critic")
+        self.critic_optimizer.step()
+        variance = sum(term[2].mean().item() for term in terms) / len(terms)
+        return {"loss_critic": loss.item(), "critic_gradient_norm": norm, "explained_variance": variance}
+
+
+def summary(outputs: list[TensorDict]) -> dict[str, float]:
+    """What a loss reports, averaged over the batches, under the names all algorithms share."""
+    names = [name for name in outputs[0].keys() if name not in QUIET]
+    return {
+        LOG_NAMES.get(name, name): sum(out[name].float().mean().item() for out in outputs) / len(outputs)
+        for name in names
+    }
