@@ -4,8 +4,8 @@ Cells are numbered ``cell = iy * width + ix``. A step to a straight neighbour we
 (chamfer weights: 8 % from Euclid at worst), and a diagonal step needs both straight cells beside it passable
 (no cutting of corners). Distances are integers, so every run and every device gives the same bits.
 
-The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance, so
-what steps of weight 10 add to one queue is ordered too, and likewise what steps of weight 14 add to the other.
+The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance,
+so what steps of weight 10 add to one queue is in order, and so is what steps of weight 14 add to the other.
 The nearer of the two heads is the next cell. A cell enters each queue at most once (a later step of the same
 weight is never shorter): queues as long as the grid never overflow.
 """

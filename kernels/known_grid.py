@@ -28,7 +28,7 @@ class NavGrids:
     cell_begin: wp.array(dtype=wp.int32)  # [M + 1], where a map's cells start in `stand_in`
     stand_in: wp.array(
         dtype=wp.int32
-    )  # cell whose state a cell takes: itself where it holds points; -1 = none
+    )  # cell whose state each takes, itself where it holds points; -1 = none
 
 
 @wp.func

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from maexp.kernels.frontier import FREE, UNKNOWN, frontier_cells, mark_frontier
+from maexp.kernels.frontier import FREE, OBSTACLE, frontier_cells, mark_frontier
 from oracle import grid as oracle
 from scipy import ndimage
 
@@ -20,7 +20,7 @@ def test_matches_scipy_and_oracle():
         unknown = ~free[b] & ~obstacle[b]
         want = free[b] & ~obstacle[b] & ndimage.binary_dilation(unknown)
         np.testing.assert_array_equal(got[b], want)
-        np.testing.assert_array_equal(got[b], oracle.frontiers(free[b] & ~obstacle[b], unknown))
+        np.testing.assert_array_equal(got[b], oracle.frontier_cells(free[b], obstacle[b]))
     assert got.any() and not got.all()
 
 
@@ -62,7 +62,7 @@ def test_mixed_grid_sizes():
     for row, g in enumerate(grid_of_row):
         cells = sizes[g][0] * sizes[g][1]
         part = known[row, :cells].reshape(sizes[g])
-        want = oracle.frontiers(part == FREE, part == UNKNOWN)
+        want = oracle.frontier_cells(part == FREE, part == OBSTACLE)
         np.testing.assert_array_equal(out.numpy()[row, :cells].reshape(sizes[g]), want)
         assert (out.numpy()[row, cells:] == 0).all()
 

@@ -1,5 +1,7 @@
 """Geodesic distances against scipy's Dijkstra and the plain-loop oracle."""
 
+from functools import partial
+
 import maexp.kernels.geodesic as geodesic
 import numpy as np
 import pytest
@@ -13,17 +15,11 @@ from scipy.sparse.csgraph import dijkstra
 pytestmark = pytest.mark.kernels
 
 
-def oracle_distance(passable: np.ndarray, sources) -> np.ndarray:
-    cells = [divmod(int(s), passable.shape[1]) for s in sources if s >= 0]
-    found = oracle.distances(passable, cells)
-    return np.where(found < 0, UNREACHED, found)
-
-
 def scipy_distance(passable: np.ndarray, sources: list[int]) -> np.ndarray:
     height, width = passable.shape
     rows, cols, weights = [], [], []
     for y, x in zip(*np.nonzero(passable), strict=True):
-        for v, u, weight in oracle.steps(passable, y, x):
+        for v, u, weight in oracle.neighbours(passable, y, x):
             rows.append(y * width + x)
             cols.append(v * width + u)
             weights.append(weight)
@@ -43,7 +39,7 @@ def test_matches_scipy_and_oracle_on_random_grids():
         got = geodesic_distance(torch.tensor(passable), torch.tensor(sources)).numpy()
         for b in range(5):
             np.testing.assert_array_equal(got[b], scipy_distance(passable[b], list(sources[b])))
-            np.testing.assert_array_equal(got[b], oracle_distance(passable[b], sources[b]))
+            np.testing.assert_array_equal(got[b], oracle.geodesic_distance(passable[b], sources[b]))
 
 
 def test_corners_are_not_cut():
@@ -111,22 +107,27 @@ def test_mixed_grid_sizes_and_early_stop():
     # Row 0 holds grid 1 of these lists, so that numbers of rows and grids differ.
     lists = (row_of_item, [1, 0], [5, 11], [13, 7])
     arrays = [wp.array(v, dtype=wp.int32, device="cpu") for v in lists]
-    search.launch(wp.array(passable, dtype=wp.uint8, device="cpu"), *arrays)
-    full = search.distance.numpy()
+    arguments = partial(wp.launch, device="cpu"), wp.array(passable, dtype=wp.uint8, device="cpu"), *arrays
+    search.search(*arguments)
+    full = search.distance.numpy().copy()
     for item, row in enumerate(row_of_item):
-        want = oracle_distance(grids[row], [starts[item]]).ravel()
+        want = oracle.geodesic_distance(grids[row], [starts[item]]).ravel()
         np.testing.assert_array_equal(full[item, : want.size], want)
         assert (full[item, want.size :] == UNREACHED).all()
     reached = [np.flatnonzero(row < UNREACHED) for row in full]
     stops = [int(cells[np.argsort(full[i, cells])[len(cells) // 2]]) for i, cells in enumerate(reached)]
     search.stop.assign(np.array(stops, np.int32))
-    search.launch(wp.array(passable, dtype=wp.uint8, device="cpu"), *arrays)
-    early = search.distance.numpy()
+    search.search(*arguments)
+    early = search.distance.numpy().copy()
     for item, stop in enumerate(stops):
         settled = full[item] <= full[item, stop]
         np.testing.assert_array_equal(early[item, settled], full[item, settled])
         assert (early[item, ~settled] > full[item, stop]).all()
         assert (early[item] == UNREACHED).sum() > (full[item] == UNREACHED).sum()
+    search.stop.assign(np.array([geodesic.SKIP, -1, geodesic.SKIP], np.int32))
+    search.search(*arguments)
+    np.testing.assert_array_equal(search.distance.numpy()[[0, 2]], early[[0, 2]])
+    np.testing.assert_array_equal(search.distance.numpy()[1], full[1])
 
 
 def test_large_open_grid_takes_less_than_the_promised_time():
@@ -142,4 +143,4 @@ def test_large_open_grid_takes_less_than_the_promised_time():
 
 
 def test_weights_are_the_documented_ones():
-    assert (geodesic.STRAIGHT, geodesic.DIAGONAL, geodesic.UNREACHED) == (10, 14, 2**30)
+    assert (geodesic.STRAIGHT, geodesic.DIAGONAL, geodesic.UNREACHED) == (10, 14, oracle.UNREACHED)

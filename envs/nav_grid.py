@@ -1,0 +1,92 @@
+"""Navigation grids of maps: a cell for every point, and what stands in for cells without one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import warp as wp
+from maexp.envs.map import PointCloudMap
+from maexp.kernels.known_grid import NavGrids
+from scipy.ndimage import distance_transform_edt
+
+
+@dataclass(frozen=True)
+class NavGrid:
+    """Regular grid over a map's extent; cell number = iy * width + ix.
+
+    Attributes:
+        origin: lower corner of cell (0, 0) [m]; points of a lattice lie at cell centres.
+        cell: edge length [m], the map's resolution.
+        width, height: cells along x and y.
+        free_cell: int32 [free_count], the cell of every free point.
+        boundary_cell: int32 [boundary_count], the cell of every boundary point.
+        stand_in: int32 [width * height], the cell whose state a cell takes: itself where it holds points, the
+            nearest cell that does where one is within the spacing of its points, else -1 (solid, outside).
+    """
+
+    origin: tuple[float, float]
+    cell: float
+    width: int
+    height: int
+    free_cell: np.ndarray
+    boundary_cell: np.ndarray
+    stand_in: np.ndarray
+
+    def reorder(self, free_order: np.ndarray, boundary_order: np.ndarray) -> NavGrid:
+        """The grid for points taken in another order (a bank sorts them): new point k is old `order[k]`."""
+        return replace(
+            self, free_cell=self.free_cell[free_order], boundary_cell=self.boundary_cell[boundary_order]
+        )
+
+
+def build_nav_grid(map: PointCloudMap) -> NavGrid:
+    """The navigation grid of a map: cells as large as its resolution, the extent's corner at a cell centre."""
+    cell = float(map.resolution)
+    (xmin, ymin), (xmax, ymax) = map.extent
+    origin = np.array([xmin, ymin]) - 0.5 * cell
+    width, height = (int(np.floor(side / cell + 0.5)) + 1 for side in (xmax - xmin, ymax - ymin))
+
+    def cell_of(points: np.ndarray) -> np.ndarray:
+        index = np.floor((points[:, :2].astype(np.float64) - origin) / cell).astype(np.int64)
+        index = np.clip(index, 0, [width - 1, height - 1])
+        return (index[:, 1] * width + index[:, 0]).astype(np.int32)
+
+    free_cell, boundary_cell = cell_of(map.free), cell_of(map.boundary)
+    spacing = np.zeros(width * height)
+    np.maximum.at(spacing, free_cell, map.free_spacing)
+    np.maximum.at(spacing, boundary_cell, map.boundary_spacing)
+    empty = (spacing == 0).reshape(height, width)
+    gap, nearest = distance_transform_edt(empty, return_indices=True)
+    nearest = (nearest[0] * width + nearest[1]).reshape(-1)
+    # 1.5 spacings: the distance at which an obstacle point still bounds a free one (design 4.1).
+    in_reach = gap.reshape(-1) * cell <= 1.5 * spacing[nearest]
+    return NavGrid(
+        origin=(float(origin[0]), float(origin[1])),
+        cell=cell,
+        width=width,
+        height=height,
+        free_cell=free_cell,
+        boundary_cell=boundary_cell,
+        stand_in=np.where(in_reach, nearest, -1).astype(np.int32),
+    )
+
+
+def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids, int]:
+    """Device arrays over several maps, and the cells of the largest (points in the order of `Maps`)."""
+    begin = np.cumsum([0] + [len(g.stand_in) for g in grids])
+    values = {
+        "origin": (np.array([g.origin for g in grids], np.float32), wp.vec2),
+        "cell": (np.array([g.cell for g in grids], np.float32), wp.float32),
+        "width": (np.array([g.width for g in grids], np.int32), wp.int32),
+        "height": (np.array([g.height for g in grids], np.int32), wp.int32),
+        "free_cell": (np.concatenate([g.free_cell for g in grids]), wp.int32),
+        "boundary_cell": (np.concatenate([g.boundary_cell for g in grids]), wp.int32),
+        "cell_begin": (begin.astype(np.int32), wp.int32),
+        "stand_in": (np.concatenate([g.stand_in for g in grids]), wp.int32),
+    }
+    stacked = NavGrids()
+    for name, (array, kind) in values.items():
+        setattr(stacked, name, wp.array(array, dtype=kind, device=str(torch.device(device))))
+    return stacked, int(np.diff(begin).max())
