@@ -1,0 +1,318 @@
+"""Pictures of an episode: frames, grids of frames, films. NumPy and Pillow only; needs no display.
+
+A frame shows what the team has done so far: unexplored free space pale yellow, explored space green, space
+that two or more robots have seen blue, walls dark once discovered and light before. Each robot is a rectangle
+with a light front in its own colour, with its trail (fading), its radar range (circle), what it sees now (the
+points lit up) and its goal (cross). Robots smaller than a few pixels are drawn larger than they are.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from maexp.envs.film import write_gif, write_mp4
+from maexp.envs.raster import MapRaster, map_raster
+from PIL import Image, ImageDraw, ImageFont
+from torchrl.envs.utils import step_mdp
+
+__all__ = ["draw_frame", "draw_grid", "record_episode", "write_gif", "write_mp4"]
+
+DT = 0.1  # seconds in a local step (design 1)
+
+# Lightness falls from unexplored to overlap, so that the classes differ without colour, too.
+NOTHING = (255, 255, 255)
+UNEXPLORED = (250, 238, 170)
+EXPLORED = (150, 208, 140)
+OVERLAP = (120, 170, 225)
+WALL_UNSEEN = (196, 196, 196)
+WALL_SEEN = (52, 52, 56)
+INK = (30, 30, 34)
+STRIP = (246, 246, 246)
+_LEGEND = (
+    ("unexplored", UNEXPLORED),
+    ("explored", EXPLORED),
+    ("by 2+", OVERLAP),
+    ("wall", WALL_SEEN),
+    ("unseen wall", WALL_UNSEEN),
+)
+# Distinct in hue and lightness for the colour-blind, none close to a class above (after Okabe-Ito and Tol).
+ROBOT_COLOURS = (
+    (213, 94, 0),
+    (106, 30, 150),
+    (215, 50, 130),
+    (0, 60, 140),
+    (130, 65, 15),
+    (0, 90, 60),
+    (235, 160, 0),
+    (20, 20, 20),
+)
+LIGHT = 0.4  # share of white in what a robot sees now
+TINT = 0.12  # and share of its colour
+TRAIL_STEPS = 200  # local steps until a trail has faded away
+_TRAIL_BANDS = 20
+_SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture
+_AA = 2  # overlays are drawn this many times larger, then averaged
+
+
+def robot_colour(index: int) -> tuple[int, int, int]:
+    """Colour of robot ``index``; colours repeat after eight robots."""
+    return ROBOT_COLOURS[index % len(ROBOT_COLOURS)]
+
+
+def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
+    """Picture of one team, uint8 (height, width, 3).
+
+    Args:
+        snapshot: what ``ExplorationEnv.snapshot(i)`` returns.
+        size: width in pixels, at least 64; the map keeps its proportions within size x size, and a caption
+            strip with coverage, time, scale and legend comes below.
+
+    Raises:
+        ValueError: size is not an integer of at least 64, or the snapshot's flags do not fit its map.
+    """
+    if int(size) != size or size < 64:
+        raise ValueError(f"size={size} is not a picture width; give an integer of at least 64 pixels")
+    size = int(size)
+    raster = map_raster(snapshot["map"], size)
+    picture = Image.fromarray(raster.paint(_point_colours(snapshot, raster)))
+    picture = _draw_moving(snapshot, raster, picture)
+    strip = _draw_strip(snapshot, raster, size)
+    height = raster.height + strip.height
+    frame = Image.new("RGB", (size + size % 2, height + height % 2), STRIP)  # even sides, for video codecs
+    frame.paste(NOTHING, (0, 0, frame.width, raster.height))
+    frame.paste(picture, ((size - raster.width) // 2, 0))
+    frame.paste(strip, (0, raster.height))
+    return np.array(frame)
+
+
+def draw_grid(frames, columns: int | None = None, gap: int = 6) -> np.ndarray:
+    """Several pictures (of any sizes) in one, row by row, about as wide as high; uint8 (height, width, 3)."""
+    frames = [np.asarray(frame) for frame in frames]
+    if not frames:
+        raise ValueError("frames is empty; give at least one picture")
+    columns = columns or int(np.ceil(np.sqrt(len(frames))))
+    height, width = (max(frame.shape[axis] for frame in frames) for axis in (0, 1))
+    rows = -(-len(frames) // columns)
+    grid = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, 3), 255, dtype=np.uint8)
+    for k, frame in enumerate(frames):
+        top, left = (k // columns) * (height + gap), (k % columns) * (width + gap)
+        grid[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
+    return grid
+
+
+def record_episode(env, policy, env_index: int = 0, every: int | None = 2, size: int = 512) -> list:
+    """Plays one episode from ``env.reset()`` and draws team ``env_index``: a list of uint8 pictures.
+
+    Args:
+        env: an :class:`ExplorationEnv`; call ``env.set_episodes`` before to choose an evaluation episode.
+        policy: a TensorDictModule that writes the action.
+        every: local steps from one picture to the next (a tenth of a second each); None: as many as make
+            about 150 pictures of a full episode.
+        size: width of the pictures in pixels.
+
+    The other teams of the batch play along, undrawn. The first picture is the start, the last one the end.
+    """
+    if every is None:
+        every = max(1, env.local_steps * env.macro_steps // 150)
+    frames, drawn = [], []
+
+    def draw(env) -> None:
+        snapshot = env.snapshot(env_index)
+        if snapshot["local_step"] not in drawn[-1:]:  # a team that is done stands still
+            frames.append(draw_frame(snapshot, size))
+            drawn.append(snapshot["local_step"])
+
+    env.set_step_hook(draw, every=every)
+    try:
+        with torch.no_grad():
+            state = env.reset()
+            done = False
+            while not done:
+                state = env.step(policy(state))
+                done = bool(state["next", "done"][env_index].any())
+                state = step_mdp(state)
+        draw(env)
+    finally:
+        env.set_step_hook(None)
+    return frames
+
+
+# Colours of the points
+
+
+def _point_colours(snapshot: dict, raster: MapRaster) -> np.ndarray:
+    """Colour table of the raster, uint8 (1 + free + boundary + 1, 3)."""
+    seen_free, seen_boundary = np.asarray(snapshot["seen_free"]), np.asarray(snapshot["seen_boundary"])
+    visible = np.asarray(snapshot["visible"])
+    for name, flags, count in (
+        ("seen_free", seen_free, raster.num_free),
+        ("visible", visible, raster.num_free),
+        ("seen_boundary", seen_boundary, raster.num_boundary),
+    ):
+        if flags.ndim != 2 or flags.shape[1] != count:
+            raise ValueError(f"snapshot {name} has shape {flags.shape}; the map needs (robots, {count})")
+    classes = np.array([UNEXPLORED, EXPLORED, OVERLAP], dtype=np.uint8)
+    table = np.empty((2 + raster.num_free + raster.num_boundary, 3), dtype=np.uint8)
+    table[0], table[-1] = NOTHING, WALL_UNSEEN
+    free, boundary = table[1 : 1 + raster.num_free], table[1 + raster.num_free : -1]
+    free[:] = classes[np.minimum(np.count_nonzero(seen_free, axis=0), 2)]
+    boundary[:] = np.where(seen_boundary.any(axis=0)[:, None], WALL_SEEN, WALL_UNSEEN)
+    now = np.flatnonzero(visible.any(axis=0))
+    if now.size:
+        sees = visible[:, now].astype(np.float32)
+        colours = np.array([robot_colour(i) for i in range(len(sees))], dtype=np.float32)
+        tint = sees.T @ colours / sees.sum(axis=0)[:, None]
+        free[now] = np.rint((1 - LIGHT - TINT) * free[now] + LIGHT * 255 + TINT * tint)
+    return table
+
+
+# Robots, trails, goals, radar
+
+
+def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Image.Image:
+    """The picture of the points with everything that moves on top, smoothed."""
+    large = picture.resize((raster.width * _AA, raster.height * _AA), Image.Resampling.NEAREST)
+    unit = max(large.size) / 512  # line widths follow the picture's size
+    _draw_trails(large, raster.to_pixels(snapshot["trail"]) * _AA, unit)
+    draw = ImageDraw.Draw(large, "RGBA")
+    centers = raster.to_pixels(snapshot["center"]) * _AA
+    for i, (x, y) in enumerate(centers):
+        radius = float(snapshot["radar_range"][i]) * raster.scale * _AA
+        box = (x - radius, y - radius, x + radius, y + radius)
+        draw.ellipse(box, outline=(*robot_colour(i), 150), width=max(1, round(1.5 * unit)))
+    corners = np.array(large.size)
+    for i, goal in enumerate(raster.to_pixels(snapshot["goal"]) * _AA):
+        if np.isfinite(goal).all():
+            _draw_goal(draw, np.clip(goal, 8 * unit, corners - 8 * unit), robot_colour(i), unit)
+    least = _SMALLEST_ROBOT * max(large.size)
+    for i, center in enumerate(centers):
+        length, width = np.asarray(snapshot["body"][i], dtype=float) * raster.scale * _AA
+        grow = max(1.0, least / length)
+        body = (length * grow, max(width * grow, 0.55 * least))
+        heading = float(snapshot["pose"][i][3])
+        _draw_robot(draw, center, heading, body, robot_colour(i), unit, bool(snapshot["collided"][i]))
+    return large.reduce(_AA)
+
+
+def _draw_trails(large: Image.Image, trail: np.ndarray, unit: float) -> None:
+    """Trails (steps, robots, 2) [px]: the latest TRAIL_STEPS steps in bands that fade with age."""
+    trail = trail[-TRAIL_STEPS - 1 :]
+    edges = np.linspace(len(trail) - 1 - TRAIL_STEPS, len(trail) - 1, _TRAIL_BANDS + 1)
+    edges = np.maximum(np.rint(edges).astype(int), 0)
+    width = max(1, round(2 * unit))
+    for i in range(trail.shape[1]):
+        corner = np.floor(trail[:, i].min(axis=0)).astype(int) - width
+        mask = Image.new("L", tuple(np.ceil(trail[:, i].max(axis=0)).astype(int) - corner + width))
+        draw = ImageDraw.Draw(mask)
+        points = trail[:, i] - corner
+        for band, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            if last > first:  # oldest first: a newer band covers it
+                alpha = 30 + 225 * (band + 1) // _TRAIL_BANDS
+                draw.line(points[first : last + 1].ravel().tolist(), fill=alpha, width=width, joint="curve")
+        large.paste(robot_colour(i), tuple(corner.tolist()), mask)
+
+
+def _draw_robot(draw, center, heading: float, body, colour, unit: float, collided: bool) -> None:
+    """Oriented rectangle ``body`` (length, width) [px]; a light triangle forward, or a cross: collided."""
+    forward = np.array([np.cos(heading), -np.sin(heading)])  # rows grow downward
+    left = np.array([forward[1], -forward[0]])
+
+    def outline(along: float, across: float, signs=((1, 1), (1, -1), (-1, -1), (-1, 1))) -> list[tuple]:
+        return [tuple(center + a * along * forward + b * across * left) for a, b in signs]
+
+    half_length, half_width = 0.5 * body[0], 0.5 * body[1]
+    white = (255, 255, 255, 255)
+    draw.polygon(outline(half_length + 1.5 * unit, half_width + 1.5 * unit), fill=white)
+    draw.polygon(outline(half_length, half_width), fill=(*colour, 255))
+    if collided:  # the arms of a cross
+        for sign in (1, -1):
+            ends = outline(0.8 * half_length, 0.8 * half_width, ((1, sign), (-1, -sign)))
+            draw.line(ends, fill=white, width=max(1, round(2.5 * unit)))
+    else:
+        nose = outline(0.85 * half_length, 0.75 * half_width, ((1, 0), (0.1, 1), (0.1, -1)))
+        draw.polygon(nose, fill=white)
+
+
+def _draw_goal(draw: ImageDraw.ImageDraw, goal, colour, unit: float) -> None:
+    _draw_cross(draw, goal, 6.5 * unit, (255, 255, 255, 255), round(5 * unit))
+    _draw_cross(draw, goal, 5.5 * unit, (*colour, 255), round(2.5 * unit))
+
+
+def _draw_cross(draw: ImageDraw.ImageDraw, at, arm: float, colour, width: int) -> None:
+    x, y = at
+    for dx in (arm, -arm):
+        draw.line([(x - dx, y - arm), (x + dx, y + arm)], fill=colour, width=max(1, width))
+
+
+# The strip below the map
+
+
+@lru_cache(maxsize=8)
+def _font(pixels: int):
+    return ImageFont.load_default(size=pixels)  # Pillow's own: the same on every machine
+
+
+def _draw_strip(snapshot: dict, raster: MapRaster, width: int) -> Image.Image:
+    """Caption: map, team and time; a bar of coverage; scale and legend."""
+    text, small = max(8, width // 34), max(7, width // 42)
+    pad, row = width // 64, int(1.45 * text)
+    strip = Image.new("RGB", (width, 3 * row + 2 * pad), STRIP)
+    draw = ImageDraw.Draw(strip)
+    right, seconds = width - pad, int(snapshot["local_step"]) * DT
+    robots, collided = len(snapshot["pose"]), int(np.count_nonzero(snapshot["collided"]))
+    team = f"{robots} robot{'s' * (robots != 1)}" + (f", {collided} collided" if collided else "")
+    clock = f"{seconds:.1f} s, step {int(snapshot['local_step'])}"
+    title = _fit(f"{snapshot['map'].name} · {team}", _font(text), 0.66 * width)
+    draw.text((pad, pad + row // 2), title, INK, _font(text), "lm")
+    draw.text((right, pad + row // 2), clock, INK, _font(text), "rm")
+    bar = (pad, pad + row, right, pad + 2 * row - pad // 2)
+    _draw_bar(draw, bar, float(snapshot["coverage"]), _font(text))
+    _draw_legend(draw, (pad, int(pad + 2.5 * row)), _font(small), small)
+    _draw_scale(draw, (right, int(pad + 2.5 * row)), raster.scale, width, _font(small))
+    return strip
+
+
+def _fit(text: str, font, width: float) -> str:
+    """Text, cut in the middle of what does not fit into ``width`` pixels."""
+    if font.getlength(text) <= width:
+        return text
+    keep = len(text)
+    while keep > 2 and font.getlength(text[: keep // 2] + "…" + text[-(keep - keep // 2) :]) > width:
+        keep -= 1
+    return text[: keep // 2] + "…" + text[-(keep - keep // 2) :]
+
+
+def _draw_bar(draw: ImageDraw.ImageDraw, box, coverage: float, font) -> None:
+    """Share explored, with marks at 85 % and 95 %, where the metrics are taken."""
+    left, top, right, bottom = box
+    draw.rectangle(box, fill=UNEXPLORED)
+    if coverage > 0:
+        draw.rectangle((left, top, left + coverage * (right - left), bottom), fill=EXPLORED)
+    for mark in (0.85, 0.95):
+        x = left + mark * (right - left)
+        draw.line([(x, top), (x, bottom)], fill=INK)
+    percent = np.floor(coverage * 1000 + 1e-3) / 10  # down: never shows 95 % before it is reached
+    label = f"explored {percent:.1f} %"
+    draw.text((left + (right - left) // 64, (top + bottom) // 2), label, INK, font, "lm")
+    draw.rectangle(box, outline=INK)
+
+
+def _draw_legend(draw: ImageDraw.ImageDraw, at, font, box: int) -> None:
+    x, y = at
+    for label, colour in _LEGEND:
+        draw.rectangle((x, y - box // 2, x + box, y + box // 2), fill=colour, outline=INK)
+        draw.text((x + 1.4 * box, y), label, INK, font, "lm")
+        x += int(2.1 * box + font.getlength(label))
+
+
+def _draw_scale(draw: ImageDraw.ImageDraw, at, scale: float, width: int, font) -> None:
+    """A bar of 1, 2 or 5 times a power of ten metres, right-aligned at ``at``."""
+    longest = 0.14 * width / scale
+    power = 10.0 ** np.floor(np.log10(longest))
+    metres = max(step * power for step in (1, 2, 5) if step * power <= longest)
+    x, y = at
+    left = x - metres * scale
+    draw.line([(left, y), (x, y)], fill=INK, width=max(1, width // 256))
+    for end in (left, x):
+        draw.line([(end, y - width // 128), (end, y + width // 128)], fill=INK)
+    draw.text((left - width // 100, y), f"{metres:g} m", INK, font, "rm")
