@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import warp as wp
+from maexp.envs.bank import MapBank
 from maexp.envs.map import PointCloudMap
 from maexp.kernels.known_grid import NavGrids
 from scipy.ndimage import distance_transform_edt
@@ -90,3 +91,9 @@ def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids
     for name, (array, kind) in values.items():
         setattr(stacked, name, wp.array(array, dtype=kind, device=str(torch.device(device))))
     return stacked, int(np.diff(begin).max())
+
+
+def bank_nav_grids(bank: MapBank, device: str = "cpu") -> tuple[NavGrids, int]:
+    """`stack_nav_grids` for the maps of a bank, points in the bank's order."""
+    orders = zip(bank.maps, bank.order_free, bank.order_boundary, strict=True)
+    return stack_nav_grids([build_nav_grid(m).reorder(free, boundary) for m, free, boundary in orders], device)

@@ -5,6 +5,7 @@ import os
 
 import torch
 
+from maexp.envs.nav_grid import bank_nav_grids
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.state import axis_sizes, memory_per_env
 from maexp.kernels.step import Settings, Simulation
@@ -31,6 +32,7 @@ def build_simulation(env, seed: int, num_threads: int) -> Simulation:
         device=env.device,
         seed=seed,
         num_shards=num_threads,
+        nav=bank_nav_grids(env.bank, env.device) if env.planner_config.name == "wavefront" else None,
     )
     return simulation
 

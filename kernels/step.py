@@ -14,8 +14,10 @@ import torch
 import warp as wp
 
 from maexp.kernels import collision, dynamics, merge, observe, planner, reset, reward, visibility
+from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.state import SCRATCH, STATE, allocate, robots_struct, warp_views
 from maexp.kernels.types import Maps
+from maexp.kernels.wavefront import Wavefront
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Shard:
         self.robots = robots_struct(sim.robot_tensors, first, last)
         self.shape = (last - first, sim.sizes["N"])
         self.lanes = 1 if self.device.is_cpu else 32
-        self.wavefront = None
+        self.wavefront = Wavefront(sim, self) if sim.settings.planner == "wavefront" else None
         self.goal_launches = self.record(self.set_goals)
         self.step_launches = self.record(self.local_step)
         self.reset_launches = self.record(self.place)
@@ -249,6 +251,7 @@ class Simulation:
         device: where it runs.
         seed: key of the random numbers.
         num_shards: runs of envs, each with a thread of its own on the CPU.
+        nav: navigation grids of the maps and the cells of the largest; the `wavefront` planner needs them.
     """
 
     def __init__(
@@ -262,11 +265,13 @@ class Simulation:
         device: torch.device,
         seed: int,
         num_shards: int = 1,
+        nav: tuple[NavGrids, int] | None = None,
     ):
         self.map_tensors, self.num_maps, self.robot_tensors = maps, num_maps, robots
         self.weights, self.settings, self.sizes = weights, settings, sizes
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
+        self.nav_grids, self.nav_cells = nav or (None, 0)
         self.team_bits = int(settings.draw_known and not settings.comm_limited)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
