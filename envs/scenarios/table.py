@@ -8,6 +8,7 @@ from numbers import Integral
 
 from maexp.envs.map import PointCloudMap
 
+from .indoor import build_indoor
 from .maze import build_maze
 from .random_obstacles import build_adaptive, build_random_obstacles
 
@@ -42,6 +43,10 @@ _RANDOM = dict(
     _CAR, count=32, resolution=1.0, size=125.0, radar_range=10.0, max_speed=6.0, clearance_factor=3.0,
     local_steps=40, macro_steps=15,
 )  # fmt: skip
+_INDOOR = dict(
+    resolution=0.1, radar_range=1.0, max_speed=0.6, max_accel=0.2, body_length=0.15, body_width=0.1,
+    collision_threshold=0.06, clearance_factor=4.2, local_steps=40, macro_steps=15, num_steering=21,
+)  # fmt: skip
 
 _ROWS = [
     Scenario("random_obstacles", **_RANDOM,
@@ -52,6 +57,12 @@ _ROWS = [
              build=partial(build_maze, scenario="maze", cells=12, corridor=5, wall=5, resolution=1.0)),
     Scenario("maze_small", size=37.0, macro_steps=15, **_MAZE,
              build=partial(build_maze, scenario="maze_small", cells=6, corridor=5, wall=1, resolution=1.0)),
+    Scenario("indoor_small", count=17, size=10.0, **_INDOOR,
+             build=partial(build_indoor, scenario="indoor_small", longest=(6.5, 9.8))),
+    Scenario("indoor_medium", count=32, size=14.0, **_INDOOR,
+             build=partial(build_indoor, scenario="indoor_medium", longest=(10.2, 13.8))),
+    Scenario("indoor_large", count=22, size=20.0, **_INDOOR,
+             build=partial(build_indoor, scenario="indoor_large", longest=(14.4, 19.8))),
     Scenario("pointcloud", count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
              max_accel=1.0, body_length=0.6, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
              local_steps=20, macro_steps=None),
