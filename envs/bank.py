@@ -56,7 +56,8 @@ def build_bank(maps: list[PointCloudMap], radars: list[RadarConfig]) -> MapBank:
     arrays["cell_begin"] = _begins([len(p["points"]["free_cell"]) for p in parts])[:-1]
     neighbours = [p["neighbour_count"] for p in parts]
     arrays["neighbour_begin"] = _begins(np.concatenate(neighbours))
-    arrays["pixel_begin"] = _begins(np.concatenate([p["pixel_count"] for p in parts]))
+    arrays["pixel_begin"] = _begins([len(p["points"]["pixel"]) for p in parts])
+    arrays["pixel_point_begin"] = _begins(np.concatenate([p["pixel_count"] for p in parts]))
     for name in parts[0]["scalars"]:
         arrays[name] = np.stack([np.asarray(p["scalars"][name]) for p in parts])
     return MapBank(
@@ -87,7 +88,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
     weight, total = _weights(m)
     neighbour_count, neighbour = _neighbours(m, free, boundary, boundary_order)
     frame_origin, pixel = _frame(m.extent)
-    pixel_count, pixel_point = _pixels(m, free, boundary, free_order, boundary_order, frame_origin, pixel)
+    shown, pixel_count, pixel_point = _pixels(m, free, boundary, free_order, boundary_order, frame_origin, pixel)
     clearance = cKDTree(m.boundary).query(free)[0] if len(boundary) else np.full(len(free), np.inf)
     (x0, y0), (x1, y1) = m.extent
     return {
@@ -102,6 +103,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "occluder": occluder[occluder_order],
             "occluder_radius": radius[occluder_order],
             "occluder_cell": occluder_cell,
+            "pixel": shown,
             "pixel_point": pixel_point,
         },
         "scalars": {
@@ -215,8 +217,8 @@ def _frame(extent) -> tuple[np.ndarray, float]:
     return 0.5 * (low + high) - 0.5 * side + 0.5 * pixel, pixel
 
 
-def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tuple[np.ndarray, np.ndarray]:
-    """Points shown by each pixel: those nearest to its centre; an empty pixel between points shows the nearest one."""
+def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels that show points, how many each, and which: those nearest to its centre, or between points the nearest."""
     points = np.concatenate([free[:, :2], boundary[:, :2]]).astype(np.float64)
     code = np.concatenate([np.arange(len(free)), -1 - np.arange(len(boundary))]).astype(np.int32)
     spacing = np.concatenate([m.free_spacing[free_order], m.boundary_spacing[boundary_order]])
@@ -230,7 +232,8 @@ def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tup
     index = np.concatenate([index, empty[between]])
     code = np.concatenate([code, code[nearest[between]]])
     order = np.argsort(index, kind="stable")
-    return np.bincount(index, minlength=_PIXELS * _PIXELS), code[order]
+    shown, counts = np.unique(index, return_counts=True)
+    return shown.astype(np.int32), counts, code[order]
 
 
 def region_count() -> int:

@@ -186,8 +186,8 @@ class ExplorationEnv(EnvBase):
     def _observe(self) -> TensorDict:
         """Fresh tensors, never the simulation's own: collectors keep what they get (design 6.1)."""
         e, n, p, r = self.num_envs, self.num_robots, int(PIXELS), int(REGIONS)
-        picture = torch.empty((e, n, 4, p, p), dtype=torch.uint8, device=self.device)
-        team = torch.empty((e, 3, p, p), dtype=torch.uint8, device=self.device)
+        picture = torch.zeros((e, n, 4, p, p), dtype=torch.uint8, device=self.device)
+        team = torch.zeros((e, 3, p, p), dtype=torch.uint8, device=self.device)
         pose = torch.empty((e, n, 4), device=self.device)
         grid = torch.empty((e, n, 4, r, r), device=self.device)
         self.simulation.observe(picture, team, pose, grid)

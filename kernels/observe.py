@@ -40,16 +40,20 @@ def _draw_points(
     picture: wp.array4d(dtype=wp.uint8),
     team: wp.array3d(dtype=wp.uint8),
 ):
-    """Pixel p of every robot of env e: explored and obstacle; of the team: explored, obstacle, viewers.
+    """One shown pixel of every robot of env e: explored and obstacle; of the team: explored, obstacle, viewers.
 
     ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map;
     with ``team_bits`` every robot is drawn the team's map (what it knows under perfect communication).
+    The pictures come in as zeros, so a pixel nobody knows costs only its reading.
     """
-    e, p = wp.tid()
+    e, k = wp.tid()
     m = map_id[e]
-    pixel = m * PIXELS * PIXELS + p
-    start = maps.pixel_begin[pixel]
-    stop = maps.pixel_begin[pixel + 1]
+    shown = maps.pixel_begin[m] + k
+    if shown >= maps.pixel_begin[m + 1]:
+        return
+    p = maps.pixel[shown]
+    start = maps.pixel_point_begin[shown]
+    stop = maps.pixel_point_begin[shown + 1]
     viewers = int(0)
     explored = OFF
     obstacle = OFF
@@ -58,8 +62,8 @@ def _draw_points(
         wall_word = int(0)
         team_free = int(0)
         team_wall = int(0)
-        for k in range(start, stop):
-            j = maps.pixel_point[k]
+        for q in range(start, stop):
+            j = maps.pixel_point[q]
             if j >= 0:
                 free_word = free_word | draw_free[e, w, j]
                 team_free = team_free | seen_free[e, w, j]
@@ -72,19 +76,21 @@ def _draw_points(
         if team_wall != 0:
             obstacle = ON
         first = w * ROBOTS_PER_WORD
-        for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
-            bit = 1 << (i - first)
-            picture[e, i, 0, p] = wp.where((free_word & bit) != 0, ON, OFF)
-            picture[e, i, 1, p] = wp.where((wall_word & bit) != 0, ON, OFF)
-            picture[e, i, 2, p] = OFF
-            picture[e, i, 3, p] = OFF
+        if (free_word | wall_word) != 0:
+            for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
+                bit = 1 << (i - first)
+                if (free_word & bit) != 0:
+                    picture[e, i, 0, p] = ON
+                if (wall_word & bit) != 0:
+                    picture[e, i, 1, p] = ON
     if team_bits != 0:
         for i in range(robot_count):
             picture[e, i, 0, p] = explored
             picture[e, i, 1, p] = obstacle
-    team[e, 0, p] = explored
-    team[e, 1, p] = obstacle
-    team[e, 2, p] = wp.uint8(wp.min(viewers, 255))
+    if explored != OFF or obstacle != OFF:
+        team[e, 0, p] = explored
+        team[e, 1, p] = obstacle
+        team[e, 2, p] = wp.uint8(wp.min(viewers, 255))
 
 
 @wp.func

@@ -223,7 +223,7 @@ class Shard:
             free, boundary = s.known_free, s.known_boundary
         draw = partial(wp.launch, device=self.device)
         draw(
-            observe._draw_points, dim=(self.shape[0], out[1].shape[2]),
+            observe._draw_points, dim=(self.shape[0], self.sim.max_pixels),
             inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, free, boundary, s.seen_free, s.seen_boundary],
             outputs=out,
         )  # fmt: skip
@@ -272,6 +272,7 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
+        self.max_pixels = int(maps["pixel_begin"].diff().max())
         self.team_bits = int(settings.draw_known and not settings.comm_limited)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
@@ -305,7 +306,7 @@ class Simulation:
         self.each_shard(lambda shard: shard.run(start, count))
 
     def observe(self, picture, team, pose, grid) -> None:
-        """Fill the observation tensors: [E, N, 4, 125, 125] and [E, 3, 125, 125] uint8, [E, N, 4], [E, N, 4, 8, 8]."""
+        """Fill the observation tensors, zero before: [E, N, 4, 125, 125] and [E, 3, 125, 125] uint8, [E, N, 4], [E, N, 4, 8, 8]."""
         self.each_shard(lambda shard: shard.observe(picture, team, pose, grid))
 
 

@@ -73,8 +73,10 @@ class Maps:
     upper: wp.array(dtype=wp.vec2)
     frame_origin: wp.array(dtype=wp.vec2)
     pixel_size: wp.array(dtype=wp.float32)
-    # Points shown by each pixel: free point j as j, boundary point j as -1 - j.
-    pixel_begin: wp.array(dtype=wp.int32)  # [M * 125 * 125 + 1]
+    # Pixels that show points at all, and their points: free point j as j, boundary point j as -1 - j.
+    pixel: wp.array(dtype=wp.int32)
+    pixel_begin: wp.array(dtype=wp.int32)  # [M + 1]
+    pixel_point_begin: wp.array(dtype=wp.int32)  # [all shown pixels + 1]
     pixel_point: wp.array(dtype=wp.int32)
 
 
