@@ -6,7 +6,7 @@ import numpy as np
 from maexp.envs.map import PointCloudMap
 from scipy import ndimage
 
-from .furniture import CELL, Furnisher, Room, cells
+from .furniture import CELL, CLEARANCE, Furnisher, Room, cells
 from .lattice import grid_points, largest_component, make_generator
 
 OUTER_WALL = 3  # cells
@@ -21,6 +21,25 @@ TWO_BANDS = 2 * (BAND + INNER_WALL) + CORRIDOR  # what a corridor with rooms on 
 def build_indoor(index: int, *, scenario: str, longest: tuple[float, float]) -> PointCloudMap:
     """Floor plan `index`; `longest` is the range of its longer outside measure [m]."""
     rng = make_generator(scenario, index)
+    free, walls, footprint = _draw_plan(longest, rng)
+    while not _is_roomy(free):  # about one plan in a hundred
+        free, walls, footprint = _draw_plan(longest, rng)
+    obstacles = footprint & ~free
+    return PointCloudMap(
+        grid_points(free, CELL),
+        grid_points(obstacles, CELL),
+        CELL,
+        name=f"{scenario}_{index}",
+        scenario=scenario,
+        free_height=np.zeros(int(free.sum()), dtype=np.float32),
+        obstacle_height=np.where(walls[obstacles], WALL_HEIGHT, FURNITURE_HEIGHT).astype(np.float32),
+    )
+
+
+def _draw_plan(
+    longest: tuple[float, float], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One furnished plan: cells that are free, wall, and inside the outer walls, bool (nx, ny) each."""
     width = cells(rng.uniform(*longest))
     depth = cells(width * CELL * rng.uniform(0.68, 0.95))
     is_office = rng.random() < (0.0 if width < 100 else 0.25 if width < 140 else 0.5)
@@ -37,17 +56,14 @@ def build_indoor(index: int, *, scenario: str, longest: tuple[float, float]) -> 
     # Slits one cell wide (between a shelf and a wall) are neither swept nor seen: they count as furniture.
     free = largest_component(ndimage.binary_opening(~blocked, np.ones((2, 2))))
     if rng.random() < 0.5:
-        free, footprint, walls = free.T, footprint.T, walls.T
-    obstacles = footprint & ~free
-    return PointCloudMap(
-        grid_points(free, CELL),
-        grid_points(obstacles, CELL),
-        CELL,
-        name=f"{scenario}_{index}",
-        scenario=scenario,
-        free_height=np.zeros(int(free.sum()), dtype=np.float32),
-        obstacle_height=np.where(walls[obstacles], WALL_HEIGHT, FURNITURE_HEIGHT).astype(np.float32),
-    )
+        return free.T, walls.T, footprint.T
+    return free, walls, footprint
+
+
+def _is_roomy(free: np.ndarray) -> bool:
+    """Whether all but 3 % of the places with clearance hang together: no door is furnished shut."""
+    passable = ndimage.distance_transform_edt(free) >= CLEARANCE
+    return largest_component(passable).sum() >= 0.97 * passable.sum()
 
 
 def _plan_rooms(width: int, depth: int, is_office: bool, rng: np.random.Generator) -> list[Room]:
@@ -127,8 +143,8 @@ def _drop_corner(rooms: list[Room], inside: Room, rng: np.random.Generator) -> l
     corners = [
         room
         for room in rooms
-        if (room.x0 == inside.x0 or room.x1 == inside.x1)
-        and (room.y0 == inside.y0 or room.y1 == inside.y1)
+        if (room.x0 == inside.x0) != (room.x1 == inside.x1)
+        and (room.y0 == inside.y0) != (room.y1 == inside.y1)  # at a corner, and no whole end of the building
         and room.kind != "corridor"
         and room.area < 0.16 * total
     ]
