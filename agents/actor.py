@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
+from tensordict import TensorDict
+from tensordict.nn import CompositeDistribution, InteractionType, TensorDictModule
+from torch import Tensor, distributions, nn
+from torchrl.modules import IndependentNormal, ProbabilisticActor
+
 from maexp.agents.model import ModelConfig, model_config
 from maexp.agents.networks import TargetGenerator
-from tensordict.nn import CompositeDistribution, InteractionType, TensorDictModule
-from torch import distributions
-from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 MAP = ("agents", "observation", "map")
 POSE = ("agents", "observation", "pose")
@@ -51,6 +53,22 @@ def observation_shape(env) -> ObservationShape:
     )
 
 
+class ActionParams(nn.Module):
+    """Puts what the target generator returns under the names that the distributions expect.
+
+    One tensordict rather than one key each: else the actor would count ("agents", "params") as its input.
+    """
+
+    def __init__(self, network: TargetGenerator, heads: dict[str, type]):
+        super().__init__()
+        self.network = network
+        self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
+
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> TensorDict:
+        values = self.network(picture, pose, grid, comm)
+        return TensorDict(dict(zip(self.names, values, strict=True)), batch_size=comm.shape[:-2])
+
+
 def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
     """The trainable policy of a team, for the action that `env` takes.
 
@@ -65,11 +83,7 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
     shape = observation_shape(env)
     network = TargetGenerator(model_config(model), shape.channels, shape.side, shape.regions)
     heads = REGION_HEADS if shape.regions else CONTROL_HEADS
-    module = TensorDictModule(
-        network,
-        in_keys=list(OBSERVATION),
-        out_keys=[(*PARAMS, head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]],
-    )
+    module = TensorDictModule(ActionParams(network, heads), in_keys=list(OBSERVATION), out_keys=[PARAMS])
     actor = ProbabilisticActor(
         module,
         in_keys=[PARAMS],

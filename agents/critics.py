@@ -5,12 +5,13 @@ centralised). mixed: local values, mixed to one value of the team.
 """
 
 import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
 from maexp.agents.actor import COMM, GRID, MAP, POSE, observation_shape
 from maexp.agents.encoder import CellEncoder
 from maexp.agents.mixers import make_mixer
 from maexp.agents.model import ModelConfig, model_config
-from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
 
 VALUE = ("agents", "state_value")
 TEAM_VALUE = ("team", "state_value")
@@ -67,6 +68,9 @@ class Critic(nn.Module):
         nn.init.orthogonal_(self.value[-1].weight, 0.1)
         nn.init.zeros_(self.value[-1].bias)
         self.mixer = make_mixer(mixer, hidden) if kind == "mixed" else None
+        self.register_buffer("offset", torch.zeros(()))
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
 
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor):
         """Shapes as in TargetGenerator.forward."""
@@ -78,8 +82,18 @@ class Critic(nn.Module):
             features = torch.cat((robots, around.expand(-1, robots.shape[1], -1)), dim=-1)
         values = self.value(features)
         if self.mixer is None:
-            return values.unflatten(0, lead)
-        return values.unflatten(0, lead), self.mixer(values, robots).unflatten(0, lead)
+            return self._to_returns(values).unflatten(0, lead)
+        return values.unflatten(0, lead), self._to_returns(self.mixer(values, robots)).unflatten(0, lead)
+
+    def _to_returns(self, values: Tensor) -> Tensor:
+        return self.offset + self.scale * values
+
+    @torch.no_grad()
+    def calibrate(self, returns: Tensor) -> None:
+        """Give the outputs the mean and spread of the first returns seen, so that learning starts there."""
+        self.offset.copy_(returns.mean())
+        self.scale.copy_(returns.std().clamp_min(1e-3))
+        self.calibrated.fill_(True)
 
 
 def build_critic(

@@ -1,8 +1,9 @@
 """From one robot's observation to features of the L x L regions: picture, CNN, grid features."""
 
 import torch
-from maexp.agents.model import ModelConfig
 from torch import Tensor, nn
+
+from maexp.agents.model import ModelConfig
 
 STRIDE = 4  # both stems shrink the picture by this factor
 SUBCELLS = 4  # cells a side that the CNN sees of one region

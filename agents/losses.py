@@ -6,9 +6,6 @@ loss_critic (and loss_kl), plus what one likes to log.
 """
 
 import torch
-from maexp.agents.actor import PARAM_NAMES, PARAMS
-from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
-from maexp.agents.critics import TEAM_VALUE, VALUE
 from tensordict import TensorDictBase
 from tensordict.nn import CompositeDistribution, set_composite_lp_aggregate
 from torch import Tensor
@@ -16,6 +13,10 @@ from torch.distributions import kl_divergence
 from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.utils import distance_loss
+
+from maexp.agents.actor import PARAM_NAMES, PARAMS
+from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
+from maexp.agents.critics import TEAM_VALUE, VALUE
 
 
 def policy_divergence(batch: TensorDictBase, dist: CompositeDistribution) -> Tensor:
@@ -66,7 +67,7 @@ class KLPenalty:
         self.kl_target = kl_target
 
     def _log_weight(self, tensordict, adv_shape):
-        terms = super()._log_weight(tensordict, adv_shape)
+        terms = super()._log_weight(tensordict.copy(), adv_shape)  # a copy: it overwrites the acting parameters
         self.__dict__["_divergence"] = policy_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
         return terms
 
@@ -122,7 +123,7 @@ class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
         """Mean loss to lower (objective and entropy bonus) and mean divergence, each a scalar with its graph."""
         advantage = batch.get(self.tensor_keys.advantage)
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
-        log_weight, dist, _, _ = self._log_weight(batch, adv_shape=advantage.shape[:-1])
+        log_weight, dist, _, _ = self._log_weight(batch.copy(), adv_shape=advantage.shape[:-1])
         entropy = self._weighted_loss_entropy(self._get_entropy(dist, adv_shape=advantage.shape[:-1]))
         loss = (entropy - log_weight.exp() * advantage).mean()
         return loss, policy_divergence(batch, dist).mean()

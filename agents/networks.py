@@ -7,10 +7,11 @@ serves a team of any size, and permuting the robots permutes the output.
 import math
 
 import torch
-from maexp.agents.encoder import CellEncoder
-from maexp.agents.model import ModelConfig
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from maexp.agents.encoder import CellEncoder
+from maexp.agents.model import ModelConfig
 
 MIN_SCALE = 0.05  # a narrower offset makes probability ratios explode, a wider one than 1 leaves the region
 MAX_SCALE = 1.0

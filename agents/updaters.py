@@ -9,13 +9,15 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 import torch
-from maexp.agents.actor import PARAMS
-from maexp.agents.advantages import write_advantages
-from maexp.agents.trust_region import TRPO
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from maexp.agents.actor import PARAMS
+from maexp.agents.advantages import write_advantages
+from maexp.agents.trust_region import TRPO
+
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
+CALIBRATION_ROUNDS = 5
 QUIET = ("composite_entropy", "max_ratio", "mean_ratio", "value_clip_fraction")
 
 
@@ -105,10 +107,20 @@ class Updater:
         """Write advantages; return the team steps with what the losses read, flattened."""
         batch = write_advantages(self.loss, batch.copy())
         keys = self.loss.tensor_keys
+        self._calibrate(batch)
         needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys, PARAMS]
         needed += [keys.advantage, keys.value_target, keys.value, *keys.action, *keys.sample_log_prob]
         check_finite("the advantage", batch.get(keys.advantage))
         return batch.select(*needed).flatten()
+
+    def _calibrate(self, batch: TensorDictBase) -> None:
+        """Once: set the critic's scale. A few rounds, because the targets lean on the values."""
+        critic = self.loss.critic_network.module
+        if getattr(critic, "calibrated", True):
+            return
+        for _ in range(CALIBRATION_ROUNDS):
+            critic.calibrate(batch.get(self.loss.tensor_keys.value_target))
+            write_advantages(self.loss, batch)
 
     def minibatches(self, steps: list[TensorDictBase], size: int) -> Iterator[list[TensorDictBase]]:
         """Random parts of every batch, together about `size` team steps, each step once."""

@@ -95,6 +95,7 @@ class ToyEnv(EnvBase):
         picture = (lit * 255).to(torch.uint8).repeat_interleave(block, -2).repeat_interleave(block, -1)
         pose = torch.zeros(*team, 4)
         pose[..., 0] = torch.linspace(-0.5, 0.5, self.num_robots)
+        pose[..., 2] = self.step_count.unsqueeze(-1) / self.steps - 0.5
         line = (torch.arange(self.side) * 2 + 1) / self.side - 1
         place = torch.stack(torch.meshgrid(line, line, indexing="ij"))
         offsets = (place - pose[..., :2, None, None]) / 2
