@@ -1,0 +1,7 @@
+"""Maps from files: floor plans of ROS, point clouds, meshes, octrees, and MAexp's own arrays."""
+
+from .api import import_map, import_map_with_report
+from .options import ImportOptions
+from .report import ImportReport, ImportStep
+
+__all__ = ["ImportOptions", "ImportReport", "ImportStep", "import_map", "import_map_with_report"]

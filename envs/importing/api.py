@@ -1,0 +1,75 @@
+"""import_map: which reader a file goes to, and the check at the end."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from maexp.envs.checker import check_map, repair_map
+from maexp.envs.map import MapError, PointCloudMap, check_file
+from maexp.envs.scenarios import find_scenario
+
+from .finish import finish_grid
+from .occupancy import read_occupancy
+from .options import ImportOptions, make_options
+from .report import ImportReport
+
+GRIDS = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".tif", ".tiff")
+
+
+def import_map(path: str | os.PathLike, options: ImportOptions | None = None, **overrides) -> PointCloudMap:
+    """Reads a file and makes it a map a team can explore; see `ImportOptions` for what can be set by hand.
+
+    Args:
+        path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .glb or .bt.
+        options: settings; None: everything automatic.
+        overrides: single settings by name, over `options`.
+
+    Raises:
+        MapError: the file cannot be read, or has no room for the team; says what was found and what to do.
+    """
+    return import_map_with_report(path, options, **overrides)[0]
+
+
+def import_map_with_report(
+    path: str | os.PathLike, options: ImportOptions | None = None, **overrides
+) -> tuple[PointCloudMap, ImportReport]:
+    """`import_map`, and what each step did."""
+    begin = time.perf_counter()
+    path = Path(path)
+    options = make_options(options, overrides)
+    report = ImportReport(str(path))
+    check_file(path)
+    world = _read(path, options, report)
+    world = _check(world, options, report)
+    report.seconds = time.perf_counter() - begin
+    return world, report
+
+
+def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointCloudMap:
+    suffix = path.suffix.lower()
+    name = options.name or path.stem
+    if suffix in GRIDS:
+        grid = read_occupancy(path, options, report)
+        return finish_grid(grid, _scenario(options, "pointcloud"), name, options, report)
+    raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported")
+
+
+def _scenario(options: ImportOptions, automatic: str):
+    return find_scenario(automatic if options.scenario == "auto" else options.scenario)
+
+
+def _check(world: PointCloudMap, options: ImportOptions, report: ImportReport) -> PointCloudMap:
+    """The checker's verdict; what it finds is repaired once, and an unusable map is an error."""
+    verdict = check_map(world, num_robots=options.num_robots)
+    if not verdict.ok or verdict.warnings:
+        world, steps = repair_map(world)
+        for step in steps:
+            report.add("repair", step)
+        verdict = check_map(world, num_robots=options.num_robots)
+    if not verdict.ok:
+        raise MapError(f"{report.path} gives no usable map: {'; '.join(verdict.errors)}")
+    report.warnings += verdict.warnings
+    report.add("check", f"{verdict.verdict}: room for {verdict.room} robots, {verdict.visible_share:.1%} visible")
+    return world

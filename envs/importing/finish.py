@@ -1,0 +1,154 @@
+"""From a labelled grid to a map that passes the checker: resolution, gaps, components, sealing."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from maexp.envs.checker import START_CLEARANCE
+from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.reach import count_room
+from maexp.envs.scenarios import Scenario
+
+from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, resample, seal, thin_walls
+from .options import ImportOptions
+from .report import ImportReport
+
+STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of the scenario's
+KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
+
+
+def finish_grid(grid: Grid, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport):
+    """The map of a grid; raises MapError where no resolution leaves room for the team."""
+    grid = crop_grid(grid, options, report)
+    if options.resolution is not None:
+        if options.resolution < grid.cell * (1 - 1e-6):
+            report.warn(
+                f"resolution {options.resolution:g} m is finer than the file's {grid.cell:g} m: kept the file's"
+            )
+        cleaned = _Cleaned(resample(grid, options.resolution), scenario, options)
+        _require_room(cleaned, options, scenario)
+        reason = "as set"
+    else:
+        cleaned, reason = _choose_resolution(grid, scenario, options)
+    report.add(
+        "resolution",
+        f"{cleaned.start.cell:g} m a cell, {reason}",
+        before=grid.labels.size,
+        after=cleaned.start.labels.size,
+    )
+    cleaned.tell(report)
+    return _to_map(cleaned.grid, scenario, name, options, report)
+
+
+def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
+    """Cuts away everything outside `options.crop` and around the free cells."""
+    before = grid.count(FREE)
+    if options.crop is not None:
+        xmin, ymin, xmax, ymax = options.crop
+        x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in grid.labels.shape), indexing="ij")
+        place = grid.to_world(np.stack([x, y], axis=-1))
+        inside = (place[..., 0] >= xmin) & (place[..., 0] <= xmax)
+        inside &= (place[..., 1] >= ymin) & (place[..., 1] <= ymax)
+        labels = np.where(inside, grid.labels, UNKNOWN).astype(np.uint8)
+        grid = Grid(labels, grid.cell, grid.origin, grid.yaw, grid.height)
+        report.add("crop", f"to x {xmin:g} to {xmax:g} m, y {ymin:g} to {ymax:g} m", before, grid.count(FREE))
+    if not grid.count(FREE):
+        raise MapError(f"{report.path}: no free space is left inside crop={options.crop}; choose another box")
+    return grid.trim(4)
+
+
+class _Cleaned:
+    """A grid at one resolution after gaps, components and sealing, with the counts for the report."""
+
+    def __init__(self, grid: Grid, scenario: Scenario, options: ImportOptions):
+        self.start = grid
+        self.passage = options.min_passage
+        if self.passage is None:
+            self.passage = 2 * scenario.collision_threshold
+        self.free_before = grid.count(FREE)
+        grid, self.pieces, self.dropped_pieces = keep_component(grid.pad(1), options.component)
+        grid, self.dropped_gaps = close_gaps(grid, self.passage / 2, options.component)
+        grid, _, self.dropped_rest = keep_component(grid, options.component)
+        self.grid, self.sealed = seal(grid)
+        self.free = self.grid.count(FREE)
+        self.area = self.free * grid.cell**2
+        self.room = self._count_room(START_CLEARANCE * scenario.collision_threshold, options.num_robots)
+
+    def _count_room(self, clearance: float, wanted: int) -> int:
+        if not self.free:
+            return 0
+        free = self.grid.centres(self.grid.labels == FREE)
+        walls = self.grid.centres(self.grid.labels == OBSTACLE)
+        away, _ = cKDTree(walls).query(free, distance_upper_bound=clearance)
+        return count_room(free[away >= clearance * (1 - 1e-6)], clearance, max(wanted, 8))
+
+    def tell(self, report: ImportReport) -> None:
+        left = self.free_before
+        for name, detail, dropped in (
+            ("component", f"kept one of {self.pieces} pieces of free space", self.dropped_pieces),
+            ("narrow gaps", f"closed gaps narrower than {self.passage:g} m", self.dropped_gaps + self.dropped_rest),
+        ):
+            report.add(name, detail, left, left - dropped)
+            left -= dropped
+        report.add("seal", f"{self.sealed:,} unknown cells that touch free space became walls", left, left)
+
+
+def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -> tuple[_Cleaned, str]:
+    """The coarsest cells that keep the free area and give the team room.
+
+    Coarse cells swallow doors and narrow rooms: the finest candidate, at most a third of the scenario's
+    resolution, tells how much area there is to keep.
+    """
+    base = scenario.resolution
+    sizes = sorted({max(base * step, grid.cell) for step in STEPS_DOWN}, reverse=True)
+    area = grid.count(FREE) * grid.cell**2
+    while area / sizes[0] ** 2 > options.max_points:
+        sizes.insert(0, sizes[0] * 1.25)
+    tried = {}
+
+    def clean(size: float) -> _Cleaned:
+        if size not in tried:
+            tried[size] = _Cleaned(resample(grid, size), scenario, options)
+        return tried[size]
+
+    finest = next((size for size in sizes if size <= base / 3), sizes[-1])
+    goal = KEPT_SHARE * clean(finest).area
+    for size in sizes:
+        cleaned = clean(size)
+        if cleaned.room >= options.num_robots and cleaned.area >= goal:
+            share = f"keeps {cleaned.area:,.0f} of the {clean(finest).area:,.0f} m2 a robot can use at {finest:g} m"
+            return cleaned, f"the coarsest that {share} and gives {options.num_robots} robots room"
+    roomy = [cleaned for cleaned in tried.values() if cleaned.room >= options.num_robots]
+    best = max(roomy or tried.values(), key=lambda cleaned: (cleaned.room, cleaned.area))
+    _require_room(best, options, scenario)
+    return best, "the one that keeps most area"
+
+
+def _require_room(cleaned: _Cleaned, options: ImportOptions, scenario: Scenario) -> None:
+    if cleaned.room >= options.num_robots:
+        return
+    raise MapError(
+        f"found {cleaned.area:,.1f} m2 of free space that a {scenario.body_length:g} x {scenario.body_width:g} m robot "
+        f"can use at {cleaned.start.cell:g} m, with room for {cleaned.room} of num_robots={options.num_robots} "
+        f"(starts {START_CLEARANCE * scenario.collision_threshold:g} m from walls and each other); use a finer "
+        "resolution, fewer robots, a smaller robot (scenario), or check units, up and floor"
+    )
+
+
+def _to_map(grid: Grid, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport) -> PointCloudMap:
+    grid = grid.trim(options.wall_depth + 1)
+    before = grid.count(OBSTACLE)
+    grid, _ = thin_walls(grid, options.wall_depth)
+    report.add("walls", f"kept {options.wall_depth} cells of wall behind the boundary", before, grid.count(OBSTACLE))
+    masks = {"free": grid.labels == FREE, "obstacle": grid.labels == OBSTACLE}
+    points = {kind: grid.centres(mask) for kind, mask in masks.items()}
+    heights = {f"{kind}_height": None if grid.height is None else grid.height[mask] for kind, mask in masks.items()}
+    low = points["free"].min(axis=0)
+    recentre = options.recentre
+    if recentre is None:
+        recentre = max(np.abs(cloud).max(initial=0.0) for cloud in points.values()) > 10_000
+    if recentre:
+        points = {kind: cloud - low for kind, cloud in points.items()}
+        report.add("recentre", f"subtracted ({low[0]:.3f}, {low[1]:.3f}) m")
+    return PointCloudMap(points["free"], points["obstacle"], grid.cell, name=name, scenario=scenario.name, **heights)

@@ -1,0 +1,184 @@
+"""ROS map_server maps: a yaml file beside a pgm or png image."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from maexp.envs.map import MapError, check_file
+
+from .grid import FREE, MAX_CELLS, OBSTACLE, UNKNOWN, Grid
+from .options import ImportOptions
+from .report import ImportReport
+
+MAX_YAML_BYTES = 64 * 1024
+FORMATS = ("PPM", "PNG", "BMP", "TIFF", "JPEG")
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the yaml says: lengths in metres, thresholds as shares of black."""
+
+    image: Path
+    pixel: float
+    origin: tuple[float, float, float]  # of the lower left corner; the third number is the yaw [rad]
+    negate: bool
+    occupied: float
+    free: float
+    mode: str
+
+
+def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> Grid:
+    """Grid of a yaml, or of an image whose yaml lies beside it or whose `pixel_size` is given."""
+    if path.suffix.lower() in (".yaml", ".yml"):
+        sheet = _read_yaml(path, options, report)
+    else:
+        beside = path.with_suffix(".yaml")
+        if options.pixel_size is None and beside.is_file():
+            sheet = _read_yaml(beside, options, report)
+        elif options.pixel_size is not None:
+            sheet = _make_sheet(path, {"image": path.name}, options)
+        else:
+            raise MapError(f"{path} is an image without {beside.name} beside it; give its yaml, or pixel_size [m]")
+    values, opaque = _read_image(sheet.image)
+    labels = _label(values, opaque, sheet, report)
+    grid = Grid(labels[::-1].T.copy(), sheet.pixel, sheet.origin[:2], sheet.origin[2])
+    report.add(
+        "read",
+        f"{sheet.image.name}: {labels.shape[1]} x {labels.shape[0]} pixels of {sheet.pixel:g} m; occupied above "
+        f"{sheet.occupied:g}, free below {sheet.free:g}; {grid.count(FREE):,} free, {grid.count(OBSTACLE):,} occupied, "
+        f"{grid.count(UNKNOWN):,} unknown",
+        after=labels.size,
+    )
+    if not grid.count(FREE):
+        raise MapError(
+            f"{path}: no pixel is free (free_thresh {sheet.free:g}, negate {int(sheet.negate)}, image values "
+            f"{values.min():g} to {values.max():g}); set free_threshold"
+        )
+    return grid
+
+
+def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Sheet:
+    check_file(path)
+    if path.stat().st_size > MAX_YAML_BYTES:
+        raise MapError(f"{path} has {path.stat().st_size} bytes; a map_server yaml has at most {MAX_YAML_BYTES}")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise MapError(f"{path} is not yaml ({str(error).splitlines()[0]}); repair the file") from error
+    if not isinstance(content, dict) or not {"image", "resolution"} <= content.keys():
+        raise MapError(f"{path} is not a map_server yaml: it needs the keys image and resolution")
+    origin = content.get("origin")
+    if isinstance(origin, list) and len(origin) > 3:
+        report.warn(f"origin has {len(origin)} numbers; the first three are taken as x, y, yaw")
+    return _make_sheet(path, content, options)
+
+
+def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
+    image = content["image"]
+    if not isinstance(image, str):
+        raise MapError(f"{path}: image={image!r} must be the path of a pgm or png file")
+    origin = content.get("origin", [0.0, 0.0, 0.0])
+    if not isinstance(origin, list) or len(origin) < 2:
+        raise MapError(f"{path}: origin={origin!r} must be a list of x, y [m] and yaw [rad]")
+    origin = [_number(path, "origin", value) for value in [*origin, 0.0][:3]]
+    mode = content.get("mode", "trinary")
+    if mode not in ("trinary", "scale", "raw"):
+        raise MapError(f"{path}: mode={mode!r} must be trinary, scale or raw")
+    given = {
+        "resolution": options.pixel_size or content.get("resolution"),
+        "occupied_thresh": _first(options.occupied_threshold, content.get("occupied_thresh"), 0.65),
+        "free_thresh": _first(options.free_threshold, content.get("free_thresh"), 0.196),
+        "negate": content.get("negate", 0),
+    }
+    numbers = {name: _number(path, name, value) for name, value in given.items()}
+    if not 1e-4 <= numbers["resolution"] <= 100:
+        raise MapError(f"{path}: resolution={numbers['resolution']:g} must be between 0.0001 and 100 m a pixel")
+    if not 0 <= numbers["free_thresh"] <= numbers["occupied_thresh"] <= 1:
+        raise MapError(
+            f"{path}: free_thresh={numbers['free_thresh']:g} and occupied_thresh={numbers['occupied_thresh']:g} "
+            "must be shares of black with 0 <= free <= occupied <= 1"
+        )
+    return Sheet(
+        path.parent / image,
+        numbers["resolution"],
+        tuple(origin),
+        bool(numbers["negate"]),
+        numbers["occupied_thresh"],
+        numbers["free_thresh"],
+        mode,
+    )
+
+
+def _first(*values):
+    return next(value for value in values if value is not None)
+
+
+def _number(path: Path, name: str, value) -> float:
+    if not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise MapError(f"{path}: {name}={value!r} must be a number")
+    return float(value)
+
+
+def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Brightness in 0..255, float32 [height, width], and which pixels are opaque (None: all)."""
+    check_file(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # large images are checked below
+            with Image.open(path, formats=FORMATS) as image:
+                if image.width * image.height > MAX_CELLS:
+                    raise MapError(f"{path} has {image.width} x {image.height} pixels; at most {MAX_CELLS} are read")
+                alpha = np.asarray(image.convert("RGBA"))[..., 3] if "A" in image.getbands() else None
+                deep = image.mode.startswith("I") or image.mode == "F"
+                values = np.asarray(image if deep else image.convert("L"), dtype=np.float32)
+    except MapError:
+        raise
+    except Exception as error:  # Pillow raises whatever its decoders raise on damaged files
+        raise MapError(f"{path} is not a readable pgm or png image ({error}); it may be truncated") from error
+    if deep:
+        values = values * (255 / 65535)
+    return values, None if alpha is None else alpha > 0
+
+
+def _label(values: np.ndarray, opaque, sheet: Sheet, report: ImportReport) -> np.ndarray:
+    """UNKNOWN, FREE or OBSTACLE of every pixel, by the rules of map_server."""
+    if sheet.mode == "raw":
+        occupied = values / 100
+    else:
+        occupied = values / 255 if sheet.negate else (255 - values) / 255
+    labels = np.full(values.shape, UNKNOWN, dtype=np.uint8)
+    labels[occupied < sheet.free] = FREE
+    labels[occupied > sheet.occupied] = OBSTACLE
+    if sheet.mode == "raw":
+        labels[values > 100] = UNKNOWN
+    if opaque is not None:
+        labels[~opaque] = UNKNOWN
+    grey = _find_grey_margin(values, labels)
+    if grey is not None:
+        labels[values == grey] = UNKNOWN
+        report.warn(
+            f"grey {grey:g} fills the image's margin yet counts as free with free_thresh {sheet.free:g}: it was "
+            "taken as unknown (set free_threshold below it in the yaml)"
+        )
+    return labels
+
+
+def _find_grey_margin(values: np.ndarray, labels: np.ndarray) -> float | None:
+    """A mid-grey that fills most of the margin and passes as free although a whiter free exists.
+
+    Maps painted with 206 instead of 205 for unknown slip through the usual threshold of 0.196.
+    """
+    margin = np.concatenate([values[0], values[-1], values[:, 0], values[:, -1]])
+    shades, counts = np.unique(margin, return_counts=True)
+    grey = float(shades[counts.argmax()])
+    whiter = (labels == FREE) & (np.abs(values - grey) > 30)
+    mid = 150 < grey < 225 and counts.max() > 0.5 * len(margin)
+    free = bool((labels[values == grey] == FREE).all())
+    return grey if mid and free and whiter.sum() > 0.01 * values.size else None
