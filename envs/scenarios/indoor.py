@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from maexp.envs.map import PointCloudMap
 from scipy import ndimage
+
+from maexp.envs.map import PointCloudMap
 
 from .furniture import CELL, CLEARANCE, Furnisher, Room, cells
 from .lattice import grid_points, largest_component, make_generator

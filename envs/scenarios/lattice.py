@@ -3,8 +3,9 @@
 import hashlib
 
 import numpy as np
-from maexp.envs.map import PointCloudMap
 from scipy import ndimage
+
+from maexp.envs.map import PointCloudMap
 
 
 def make_generator(scenario: str, index: int) -> np.random.Generator:

@@ -1,6 +1,7 @@
 """Mazes: a random spanning tree of cells (Kruskal), corridors of constant width, no loops."""
 
 import numpy as np
+
 from maexp.envs.map import PointCloudMap
 
 from .lattice import grid_map, make_generator

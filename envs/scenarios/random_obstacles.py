@@ -1,8 +1,9 @@
 """Random obstacles: corridors, corner loops and rooms first, then isolated obstacles up to a set density."""
 
 import numpy as np
-from maexp.envs.map import PointCloudMap
 from scipy import ndimage
+
+from maexp.envs.map import PointCloudMap
 
 from .lattice import grid_map, grid_points, largest_component, make_generator
 

@@ -10,6 +10,7 @@ from maexp.envs.map import PointCloudMap
 
 from .indoor import build_indoor
 from .maze import build_maze
+from .outdoor import build_outdoor
 from .random_obstacles import build_adaptive, build_random_obstacles
 
 
@@ -63,6 +64,9 @@ _ROWS = [
              build=partial(build_indoor, scenario="indoor_medium", longest=(10.2, 13.8))),
     Scenario("indoor_large", count=22, size=20.0, **_INDOOR,
              build=partial(build_indoor, scenario="indoor_large", longest=(14.4, 19.8))),
+    Scenario("outdoor", count=32, resolution=1.5, size=288.0, radar_range=20.0, max_speed=6.0, **_CAR,
+             clearance_factor=4.2, local_steps=40, macro_steps=20, num_steering=21,
+             build=partial(build_outdoor, scenario="outdoor")),
     Scenario("pointcloud", count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
              max_accel=1.0, body_length=0.6, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
              local_steps=20, macro_steps=None),
