@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from maexp.envs.config import RadarConfig
 from maexp.envs.map import PointCloudMap
-from maexp.kernels.types import PIXELS, REGIONS
+from maexp.kernels.types import PIXELS
 
 CELLS_PER_RANGE = 5
 FRAME_MARGIN = 0.05
@@ -56,8 +56,9 @@ def build_bank(maps: list[PointCloudMap], radars: list[RadarConfig]) -> MapBank:
     arrays["cell_begin"] = _begins([len(p["points"]["free_cell"]) for p in parts])[:-1]
     neighbours = [p["neighbour_count"] for p in parts]
     arrays["neighbour_begin"] = _begins(np.concatenate(neighbours))
-    arrays["pixel_begin"] = _begins([len(p["points"]["pixel"]) for p in parts])
     arrays["pixel_point_begin"] = _begins(np.concatenate([p["pixel_count"] for p in parts]))
+    arrays["point_pixel_begin"] = _begins(np.concatenate([p["shown_count"] for p in parts]))
+    arrays["shown_begin"] = _begins([len(p["shown_count"]) for p in parts])[:-1]
     for name in parts[0]["scalars"]:
         arrays[name] = np.stack([np.asarray(p["scalars"][name]) for p in parts])
     return MapBank(
@@ -88,7 +89,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
     weight, total = _weights(m)
     neighbour_count, neighbour = _neighbours(m, free, boundary, boundary_order)
     frame_origin, pixel = _frame(m.extent)
-    shown, pixel_count, pixel_point = _pixels(m, free, boundary, free_order, boundary_order, frame_origin, pixel)
+    pixel_of, point_of = _pixels(m, free, boundary, free_order, boundary_order, frame_origin, pixel)
     clearance = cKDTree(m.boundary).query(free)[0] if len(boundary) else np.full(len(free), np.inf)
     (x0, y0), (x1, y1) = m.extent
     return {
@@ -103,8 +104,8 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "occluder": occluder[occluder_order],
             "occluder_radius": radius[occluder_order],
             "occluder_cell": occluder_cell,
-            "pixel": shown,
-            "pixel_point": pixel_point,
+            "pixel_point": point_of[np.argsort(pixel_of, kind="stable")],
+            "point_pixel": pixel_of[np.argsort(point_of, kind="stable")],
         },
         "scalars": {
             "total_weight": np.int32(total),
@@ -120,7 +121,8 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "pixel_size": np.float32(pixel),
         },
         "neighbour_count": neighbour_count,
-        "pixel_count": pixel_count,
+        "pixel_count": np.bincount(pixel_of, minlength=_PIXELS * _PIXELS),
+        "shown_count": np.bincount(point_of, minlength=len(free) + len(boundary)),
         "order_free": free_order,
         "order_boundary": boundary_order,
         "bounds": {
@@ -193,7 +195,8 @@ def _weights(m: PointCloudMap) -> tuple[np.ndarray, int]:
     total = weight.sum()
     if total >= 2**31:
         raise ValueError(
-            f"map {m.name}: spacings from {m.free_spacing.min():g} to {m.free_spacing.max():g} m differ too much to weigh"
+            f"map {m.name}: spacings from {m.free_spacing.min():g} to {m.free_spacing.max():g} m differ too much "
+            "to weigh: bring them closer together"
         )
     return weight.astype(np.int32), int(total)
 
@@ -217,25 +220,20 @@ def _frame(extent) -> tuple[np.ndarray, float]:
     return 0.5 * (low + high) - 0.5 * side + 0.5 * pixel, pixel
 
 
-def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels that show points, how many each, and which: those nearest to its centre, or between points the nearest."""
+def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (pixel, point): a pixel shows the points nearest to its centre; between points, an empty one the nearest.
+
+    Points are numbered free first, then boundary.
+    """
     points = np.concatenate([free[:, :2], boundary[:, :2]]).astype(np.float64)
-    code = np.concatenate([np.arange(len(free)), -1 - np.arange(len(boundary))]).astype(np.int32)
+    code = np.arange(len(points), dtype=np.int32)
     spacing = np.concatenate([m.free_spacing[free_order], m.boundary_spacing[boundary_order]])
     at = np.clip(np.floor((points - origin) / pixel + 0.5).astype(int), 0, _PIXELS - 1)
     index = at[:, 0] * _PIXELS + at[:, 1]
     empty = np.setdiff1d(np.arange(_PIXELS * _PIXELS), index)
     centres = origin + pixel * np.stack([empty // _PIXELS, empty % _PIXELS], axis=1)
     distance, nearest = cKDTree(points).query(centres)
-    # Within a spacing's diagonal of a point, a pixel lies between points rather than outside the map.
+    # Within half a spacing's diagonal of a point, a pixel lies between points rather than outside the map.
     between = distance <= spacing[nearest] / math.sqrt(2.0) * (1.0 + 1e-6)
-    index = np.concatenate([index, empty[between]])
-    code = np.concatenate([code, code[nearest[between]]])
-    order = np.argsort(index, kind="stable")
-    shown, counts = np.unique(index, return_counts=True)
-    return shown.astype(np.int32), counts, code[order]
-
-
-def region_count() -> int:
-    """Regions the policy chooses from (8 x 8)."""
-    return int(REGIONS) ** 2
+    index = np.concatenate([index, empty[between]]).astype(np.int32)
+    return index, np.concatenate([code, code[nearest[between]]])

@@ -21,21 +21,21 @@ def center_of(pose: wp.vec4, offset: float) -> wp.vec2:
 
 
 @wp.func
-def advance(kind: int, pose: wp.vec4, slip: float, control: wp.vec2, wheelbase: float, dt: float) -> wp.vec4:
-    """One explicit Euler step; the speed is not limited here."""
-    x = pose[0]
-    y = pose[1]
-    v = pose[2]
-    theta = pose[3]
-    c = wp.cos(theta)
-    s = wp.sin(theta)
-    x += (v * c - slip * s) * dt
-    y += (v * s + slip * c) * dt
+def curvature(kind: int, turn: float, wheelbase: float) -> float:
+    """Turn per metre driven [rad/m] that a control asks of a car; 0 for the other kinds."""
     if kind == ACKERMANN:
-        theta += v * wp.tan(control[1]) / wheelbase * dt
-    elif kind == DIFFERENTIAL:
-        theta += control[1] * dt
-    return wp.vec4(x, y, v + control[0] * dt, theta)
+        return wp.tan(turn) / wheelbase
+    return 0.0
+
+
+@wp.func
+def heading_change(kind: int, v: float, turn: float, curve: float, dt: float) -> float:
+    """Change of heading in one explicit Euler step [rad]."""
+    if kind == ACKERMANN:
+        return v * curve * dt
+    if kind == DIFFERENTIAL:
+        return turn * dt
+    return 0.0
 
 
 @wp.func
@@ -60,7 +60,8 @@ def rectangle_corner(k: int, center: wp.vec2, theta: float, length: float, width
 
 @wp.func
 def separated(
-    center: wp.vec2, theta: float, length: float, width: float, other: wp.vec2, theta_o: float, length_o: float, width_o: float
+    center: wp.vec2, theta: float, length: float, width: float,
+    other: wp.vec2, theta_o: float, length_o: float, width_o: float,
 ) -> bool:
     """Whether an axis of the first rectangle separates the two."""
     c = wp.cos(theta)
@@ -75,7 +76,8 @@ def separated(
 
 @wp.func
 def rectangles_gap(
-    center: wp.vec2, theta: float, length: float, width: float, other: wp.vec2, theta_o: float, length_o: float, width_o: float
+    center: wp.vec2, theta: float, length: float, width: float,
+    other: wp.vec2, theta_o: float, length_o: float, width_o: float,
 ) -> float:
     """Distance of two oriented rectangles, 0 where they overlap.
 
@@ -120,18 +122,22 @@ def _move_robots(
     side = slip[e, i]
     limit = robots.max_speed[e, i]
     path_length[e, i] = path_length[e, i] + wp.length(wp.vec2(old[2], side)) * dt
+    c = wp.cos(old[3])
+    s = wp.sin(old[3])
+    x = old[0] + (old[2] * c - side * s) * dt
+    y = old[1] + (old[2] * s + side * c) * dt
     if kind == ACKERMANN or kind == DIFFERENTIAL:
         u = wp.vec2(wp.clamp(u[0], -accel, accel), wp.clamp(u[1], -turn, turn))
-        after = advance(kind, old, side, u, robots.wheelbase[e, i], dt)
-        pose[e, i] = wp.vec4(after[0], after[1], wp.clamp(after[2], -limit, limit), wrap_angle(after[3]))
+        curve = curvature(kind, u[1], robots.wheelbase[e, i])
+        theta = wrap_angle(old[3] + heading_change(kind, old[2], u[1], curve, dt))
+        pose[e, i] = wp.vec4(x, y, wp.clamp(old[2] + u[0] * dt, -limit, limit), theta)
     else:
         u = wp.vec2(wp.clamp(u[0], -accel, accel), wp.clamp(u[1], -accel, accel))
-        after = advance(kind, old, side, u, robots.wheelbase[e, i], dt)
-        velocity = wp.vec2(after[2], side + u[1] * dt)
+        velocity = wp.vec2(old[2] + u[0] * dt, side + u[1] * dt)
         speed = wp.length(velocity)
         if speed > limit:
             velocity = velocity * (limit / speed)
         slip[e, i] = velocity[1]
-        pose[e, i] = wp.vec4(after[0], after[1], velocity[0], wrap_angle(after[3]))
-    c = center_of(pose[e, i], robots.center_offset[e, i])
-    center[e, i] = wp.vec3(c[0], c[1], 0.0)
+        pose[e, i] = wp.vec4(x, y, velocity[0], old[3])
+    at = center_of(pose[e, i], robots.center_offset[e, i])
+    center[e, i] = wp.vec3(at[0], at[1], 0.0)

@@ -1,7 +1,7 @@
 """What the policy sees: pictures, poses, region offsets (design 2, 4.2; paper, section IV-D).
 
 Picture: a square frame around the extent, x along the first axis, flattened to 125 * 125 pixels.
-Which points a pixel shows is fixed per map (`Maps.pixel_point`).
+Which points a pixel shows is fixed per map (`Maps.pixel_point`, and the other way `Maps.point_pixel`).
 """
 
 import warp as wp
@@ -24,6 +24,21 @@ def pixel_of(maps: Maps, m: int, p: wp.vec2) -> wp.vec2i:
     )
 
 
+@wp.func
+def count_viewers(maps: Maps, m: int, e: int, p: int, free_count: int, seen_free: wp.array3d(dtype=wp.int32)) -> int:
+    """Robots that have seen a free point shown by pixel p."""
+    pixel = m * PIXELS * PIXELS + p
+    viewers = int(0)
+    for w in range(seen_free.shape[1]):
+        word = int(0)
+        for k in range(maps.pixel_point_begin[pixel], maps.pixel_point_begin[pixel + 1]):
+            j = maps.pixel_point[k]
+            if j < free_count:
+                word = word | seen_free[e, w, j]
+        viewers += wp.bit_count(word)
+    return viewers
+
+
 @wp.kernel
 def _draw_points(
     # Map:
@@ -31,6 +46,7 @@ def _draw_points(
     map_id: wp.array(dtype=wp.int32),
     robot_count: int,
     team_bits: int,
+    lanes: int,
     # State in:
     draw_free: wp.array3d(dtype=wp.int32),
     draw_boundary: wp.array3d(dtype=wp.int32),
@@ -40,57 +56,44 @@ def _draw_points(
     picture: wp.array4d(dtype=wp.uint8),
     team: wp.array3d(dtype=wp.uint8),
 ):
-    """One shown pixel of every robot of env e: explored and obstacle; of the team: explored, obstacle, viewers.
+    """Enter every known point of env e into the pictures of the robots (explored, obstacle) and of the team.
 
     ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map;
     with ``team_bits`` every robot is drawn the team's map (what it knows under perfect communication).
-    The pictures come in as zeros, so a pixel nobody knows costs only its reading.
+    The pictures come in as zeros, so a point nobody knows costs only its reading.
     """
-    e, k = wp.tid()
+    e, lane = wp.tid()
     m = map_id[e]
-    shown = maps.pixel_begin[m] + k
-    if shown >= maps.pixel_begin[m + 1]:
-        return
-    p = maps.pixel[shown]
-    start = maps.pixel_point_begin[shown]
-    stop = maps.pixel_point_begin[shown + 1]
-    viewers = int(0)
-    explored = OFF
-    obstacle = OFF
-    for w in range(seen_free.shape[1]):
-        free_word = int(0)
-        wall_word = int(0)
-        team_free = int(0)
-        team_wall = int(0)
-        for q in range(start, stop):
-            j = maps.pixel_point[q]
-            if j >= 0:
-                free_word = free_word | draw_free[e, w, j]
-                team_free = team_free | seen_free[e, w, j]
+    free_count = maps.free_begin[m + 1] - maps.free_begin[m]
+    count = free_count + maps.boundary_begin[m + 1] - maps.boundary_begin[m]
+    for j in range(lane, count, lanes):
+        channel = wp.where(j < free_count, 0, 1)
+        start = maps.point_pixel_begin[maps.shown_begin[m] + j]
+        stop = maps.point_pixel_begin[maps.shown_begin[m] + j + 1]
+        anyone = int(0)
+        for w in range(seen_free.shape[1]):
+            word = int(0)
+            if channel == 0:
+                word = draw_free[e, w, j]
+                anyone = anyone | seen_free[e, w, j]
             else:
-                wall_word = wall_word | draw_boundary[e, w, -1 - j]
-                team_wall = team_wall | seen_boundary[e, w, -1 - j]
-        viewers += wp.bit_count(team_free)
-        if team_free != 0:
-            explored = ON
-        if team_wall != 0:
-            obstacle = ON
-        first = w * ROBOTS_PER_WORD
-        if (free_word | wall_word) != 0:
-            for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
-                bit = 1 << (i - first)
-                if (free_word & bit) != 0:
-                    picture[e, i, 0, p] = ON
-                if (wall_word & bit) != 0:
-                    picture[e, i, 1, p] = ON
-    if team_bits != 0:
-        for i in range(robot_count):
-            picture[e, i, 0, p] = explored
-            picture[e, i, 1, p] = obstacle
-    if explored != OFF or obstacle != OFF:
-        team[e, 0, p] = explored
-        team[e, 1, p] = obstacle
-        team[e, 2, p] = wp.uint8(wp.min(viewers, 255))
+                word = draw_boundary[e, w, j - free_count]
+                anyone = anyone | seen_boundary[e, w, j - free_count]
+            if word != 0 and team_bits == 0:
+                first = w * ROBOTS_PER_WORD
+                for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
+                    if (word & (1 << (i - first))) != 0:
+                        for k in range(start, stop):
+                            picture[e, i, channel, maps.point_pixel[k]] = ON
+        if anyone != 0:
+            for k in range(start, stop):
+                p = maps.point_pixel[k]
+                team[e, channel, p] = ON
+                if channel == 0:
+                    team[e, 2, p] = wp.uint8(wp.min(count_viewers(maps, m, e, p, free_count, seen_free), 255))
+                if team_bits != 0:
+                    for i in range(robot_count):
+                        picture[e, i, channel, p] = ON
 
 
 @wp.func

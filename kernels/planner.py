@@ -2,27 +2,18 @@
 
 import warp as wp
 
-from maexp.kernels.dynamics import advance, center_of, rectangle_distance, rectangles_gap
+from maexp.kernels.dynamics import curvature, heading_change, rectangle_distance, rectangles_gap
 from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span
 
 NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
 
 
 @wp.func
-def candidate(kind: int, k: int, num_turns: int, num_accels: int, accel: float, turn: float) -> wp.vec2:
-    """Candidate ``k``: accelerations outside, turns inside, both evenly spaced over their limits."""
-    a = k / num_turns
-    b = k % num_turns
-    first = float(0.0)
-    second = float(0.0)
-    if num_accels > 1:
-        first = -accel + 2.0 * accel * float(a) / float(num_accels - 1)
-    reach = turn
-    if kind == OMNIDIRECTIONAL:
-        reach = accel
-    if num_turns > 1:
-        second = -reach + 2.0 * reach * float(b) / float(num_turns - 1)
-    return wp.vec2(first, second)
+def spread(k: int, count: int, limit: float) -> float:
+    """Value ``k`` of ``count`` evenly spaced over [-limit, limit]; a single one is 0."""
+    if count > 1:
+        return -limit + 2.0 * limit * float(k) / float(count - 1)
+    return 0.0
 
 
 @wp.func
@@ -148,7 +139,9 @@ def _plan_dwa(
     control: wp.array2d(dtype=wp.vec2),
     error: wp.array(dtype=wp.int32),
 ):
-    """Dynamic window: the candidate with the best score after ``horizon`` steps; the first maximum wins.
+    """Dynamic window: the candidate with the best score after ``horizon`` steps.
+
+    Candidates are numbered with accelerations outside and turns inside; the first maximum wins.
 
     score = -distance(target) + weight * log(d / clearance) where d < clearance, d the distance of the
     predicted body to what is known to be in the way.
@@ -175,24 +168,53 @@ def _plan_dwa(
     if count > nearby.shape[2]:
         wp.atomic_or(error, e, 4)
         count = nearby.shape[2]
+    reach_turn = turn
+    if kind == OMNIDIRECTIONAL:
+        reach_turn = accel
+    # The first step's position and heading do not depend on the acceleration: turns outside save trigonometry.
+    v0 = start[2]
+    side0 = slip[e, i]
+    c0 = wp.cos(start[3])
+    s0 = wp.sin(start[3])
+    x0 = start[0] + (v0 * c0 - side0 * s0) * dt
+    y0 = start[1] + (v0 * s0 + side0 * c0) * dt
     best = float(-1.0e30)
-    for k in range(num_accels * num_turns):
-        u = candidate(kind, k, num_turns, num_accels, accel, turn)
-        p = start
-        side = slip[e, i]
-        for _step in range(horizon):
-            p = advance(kind, p, side, u, robots.wheelbase[e, i], dt)
-            if kind == OMNIDIRECTIONAL:
-                side += u[1] * dt
-        c = center_of(p, offset)
-        d = obstacle_distance(count, e, i, c, p[3], length, width, footprint, nearby)
-        d = wp.min(d, body_distance(robots, e, i, c, p[3], footprint, in_range, pose, center))
-        score = -wp.length(target[e, i] - c)
-        if d < clearance:
-            score += weight * wp.log(wp.max(d, NEAREST) / clearance)
-        if score > best:
-            best = score
-            control[e, i] = u
+    best_k = int(0)
+    for b in range(num_turns):
+        u = spread(b, num_turns, reach_turn)
+        curve = curvature(kind, u, robots.wheelbase[e, i])
+        theta1 = start[3] + heading_change(kind, v0, u, curve, dt)
+        c1 = wp.cos(theta1)
+        s1 = wp.sin(theta1)
+        for a in range(num_accels):
+            push = spread(a, num_accels, accel)
+            x = float(x0)
+            y = float(y0)
+            v = v0 + push * dt
+            side = float(side0)
+            theta = float(theta1)
+            c = float(c1)
+            s = float(s1)
+            for _step in range(horizon - 1):
+                if kind == OMNIDIRECTIONAL:
+                    side += u * dt
+                x += (v * c - side * s) * dt
+                y += (v * s + side * c) * dt
+                theta += heading_change(kind, v, u, curve, dt)
+                v += push * dt
+                c = wp.cos(theta)
+                s = wp.sin(theta)
+            p = wp.vec2(x + offset * c, y + offset * s)
+            d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
+            d = wp.min(d, body_distance(robots, e, i, p, theta, footprint, in_range, pose, center))
+            score = -wp.length(target[e, i] - p)
+            if d < clearance:
+                score += weight * wp.log(wp.max(d, NEAREST) / clearance)
+            k = a * num_turns + b
+            if score > best or (score == best and k < best_k):
+                best = score
+                best_k = k
+                control[e, i] = wp.vec2(push, u)
 
 
 @wp.kernel

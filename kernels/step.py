@@ -221,10 +221,12 @@ class Shard:
         free, boundary = s.seen_free, s.seen_boundary
         if self.sim.settings.draw_known and self.sim.settings.comm_limited:
             free, boundary = s.known_free, s.known_boundary
+        lanes = 1 if self.device.is_cpu else 1024
         draw = partial(wp.launch, device=self.device)
         draw(
-            observe._draw_points, dim=(self.shape[0], self.sim.max_pixels),
-            inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, free, boundary, s.seen_free, s.seen_boundary],
+            observe._draw_points, dim=(self.shape[0], lanes),
+            inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, lanes,
+                    free, boundary, s.seen_free, s.seen_boundary],
             outputs=out,
         )  # fmt: skip
         draw(
@@ -272,7 +274,6 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
-        self.max_pixels = int(maps["pixel_begin"].diff().max())
         self.team_bits = int(settings.draw_known and not settings.comm_limited)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
@@ -306,7 +307,12 @@ class Simulation:
         self.each_shard(lambda shard: shard.run(start, count))
 
     def observe(self, picture, team, pose, grid) -> None:
-        """Fill the observation tensors, zero before: [E, N, 4, 125, 125] and [E, 3, 125, 125] uint8, [E, N, 4], [E, N, 4, 8, 8]."""
+        """Fill the observation tensors.
+
+        Args:
+            picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125].
+            pose, grid: float32 [E, N, 4] and [E, N, 4, 8, 8].
+        """
         self.each_shard(lambda shard: shard.observe(picture, team, pose, grid))
 
 

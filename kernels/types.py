@@ -73,10 +73,12 @@ class Maps:
     upper: wp.array(dtype=wp.vec2)
     frame_origin: wp.array(dtype=wp.vec2)
     pixel_size: wp.array(dtype=wp.float32)
-    # Pixels that show points at all, and their points: free point j as j, boundary point j as -1 - j.
-    pixel: wp.array(dtype=wp.int32)
-    pixel_begin: wp.array(dtype=wp.int32)  # [M + 1]
-    pixel_point_begin: wp.array(dtype=wp.int32)  # [all shown pixels + 1]
+    # Pixels that show a point, and points that a pixel shows. Points are numbered free first, then boundary;
+    # ``shown_begin`` is the first entry of a map's points in ``point_pixel_begin``.
+    shown_begin: wp.array(dtype=wp.int32)  # [M]
+    point_pixel_begin: wp.array(dtype=wp.int32)
+    point_pixel: wp.array(dtype=wp.int32)
+    pixel_point_begin: wp.array(dtype=wp.int32)  # [M * 125 * 125 + 1]
     pixel_point: wp.array(dtype=wp.int32)
 
 
@@ -112,6 +114,12 @@ def cell_index(value: float, origin: float, size: float, count: int) -> int:
 
 
 @wp.func
+def floor_within(value: float, size: float, low: int, high: int) -> int:
+    """``value / size`` rounded down, in [low, high]: clamped as a float, for a huge range overflows an int."""
+    return int(wp.clamp(wp.floor(value / size), float(low), float(high)))
+
+
+@wp.func
 def row_span(maps: Maps, m: int, row: int, center: wp.vec2, radius: float) -> wp.vec2i:
     """First and last column of cells in ``row`` that a disc can touch (first > last: none)."""
     size = maps.cell_size[m]
@@ -120,9 +128,9 @@ def row_span(maps: Maps, m: int, row: int, center: wp.vec2, radius: float) -> wp
     gap = wp.max(wp.max(low - center[1], center[1] - low - size), 0.0)
     half = wp.sqrt(wp.max(radius * radius - gap * gap, 0.0)) + 1.0e-3 * size
     count = maps.cells_x[m]
-    first = int(wp.floor((center[0] - half - origin[0]) / size))
-    last = int(wp.floor((center[0] + half - origin[0]) / size))
-    return wp.vec2i(wp.max(first, 0), wp.min(last, count - 1))
+    first = floor_within(center[0] - half - origin[0], size, 0, count)
+    last = floor_within(center[0] + half - origin[0], size, -1, count - 1)
+    return wp.vec2i(first, last)
 
 
 @wp.func
@@ -131,6 +139,7 @@ def row_range(maps: Maps, m: int, center: wp.vec2, radius: float) -> wp.vec2i:
     size = maps.cell_size[m]
     origin = maps.cell_origin[m]
     reach = radius + 1.0e-3 * size
-    first = int(wp.floor((center[1] - reach - origin[1]) / size))
-    last = int(wp.floor((center[1] + reach - origin[1]) / size))
-    return wp.vec2i(wp.max(first, 0), wp.min(last, maps.cells_y[m] - 1))
+    count = maps.cells_y[m]
+    first = floor_within(center[1] - reach - origin[1], size, 0, count)
+    last = floor_within(center[1] + reach - origin[1], size, -1, count - 1)
+    return wp.vec2i(first, last)
