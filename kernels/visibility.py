@@ -14,7 +14,7 @@ masked, and only the rest meets the occluders one by one: the verdict is the sam
 
 import warp as wp
 
-from maexp.kernels.types import PI, ROBOTS_PER_WORD, Maps, Robots, row_range, row_span
+from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots, row_range, row_span
 
 BINS = wp.constant(128)
 FAR = wp.constant(1.0e30)
@@ -159,7 +159,7 @@ def is_masked(
 ) -> bool:
     """Whether any of the ``count`` occluders masks the free point at ``delta``."""
     b = bin_of(delta[0], delta[1])
-    if not (bins[e, i, b] - dist < alpha2):
+    if dist == 0.0 or not (bins[e, i, b] - dist < alpha2):
         return False
     if bins[e, i, BINS + b] - dist < alpha2 and wp.abs(delta[2]) <= 1.0e-6 * dist:
         return True
