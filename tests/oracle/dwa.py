@@ -7,7 +7,6 @@ import numpy as np
 from oracle.motion import ackermann, center
 from oracle.radar import distance
 
-
 UNLIMITED = {"max_speed": math.inf, "max_accel": math.inf, "max_steer": math.inf}
 
 

@@ -34,10 +34,12 @@ def masks(free, obstacle, alpha1: float, alpha2: float, rho: float, slack: float
 
 
 def in_view(vector, heading: float, fov: float, slack: float = 0.0) -> bool:
-    """True when the bearing of `vector` lies within half the field of view of `heading` [rad]."""
-    if fov >= 2.0 * math.pi or (vector[0] == 0.0 and vector[1] == 0.0):
+    """True when the angle between `vector` and the heading [rad, in the plane] stays within half `fov`."""
+    length = math.sqrt(sum(c * c for c in vector))
+    if fov >= 2.0 * math.pi or length == 0.0:
         return True
-    return abs(wrap(math.atan2(vector[1], vector[0]) - heading)) <= 0.5 * fov + slack
+    cosine = (vector[0] * math.cos(heading) + vector[1] * math.sin(heading)) / length
+    return math.acos(min(1.0, max(-1.0, cosine))) <= 0.5 * fov + slack
 
 
 def visible_points(
