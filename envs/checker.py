@@ -21,6 +21,7 @@ from maexp.envs.reach import (
 from maexp.envs.scenarios import find_scenario
 
 START_CLEARANCE = 3.0  # starts keep this many collision thresholds from walls and each other (design 4.3)
+SEAL_ROUNDS = 4
 VISIBLE_SHARE = 0.95  # below it no episode can reach the coverage that ends it
 PICTURE_PIXELS = 125 * 125  # of the observation (design 4.2)
 
@@ -225,8 +226,10 @@ def repair_map(
     if piece.any():
         world = _replace(world, free_kept=piece == 0)
         steps.append(f"kept the largest of {piece.max() + 1} pieces: dropped {(piece > 0).sum():,} free points")
-    wall = find_seal(world)
-    if len(wall):
+    for _ in range(SEAL_ROUNDS):  # a winding leak may need a second look
+        wall = find_seal(world)
+        if not len(wall):
+            break
         world = _replace(world, wall=wall)
         steps.append(f"sealed the map with {len(wall):,} obstacle points")
     return world, steps
@@ -247,7 +250,7 @@ def find_seal(world: PointCloudMap) -> np.ndarray:
     away, _ = cKDTree(world.free[:, :2]).query(places := lattice.places(np.ones(lattice.shape, dtype=bool)))
     ring = places[(away > 0.75 * unit) & (away < 2.1 * unit)]
     near = round(0.7 * unit / leaks.raster.step) + 1
-    way_out = ndimage.binary_dilation(leaks.outside, np.ones((2 * near + 1, 2 * near + 1)))
+    way_out = ndimage.binary_dilation(leaks.mouths, np.ones((2 * near + 1, 2 * near + 1)))
     return ring[way_out[leaks.raster.nearest(ring)]]
 
 

@@ -44,12 +44,16 @@ class Raster:
 
     @classmethod
     def around(cls, world: PointCloudMap, step: float, margin: float) -> Raster:
-        """Covers the map's extent and `margin` [m] more; the step grows if that needs too many places."""
-        low, high = (np.array(corner) for corner in world.extent)
+        """Covers all points and `margin` [m] more; the step grows if that needs too many places."""
+        points = np.concatenate([world.free[:, :2], world.obstacles[:, :2]]).astype(np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
         span = high - low + 2 * margin
         step = max(step, float(np.sqrt(span.prod() / MAX_RASTER_CELLS)))
-        shape = tuple((np.ceil(span / step).astype(int) + 1).tolist())
-        return cls(low - margin, step, shape)
+        corner = low - margin
+        anchor = world.free[0, :2]  # places of a lattice map fall on its points
+        corner = anchor - np.ceil((anchor - corner) / step) * step
+        shape = tuple((np.ceil((high + margin - corner) / step).astype(int) + 1).tolist())
+        return cls(corner, step, shape)
 
     def places(self, mask: np.ndarray) -> np.ndarray:
         return np.argwhere(mask) * self.step + self.corner
@@ -83,7 +87,7 @@ class Leaks:
 
     free: np.ndarray  # indices of the free points they leave from
     raster: Raster
-    outside: np.ndarray  # places they lead to, bool
+    mouths: np.ndarray  # places outside the walls that they lead to within a few steps, bool
 
 
 def find_leaks(world: PointCloudMap) -> Leaks:
@@ -98,7 +102,9 @@ def find_leaks(world: PointCloudMap) -> Leaks:
     pieces, _ = ndimage.label(~blocked)
     rim = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
     outside = np.isin(pieces, np.unique(rim[rim > 0]))
-    return Leaks(np.flatnonzero(outside[raster.nearest(world.free)]), raster, outside)
+    inside = raster.paint(world.free, 0.75 * world.free_spacing) & outside
+    mouths = ndimage.binary_dilation(inside, iterations=6, mask=outside)
+    return Leaks(np.flatnonzero(outside[raster.nearest(world.free)]), raster, mouths)
 
 
 @dataclass(frozen=True)
@@ -121,7 +127,7 @@ def find_reach(world: PointCloudMap, clearance: float, starts: np.ndarray) -> Re
 
     Nothing drives between neighbouring boundary points, however far apart they stand.
     """
-    step = min(world.resolution, max(clearance / 2, world.resolution / 4)) / 2
+    step = world.resolution / np.ceil(world.resolution / max(min(world.resolution / 2, clearance), 1e-3))
     raster = Raster.around(world, step, world.resolution)
     inside = raster.paint(world.free, 0.75 * world.free_spacing)
     walls = np.maximum(clearance * (1 - 1e-6), 0.6 * world.boundary_spacing)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -103,8 +105,9 @@ def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -
     base = scenario.resolution
     sizes = sorted({max(base * step, grid.cell) for step in STEPS_DOWN}, reverse=True)
     area = grid.count(FREE) * grid.cell**2
-    while area / sizes[0] ** 2 > options.max_points:
-        sizes.insert(0, sizes[0] * 1.25)
+    coarsest = math.ceil(math.sqrt(area / options.max_points) / 0.05) * 0.05
+    if coarsest > sizes[0]:
+        sizes = [round(coarsest, 3), *(size for size in sizes if size > coarsest / 4)]
     tried = {}
 
     def clean(size: float) -> _Cleaned:
@@ -112,7 +115,7 @@ def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -
             tried[size] = _Cleaned(resample(grid, size), scenario, options)
         return tried[size]
 
-    finest = next((size for size in sizes if size <= base / 3), sizes[-1])
+    finest = next((size for size in sizes if size <= sizes[0] / 3), sizes[-1])
     goal = KEPT_SHARE * clean(finest).area
     for size in sizes:
         cleaned = clean(size)

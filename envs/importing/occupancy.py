@@ -47,7 +47,7 @@ def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> 
         else:
             raise MapError(f"{path} is an image without {beside.name} beside it; give its yaml, or pixel_size [m]")
     values, opaque = _read_image(sheet.image)
-    labels = _label(values, opaque, sheet, report)
+    labels = _label(values, opaque, sheet, options, report)
     grid = Grid(labels[::-1].T.copy(), sheet.pixel, sheet.origin[:2], sheet.origin[2])
     report.add(
         "read",
@@ -147,7 +147,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return values, None if alpha is None else alpha > 0
 
 
-def _label(values: np.ndarray, opaque, sheet: Sheet, report: ImportReport) -> np.ndarray:
+def _label(values: np.ndarray, opaque, sheet: Sheet, options: ImportOptions, report: ImportReport) -> np.ndarray:
     """UNKNOWN, FREE or OBSTACLE of every pixel, by the rules of map_server."""
     if sheet.mode == "raw":
         occupied = values / 100
@@ -167,6 +167,13 @@ def _label(values: np.ndarray, opaque, sheet: Sheet, report: ImportReport) -> np
             f"grey {grey:g} fills the image's margin yet counts as free with free_thresh {sheet.free:g}: it was "
             "taken as unknown (set free_threshold below it in the yaml)"
         )
+    dark = _find_dark_unknown(values, labels)
+    wanted = options.grey_walls
+    if wanted is None:  # where walls are black, the greys beside them are only blur
+        wanted = sheet.mode != "raw" and int(dark.sum()) > int((labels == OBSTACLE).sum())
+    if wanted and dark.any():
+        labels[dark] = OBSTACLE
+        report.add("grey walls", "pixels darker than the grey of unknown space became obstacles", after=int(dark.sum()))
     return labels
 
 
@@ -182,3 +189,16 @@ def _find_grey_margin(values: np.ndarray, labels: np.ndarray) -> float | None:
     mid = 150 < grey < 225 and counts.max() > 0.5 * len(margin)
     free = bool((labels[values == grey] == FREE).all())
     return grey if mid and free and whiter.sum() > 0.01 * values.size else None
+
+
+def _find_dark_unknown(values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Pixels between the thresholds that are darker than the usual grey of unknown space: rather wall than not.
+
+    Thin walls are often painted in such greys only; in coarse cells they would drown in the free pixels around them.
+    """
+    unknown = labels == UNKNOWN
+    if not unknown.any():
+        return unknown
+    shades, counts = np.unique(values[unknown], return_counts=True)
+    grey = shades[counts.argmax()]
+    return unknown & (values < grey - 15) & (counts.max() > 0.5 * unknown.sum())

@@ -26,7 +26,8 @@ class ImportOptions:
         num_robots: the team that must find room.
 
     Grids (ROS map_server): `pixel_size` [m] when an image comes without its yaml; `free_threshold` and
-        `occupied_threshold` (shares of black) overrule the yaml.
+        `occupied_threshold` (shares of black) overrule the yaml; `grey_walls`: pixels between the thresholds but
+        darker than the grey of unknown space are obstacles; None: where they outnumber the black ones.
 
     Clouds and meshes:
         units: of the file: "m", "cm", "mm", "ft", "us-ft", "in", or metres per unit.
@@ -60,6 +61,7 @@ class ImportOptions:
     pixel_size: float | None = None
     free_threshold: float | None = None
     occupied_threshold: float | None = None
+    grey_walls: bool | None = None
     units: str | float = "auto"
     up: str = "auto"
     level: bool | None = None
