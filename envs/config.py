@@ -89,6 +89,7 @@ class CommConfig:
         return self.line_of_sight or math.isfinite(self.range)
 
 
+WAVEFRONT_CLEARANCE = 2.0  # clearance factor of the wavefront planner (measured in docs/planners.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
 
 
@@ -130,9 +131,10 @@ def complete_radar(config: RadarConfig, scenario: Scenario) -> RadarConfig:
 
 def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig:
     """Fill in the scenario's candidates and clearance and check every value."""
-    config = _complete(
-        config, num_steering=scenario.num_steering, clearance_factor=scenario.clearance_factor
-    )
+    clearance = scenario.clearance_factor
+    if config.name == "wavefront":  # its paths keep clear of walls; more would stall DWA where walls are near
+        clearance = min(clearance, WAVEFRONT_CLEARANCE)
+    config = _complete(config, num_steering=scenario.num_steering, clearance_factor=clearance)
     _check_choice("planner.name", config.name, ("dwa", "wavefront", "direct"))
     _check_positive("planner", config, skip=("name",))
     return config

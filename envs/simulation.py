@@ -22,7 +22,7 @@ TRACK_LENGTH = 625
 
 def build_simulation(env, seed: int, num_threads: int) -> Simulation:
     """The simulation of an `ExplorationEnv` whose settings are complete."""
-    simulation = Simulation(
+    return Simulation(
         maps=env.bank.tensors(env.device),
         num_maps=len(env.maps),
         robots=robot_tensors(env),
@@ -34,7 +34,6 @@ def build_simulation(env, seed: int, num_threads: int) -> Simulation:
         num_shards=num_threads,
         nav=bank_nav_grids(env.bank, env.device) if env.planner_config.name == "wavefront" else None,
     )
-    return simulation
 
 
 def robot_tensors(env) -> dict[str, torch.Tensor]:
@@ -129,6 +128,7 @@ def check_memory(env) -> None:
                         free = int(line.split()[1]) * 1024
     if per_env * env.num_envs > free:
         raise ValueError(
-            f"num_envs={env.num_envs} needs {per_env * env.num_envs / 2**30:.1f} GiB ({per_env / 2**20:.1f} MiB per env) "
-            f"and {env.device} has {free / 2**30:.1f} GiB free: lower num_envs below {int(free / per_env)}"
+            f"num_envs={env.num_envs} needs {per_env * env.num_envs / 2**30:.1f} GiB "
+            f"({per_env / 2**20:.1f} MiB per env) and {env.device} has {free / 2**30:.1f} GiB free: "
+            f"lower num_envs below {int(free / per_env)}"
         )

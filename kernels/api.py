@@ -45,7 +45,8 @@ def visible_points(
     radius = torch.as_tensor(obstacle_radius, dtype=torch.float32, device=free.device)
     if radius.dim() > 1 or (radius.dim() == 1 and radius.shape[0] != obstacles.shape[0]):
         raise ValueError(
-            f"obstacle_radius has shape {tuple(radius.shape)}; give one number or one per obstacle ({obstacles.shape[0]})"
+            f"obstacle_radius has shape {tuple(radius.shape)}; "
+            f"give one number or one per obstacle ({obstacles.shape[0]})"
         )
     for name, value in (("radar_range", radar_range), ("alpha1", alpha1), ("field_of_view", field_of_view)):
         if not value >= 0.0:

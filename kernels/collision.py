@@ -7,7 +7,9 @@ from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
 
 
 @wp.func
-def hits_boundary(maps: Maps, m: int, robots: Robots, e: int, i: int, at: wp.vec2, theta: float, footprint: int) -> bool:
+def hits_boundary(
+    maps: Maps, m: int, robots: Robots, e: int, i: int, at: wp.vec2, theta: float, footprint: int
+) -> bool:
     """Whether a boundary point is nearer to the centre than the threshold, or inside the footprint."""
     length = robots.length[e, i]
     width = robots.width[e, i]

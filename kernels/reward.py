@@ -59,7 +59,10 @@ def _reward_robots(
     terms: wp.array3d(dtype=wp.float32),
     raw: wp.array3d(dtype=wp.float32),
 ):
-    """Add this local step's reward terms of robot (e, i): weighted in ``terms`` (macro step), plain in ``raw`` (episode)."""
+    """Add this local step's reward terms of robot (e, i): weighted in ``terms``, plain in ``raw``.
+
+    ``terms`` is summed over the macro step, ``raw`` over the episode.
+    """
     e, i = wp.tid()
     if active[e] == 0:
         return

@@ -4,7 +4,8 @@ A free point P_f (seen from the robot's centre) is masked when some occluder P_o
 
     |P_o| - |P_f| < alpha2   and   (cos(P_f, P_o) > 1 - alpha1  or  angle(P_f, P_o) < asin(min(1, rho / |P_o|)))
 
-Both angular tests fold into ``dot(P_f, u_o) > c_o |P_f|`` with ``c_o = min(1 - alpha1, sqrt(1 - min(1, rho / |P_o|)^2))``.
+Both angular tests fold into ``dot(P_f, u_o) > c_o |P_f|`` with
+``c_o = min(1 - alpha1, sqrt(1 - min(1, rho / |P_o|)^2))``.
 
 Directions are cut into bins so that most points need no pairwise test. For every bin we keep the
 distance of the nearest occluder that may touch it (``near``) and of the nearest one that surely
