@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import warp as wp
+from scipy.ndimage import distance_transform_edt
+
 from maexp.envs.bank import MapBank
 from maexp.envs.map import PointCloudMap
 from maexp.kernels.known_grid import NavGrids
-from scipy.ndimage import distance_transform_edt
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ where communication is limited. Cells are numbered ``iy * width + ix`` with the 
 
 import numpy as np
 import warp as wp
+
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.planner import is_known
 from maexp.kernels.types import Maps

@@ -4,7 +4,7 @@ Every few local steps a robot's map is brought up to date and, where the path he
 up, the distance from the robot is searched over cells not known to be blocked (unknown ones count as
 passable) until the goal is reached. A goal inside an obstacle or out of reach is replaced by the reached cell
 nearest to it. Every local step the waypoint becomes the farthest cell of the path that is in the robot's
-radar range and in sight.
+radar range and in sight, drawn nearer where the robot could not brake in time.
 
 A path holds its first `PATH_CELLS` cells only; the search is repeated long before a robot gets there. What is
 held never outlives a macro step: a new goal always searches anew.
@@ -12,14 +12,18 @@ held never outlives a macro step: a new goal always searches anew.
 
 import numpy as np
 import warp as wp
+
 from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch, wp_diagonal, wp_straight
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids, nav_cell, nav_center
-from maexp.kernels.types import point_xy
+from maexp.kernels.types import Robots, point_xy
 
 PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
 SNAP_CELLS = 4  # how far the search may start from a robot that stands on a blocked cell, in cells
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
 
+CREEP = 0.5  # least distance of a waypoint that is not the end, in clearances of the robot
+
+wp_creep = wp.constant(CREEP)
 wp_path_cells = wp.constant(PATH_CELLS)
 wp_snap_cells = wp.constant(SNAP_CELLS)
 wp_unreached = wp.constant(wp.int32(UNREACHED))
@@ -207,6 +211,58 @@ def _trace_path(
     path_used[item] = 0
 
 
+@wp.func
+def clear_ahead(
+    e: int,
+    i: int,
+    way: wp.vec2,
+    keep: float,
+    collided: wp.array2d(dtype=wp.int32),
+    center: wp.array2d(dtype=wp.vec3),
+) -> float:
+    """Room to brake on the straight `way` [m]: its length, or half the gap to a robot that may come closer."""
+    room = wp.length(way)
+    at = point_xy(center[e, i])
+    for other in range(center.shape[1]):
+        gap = point_xy(center[e, other]) - at
+        if other != i and wp.dot(gap, way) > 0.0:
+            free = wp.length(gap) - keep
+            if collided[e, other] == 0:
+                free = 0.5 * free
+            room = wp.min(room, free)
+    return wp.max(room, 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def _hold_back(
+    # Robots:
+    robots: Robots,
+    lead_time: float,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    collided: wp.array2d(dtype=wp.int32),
+    center: wp.array2d(dtype=wp.vec3),
+    # State out:
+    target: wp.array2d(dtype=wp.vec2),
+):
+    """Draws waypoints nearer, so that robots drive no faster than they can brake before the waypoint.
+
+    DWA brakes only for a target that it would pass in its `lead_time` [s], three steps: a target at
+    lead_time * v holds it at about the speed v. At least `CREEP` clearances, or it would not get going.
+    """
+    e, i = wp.tid()
+    if active[e] == 0 or collided[e, i] != 0:
+        return
+    at = point_xy(center[e, i])
+    way = target[e, i] - at
+    keep = 2.0 * robots.clearance[e, i]
+    room = clear_ahead(e, i, way, keep, collided, center)
+    length = lead_time * wp.sqrt(2.0 * robots.max_accel[e, i] * room) + wp_creep * robots.clearance[e, i]
+    full = wp.length(way)
+    if full > length:
+        target[e, i] = at + way * (length / full)
+
+
 @wp.kernel(enable_backward=False)
 def _pick_waypoint(
     # Map:
@@ -293,10 +349,19 @@ class PathSearch:
              self.row_of_item, self.path, self.path_total, self.path_used],
             [self.search.sources, self.search.stop],
         )  # fmt: skip
-        grids = known.grids
+        self.flood(launch)
+        self.trace(launch, goal)
+
+    def flood(self, launch) -> None:
+        """Distances from `search.sources`, as far as `search.stop`."""
+        masks, grids = self.passable, self.passable.known.grids
         self.search.search(
             launch, masks.passable, self.row_of_item, masks.grid_of_row, grids.width, grids.height
         )
+
+    def trace(self, launch, goal) -> None:
+        """Paths to the cells of `search.stop`; where that is -1, to the reached cell nearest to `goal`."""
+        known = self.passable.known
         launch(
             _trace_path, self.shape,
             [known.grids, known.map_id, goal, self.search.distance, self.search.stop],
@@ -324,6 +389,7 @@ class Wavefront:
 
     def __init__(self, sim, shard):
         limited = sim.settings.comm_limited
+        self.lead_time = sim.settings.horizon * sim.settings.dt
         self.view, self.robots = shard.view, shard.robots
         threshold = self.robots.threshold.numpy()
         robots = threshold.shape[1]
@@ -349,3 +415,7 @@ class Wavefront:
     def pick_waypoints(self, launch) -> None:
         s = self.view
         self.paths.pick(launch, s.active, s.collided, s.center, s.goal, self.robots.radar_range, s.target)
+        launch(
+            _hold_back, self.paths.shape,
+            [self.robots, self.lead_time, s.active, s.collided, s.center], [s.target],
+        )  # fmt: skip

@@ -5,14 +5,15 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
+from oracle import waypoint as oracle
+from oracle.grid import geodesic_distance
+
 from maexp.envs.map import PointCloudMap
 from maexp.envs.nav_grid import build_nav_grid, stack_nav_grids
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids
-from maexp.kernels.types import Maps
-from maexp.kernels.wavefront import PATH_CELLS, SNAP_CELLS, PathSearch, in_sight
-from oracle import waypoint as oracle
-from oracle.grid import geodesic_distance
+from maexp.kernels.types import Maps, Robots
+from maexp.kernels.wavefront import CREEP, PATH_CELLS, SNAP_CELLS, PathSearch, _hold_back, in_sight
 
 pytestmark = pytest.mark.kernels
 
@@ -319,6 +320,28 @@ def test_following_waypoints_arrives():
         x, y = at[0, 0].astype(int)
         assert passable[y, x]
     np.testing.assert_allclose(at, goal, atol=1e-3)
+
+
+def test_waypoints_leave_room_to_brake():
+    """Drawn to lead_time * the speed that stops at the waypoint, or half-way to a robot ahead, plus a creep."""
+    robots = Robots()
+    robots.max_accel = array([[2.0] * 5], wp.float32)
+    robots.clearance = array([[1.0] * 5], wp.float32)
+    # 0 and 1 drive at each other, 2 behind 1, 3 far off and almost there, 4 stands on its target.
+    x = np.array([0.0, 6.0, 30.0, 100.0, 200.0])
+    ahead = np.array([20.0, -6.0, 18.0, 0.4, 0.0])
+    center = np.stack([x, 0 * x, 0 * x], axis=-1)[None]
+    for stopped, room_0 in ((0, 0.5 * (6.0 - 2.0)), (1, 6.0 - 2.0)):
+        collided = array([[0, stopped, 0, 0, 0]], wp.int32)
+        target = array(np.stack([x + ahead, 0 * x], axis=-1)[None], wp.vec2)
+        launch(
+            _hold_back, (1, 5), [robots, 0.3, array([1], wp.int32), collided, array(center, wp.vec3)], [target]
+        )
+        got = target.numpy()[0, :, 0] - x
+        want = [0.3 * np.sqrt(2 * 2.0 * room) + CREEP for room in (room_0, 2.0, 18.0)]
+        np.testing.assert_allclose(got[0], want[0], rtol=1e-5)
+        np.testing.assert_allclose(got[1], -6.0 if stopped else -want[1], rtol=1e-5)
+        np.testing.assert_allclose(got[2:], [want[2], 0.4, 0.0], rtol=1e-5, atol=1e-5)
 
 
 def test_nav_grids_struct_has_every_field():
