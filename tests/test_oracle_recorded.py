@@ -71,12 +71,32 @@ def test_dwa_scores_and_choices_agree_with_the_recorded_cases(oracle_dir):
     np.testing.assert_allclose(controls, recorded["candidates"], atol=1e-6)
     clearance = float(recorded["multi_para"]) * float(recorded["collision_threshold_m"])
     offsets = recorded["obstacle_offsets"]
+    unlimited = {"max_speed": math.inf, "max_accel": math.inf, "max_steer": math.inf}
+
+    def drive(state, control):
+        return motion.ackermann(state, control, wheelbase=1.0, **unlimited)
+
     for k in range(len(offsets) - 1):
         near = recorded["obstacle_points"][offsets[k] : offsets[k + 1]]
         near = np.concatenate([near, np.zeros((1, 2))])  # a quirk of the recording: one obstacle at (0, 0)
         near = near[np.linalg.norm(near - recorded["state"][k, :2], axis=1) < 8.0]  # none beyond can score
         state, goal = recorded["state"][k], recorded["goal"][k]
-        values, gaps = dwa.scores(state, goal, near, controls, length=1.5, wheelbase=1.0, clearance=clearance)
+        gaps: list[float] = []
+
+        def gap(ahead, near=near, gaps=gaps):
+            gaps.append(min(radar.distance(p, motion.center(ahead, 1.5)) for p in near))
+            return gaps[-1]
+
+        values = dwa.scores(
+            state,
+            goal,
+            controls,
+            move=drive,
+            middle=lambda s: motion.center(s, 1.5),
+            gap=gap,
+            clearance=clearance,
+        )
+        gaps = np.asarray(gaps)
         # 100 ln d in float32: the recording's distances are good to some 5e-5 m near 0.
         assert (np.abs(values - recorded["scores"][k]) < 1e-4 + 5e-3 / gaps**2).all()
         assert np.abs(values - recorded["scores"][k])[gaps > 0.5].max() < 3e-3

@@ -4,10 +4,7 @@ import math
 
 import numpy as np
 
-from oracle.motion import ackermann, center
 from oracle.radar import distance
-
-UNLIMITED = {"max_speed": math.inf, "max_accel": math.inf, "max_steer": math.inf}
 
 
 def candidates(max_accel: float, max_steer: float, num_steering: int, num_accel: int = 3) -> np.ndarray:
@@ -24,33 +21,19 @@ def score(nearest: float, to_goal: float, clearance: float, weight: float = 100.
     return -math.inf if nearest <= 0.0 else -to_goal + weight * math.log(nearest / clearance)
 
 
-def scores(
-    state,
-    goal,
-    obstacles,
-    controls,
-    *,
-    length: float,
-    wheelbase: float,
-    clearance: float,
-    horizon: int = 3,
-    weight: float = 100.0,
-    dt: float = 0.1,
-) -> tuple[np.ndarray, np.ndarray]:
-    """`(scores, nearest)` per control: the body's centre after `horizon` steps, without the speed limit.
+def scores(state, goal, controls, *, move, middle, gap, clearance, horizon=3, weight=100.0) -> np.ndarray:
+    """Score of every control held for `horizon` steps.
 
-    obstacles (n, 2): what counts as near: known obstacle points and the other robots' bodies, in range [m].
+    move(state, control) -> next state, without the speed limit; middle(state) -> centre of the body;
+    gap(state) -> distance [m] of the body there to the nearest thing known to be in the way.
     """
-    values, gaps = np.zeros(len(controls)), np.full(len(controls), np.inf)
+    values = np.zeros(len(controls))
     for index, control in enumerate(controls):
-        ahead = np.asarray(state, np.float64)
+        ahead = state
         for _ in range(horizon):
-            ahead = ackermann(ahead, control, wheelbase=wheelbase, dt=dt, **UNLIMITED)
-        middle = center(ahead, length)
-        for point in obstacles:
-            gaps[index] = min(gaps[index], distance(point[:2], middle))
-        values[index] = score(gaps[index], distance(goal, middle), clearance, weight)
-    return values, gaps
+            ahead = move(ahead, control)
+        values[index] = score(gap(ahead), distance(goal, middle(ahead)), clearance, weight)
+    return values
 
 
 def first_best(values) -> int:
