@@ -1,10 +1,11 @@
 """Generalised advantages for teams: per robot, or one for the whole team, from one look at each state."""
 
 import torch
-from maexp.agents.actor import COMM, GRID, MAP, POSE
-from maexp.agents.critics import TEAM_VALUE, VALUE
 from tensordict import TensorDictBase
 from torchrl.objectives.value import GAE, MultiAgentGAE
+
+from maexp.agents.actor import COMM, GRID, MAP, POSE
+from maexp.agents.critics import TEAM_VALUE, VALUE
 
 REWARD = ("agents", "reward")
 ADVANTAGE = ("agents", "advantage")

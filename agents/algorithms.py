@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, fields, replace
 
+from torchrl.modules import PopArtValueNorm
+
 from maexp.agents import losses
 from maexp.agents.critics import build_critic
 from maexp.agents.model import ModelConfig
 from maexp.agents.updaters import GradientUpdater, TrustRegionUpdater, Updater
-from torchrl.modules import PopArtValueNorm
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,8 @@ class Algorithm:
     def make_loss(self, policy, critic, settings: Settings | None = None):
         """The loss for a policy and critic, with its estimator of advantages."""
         settings = settings or self.settings
-        loss = self.loss(policy, critic, **settings.loss_arguments())
-        loss.value_norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
+        norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
+        loss = self.loss(policy, critic, value_norm=norm, **settings.loss_arguments())
         loss.setup(settings.gamma, settings.lmbda)
         return loss.to(next(policy.parameters()).device)
 

@@ -82,8 +82,9 @@ class Critic(nn.Module):
             features = torch.cat((robots, around.expand(-1, robots.shape[1], -1)), dim=-1)
         values = self.value(features)
         if self.mixer is None:
-            return self._to_returns(values).unflatten(0, lead)
-        return values.unflatten(0, lead), self._to_returns(self.mixer(values, robots)).unflatten(0, lead)
+            return self._to_returns(values).reshape(*lead, *values.shape[1:])
+        team = self._to_returns(self.mixer(values, robots))
+        return values.reshape(*lead, *values.shape[1:]), team.reshape(*lead, 1)
 
     def _to_returns(self, values: Tensor) -> Tensor:
         return self.offset + self.scale * values

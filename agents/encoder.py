@@ -121,7 +121,7 @@ class CellEncoder(nn.Module):
         """Encode each robot's observation once.
 
         Args:
-            picture: uint8, shape [batch, robots, channels, pixels, pixels]
+            picture: uint8, shape [batch, robots, channels, pixels, pixels]; or what `compact` makes of it
             pose: shape [batch, robots, 4]
             grid: shape [batch, robots, 4, L, L]
             comm: who hears whom, bool [batch, robots, robots]
@@ -132,7 +132,9 @@ class CellEncoder(nn.Module):
         team = comm.shape[:2]
         picture, pose, grid = picture.flatten(0, 1), pose.flatten(0, 1), grid.flatten(0, 1)
         along_x, along_y = region_centres(pose, grid)
-        if self.stem is None:
+        if picture.is_floating_point():
+            cells = pooled = picture  # pooled before (`compact`)
+        elif self.stem is None:
             cells = pooled = pool_regions(picture, along_x, along_y)
         else:
             cells = self._convolve(picture, along_x, along_y)
@@ -161,7 +163,22 @@ def pool_regions(picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
     return resample(lines, by_row, resampling(along_y, 1 / columns - 1, 2 / columns, columns))
 
 
+def compact(picture: Tensor, pose: Tensor, grid: Tensor) -> Tensor:
+    """Pictures pooled once for all passes over a batch, a quarter of the size; encoders with the "pool" stem
+    take them in place of the pictures. Shapes [*, robots, ...]; returns float32 [*, robots, channels, y, x]."""
+    lead = picture.shape[:-3]
+    parts = (value.flatten(0, len(lead) - 1) for value in (picture, pose, grid))
+    picture, pose, grid = parts
+    return pool_regions(picture, *region_centres(pose, grid)).unflatten(0, lead)
+
+
 def merged_maps(maps: Tensor, comm: Tensor) -> Tensor:
     """What the robots that robot i hears have seen together, shapes [batch, robots, channels, y, x]."""
     heard = comm | torch.eye(comm.shape[-1], dtype=torch.bool, device=comm.device)
     return torch.where(heard[..., None, None, None], maps.unsqueeze(1), 0.0).amax(2)
+
+
+def pools_pictures(network: nn.Module) -> bool:
+    """Whether all that a network sees of a picture is its pooled cells."""
+    encoders = [module for module in network.modules() if isinstance(module, CellEncoder)]
+    return bool(encoders) and all(encoder.stem is None for encoder in encoders)

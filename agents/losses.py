@@ -19,6 +19,19 @@ from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, esti
 from maexp.agents.critics import TEAM_VALUE, VALUE
 
 
+class NonFiniteLoss(ArithmeticError):
+    """A loss term or gradient is NaN or infinite; the message names it."""
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """Raise NonFiniteLoss if `value` holds a NaN or an infinity."""
+    if not torch.isfinite(value).all():
+        raise NonFiniteLoss(
+            f"{name} became {value.detach().sum().item()}; lower lr or max_grad_norm, or look for such values in "
+            "the rewards and observations."
+        )
+
+
 def policy_divergence(batch: TensorDictBase, dist: CompositeDistribution) -> Tensor:
     """KL(policy that acted || dist), summed over the heads, shape [*, robots].
 
@@ -68,6 +81,7 @@ class KLPenalty:
 
     def _log_weight(self, tensordict, adv_shape):
         terms = super()._log_weight(tensordict.copy(), adv_shape)  # a copy: it overwrites the acting parameters
+        check_finite("loss_objective", terms[0])  # here, for TorchRL would draw from the broken policy next
         self.__dict__["_divergence"] = policy_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
         return terms
 
@@ -100,7 +114,9 @@ class VDPPO(TeamValues, KLPenalty, MAPPOLoss):
 class NormalisedValues:
     """Critic error in units of the returns' running spread, as TorchRL's MAPPO has it."""
 
-    value_norm = None
+    def __init__(self, *args, value_norm=None, **settings):
+        super().__init__(*args, **settings)
+        self.value_norm = value_norm
 
     def _critic_loss_inputs(self, target: Tensor, value: Tensor, old: Tensor | None):
         norm = self.value_norm
@@ -119,13 +135,17 @@ class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
 
     default_value_estimator = ValueEstimators.MAGAE
 
+    def __init__(self, *args, normalize_advantage_exclude_dims: tuple[int, ...] = (-2,), **settings):
+        exclude = normalize_advantage_exclude_dims  # each robot by itself, as in TorchRL's MAPPO
+        super().__init__(*args, normalize_advantage_exclude_dims=exclude, **settings)
+
     def surrogate(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean loss to lower (objective and entropy bonus) and mean divergence, each a scalar with its graph."""
         advantage = batch.get(self.tensor_keys.advantage)
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
         log_weight, dist, _, _ = self._log_weight(batch.copy(), adv_shape=advantage.shape[:-1])
-        entropy = self._weighted_loss_entropy(self._get_entropy(dist, adv_shape=advantage.shape[:-1]))
-        loss = (entropy - log_weight.exp() * advantage).mean()
+        entropy = sum(head.entropy() for head in dist.dists.values()).unsqueeze(-1)
+        loss = -(log_weight.exp() * advantage + self.entropy_coeff * entropy).mean()
         return loss, policy_divergence(batch, dist).mean()
 
     def divergence(self, batch: TensorDictBase) -> Tensor:
@@ -145,7 +165,7 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
     @property
     def in_keys(self) -> list:
         """A2CLoss expects one action key; here each head has its own."""
-        ends = [("next", self.tensor_keys.reward), ("next", "done"), ("next", "terminated")]
+        ends = [("next", *self.tensor_keys.reward), ("next", "done"), ("next", "terminated")]
         seen = {*self.actor_network.in_keys, *self.critic_network.in_keys}
         following = [("next", *key) for key in self.critic_network.in_keys]
         return [*self.tensor_keys.action, *ends, *seen, *following]

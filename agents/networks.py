@@ -85,6 +85,8 @@ class TeamFormerBlock(nn.Module):
 class TargetGenerator(nn.Module):
     """Observations of a team to the parameters of every robot's action.
 
+    A robot listens only to those it hears, but block by block these pass on what they heard themselves.
+
     Args:
         config: sizes
         channels: channels of the picture
@@ -130,7 +132,8 @@ class TargetGenerator(nn.Module):
         for block in self.blocks:
             cells = block(cells, bias)
         cells = cells + self.merge(own, self.norm(cells), bias)
-        coarse, fine = self.cells(cells).unflatten(0, lead).unbind(-1)
+        cells = self.cells(cells)
+        coarse, fine = cells.reshape(*lead, *cells.shape[1:]).unbind(-1)
         mean, scale = self.fine(fine).chunk(2, dim=-1)
         mean, scale = mean.tanh(), MIN_SCALE + (MAX_SCALE - MIN_SCALE) * scale.sigmoid()
         return (coarse, mean, scale) if self.regions else (mean, scale)

@@ -12,26 +12,16 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from maexp.agents.actor import PARAMS
+from maexp.agents.actor import GRID, MAP, PARAMS, POSE
 from maexp.agents.advantages import write_advantages
+from maexp.agents.encoder import compact, pools_pictures
+from maexp.agents.losses import check_finite
 from maexp.agents.trust_region import TRPO
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
 CALIBRATION_ROUNDS = 5
+CHUNK = 256  # team steps at a time where memory matters more than speed
 QUIET = ("composite_entropy", "max_ratio", "mean_ratio", "value_clip_fraction")
-
-
-class NonFiniteLoss(ArithmeticError):
-    """A loss term or gradient is NaN or infinite; the message names it."""
-
-
-def check_finite(name: str, value: Tensor) -> None:
-    """Raise NonFiniteLoss if `value` holds a NaN or an infinity."""
-    if not torch.isfinite(value).all():
-        raise NonFiniteLoss(
-            f"{name} became {value.detach().sum().item()}; lower lr or max_grad_norm, or look for such values in "
-            "the rewards and observations."
-        )
 
 
 class Meter:
@@ -105,13 +95,21 @@ class Updater:
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
         """Write advantages; return the team steps with what the losses read, flattened."""
-        batch = write_advantages(self.loss, batch.copy())
+        batch = write_advantages(self.loss, self._compact(batch.copy()))
         keys = self.loss.tensor_keys
+        check_finite("the advantage", batch.get(keys.advantage))
         self._calibrate(batch)
         needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys, PARAMS]
         needed += [keys.advantage, keys.value_target, keys.value, *keys.action, *keys.sample_log_prob]
-        check_finite("the advantage", batch.get(keys.advantage))
         return batch.select(*needed).flatten()
+
+    def _compact(self, batch: TensorDictBase) -> TensorDictBase:
+        """Pool the pictures once, where both networks would do so in every pass."""
+        if all(pools_pictures(net) for net in (self.loss.actor_network, self.loss.critic_network)):
+            parts = [part.flatten(0, 1) for part in (batch[MAP], batch[POSE], batch[GRID])]
+            chunks = zip(*(part.split(CHUNK) for part in parts), strict=True)
+            batch[MAP] = torch.cat([compact(*chunk) for chunk in chunks]).unflatten(0, batch.shape)
+        return batch
 
     def _calibrate(self, batch: TensorDictBase) -> None:
         """Once: set the critic's scale. A few rounds, because the targets lean on the values."""

@@ -1,0 +1,191 @@
+"""What the losses compute: advantages by hand, ratios per robot, keys kept apart, terms that add up."""
+
+import math
+
+import pytest
+import torch
+from toy_env import ToyEnv
+
+from maexp.agents import make_critic, make_loss, make_policy
+from maexp.agents.actor import MAP
+from maexp.agents.advantages import ADVANTAGE, TARGET, TEAM_TARGET, write_advantages
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.critics import TEAM_VALUE, VALUE
+from maexp.agents.losses import policy_divergence
+from maexp.agents.model import ModelConfig
+
+TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
+GAMMA, LAMBDA = 0.9, 0.7
+
+
+def setup(name, envs=5, steps=7, robots=3, seed=0, **settings):
+    """Policy, critic, loss and a rollout that holds terminated, truncated and cut-off episodes."""
+    torch.manual_seed(seed)
+    env = ToyEnv(num_envs=envs, num_robots=robots, steps=3, seed=seed)
+    policy, critic = make_policy(env, TINY), make_critic(name, env, TINY)
+    for p in (*policy.parameters(), *critic.parameters()):
+        torch.nn.init.normal_(p, std=0.3)
+    loss = make_loss(name, policy, critic, gamma=GAMMA, lmbda=LAMBDA, **settings)
+    with torch.no_grad():
+        batch = env.rollout(steps, policy, break_when_any_done=False)
+    assert batch["next", "terminated"].any() and batch["next", "truncated"].any()
+    assert not batch["next", "done"][:, -1].all()
+    return policy, critic, loss, batch
+
+
+def by_hand(value, following, reward, done, terminated):
+    """GAE as Schulman et al. 2016 write it, one env and one value at a time, in plain Python."""
+    advantage = [[0.0] * len(row) for row in value]
+    for e, row in enumerate(value):
+        trace = 0.0
+        for t in reversed(range(len(row))):
+            after = 0.0 if terminated[e][t] else following[e][t]
+            error = reward[e][t] + GAMMA * after - row[t]
+            trace = error + (0.0 if done[e][t] else GAMMA * LAMBDA * trace)
+            advantage[e][t] = trace
+    return torch.tensor(advantage)
+
+
+def hand_made(critic, batch, key):
+    """Values by calling the critic on every state and on every next state, then `by_hand` per robot."""
+    with torch.no_grad():
+        value = critic(batch.select("agents"))[key]
+        following = critic(batch["next"].select("agents"))[key]
+    reward = batch["next", "agents", "reward"]
+    if key == TEAM_VALUE:
+        reward, value, following = reward.sum(-2, keepdim=True), value.unsqueeze(-2), following.unsqueeze(-2)
+    flags = [batch["next", name][..., 0].tolist() for name in ("done", "terminated")]
+    columns = [
+        by_hand(*(x[..., robot, 0].tolist() for x in (value, following, reward)), *flags)
+        for robot in range(reward.shape[-2])
+    ]
+    return torch.stack(columns, -1).unsqueeze(-1), value
+
+
+@pytest.mark.parametrize("name", ["ippo", "matrpo", "vdppo", "vda2c"])
+@pytest.mark.parametrize("way", ["loss", "updater"])
+def test_advantages_match_a_hand_written_gae(name, way):
+    _, critic, loss, batch = setup(name)
+    team = ALGORITHMS[name].critic == "mixed"
+    expected, value = hand_made(critic, batch, TEAM_VALUE if team else VALUE)
+    if way == "updater":
+        out = write_advantages(loss, batch.copy(), chunk=4)
+    else:
+        params = loss.critic_network_params.detach()
+        out = loss.value_estimator(batch.copy(), params=params, target_params=params)
+    torch.testing.assert_close(out[ADVANTAGE], expected.expand(5, 7, 3, 1), atol=1e-5, rtol=1e-4)
+    target = (expected + value).squeeze(-2) if team else expected + value
+    torch.testing.assert_close(out[TEAM_TARGET if team else TARGET], target, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_before_the_first_update_nothing_has_moved(name):
+    policy, _, loss, batch = setup(name)
+    with torch.no_grad():
+        dist = policy.get_dist(batch.copy())
+    again = dist.log_prob(batch)
+    for head in ("region", "offset"):
+        key = ("agents", "action", f"{head}_log_prob")
+        torch.testing.assert_close(again[key], batch[key], atol=1e-5, rtol=1e-5)
+    assert policy_divergence(batch, dist).abs().max() < 1e-5
+    terms = loss(batch)
+    if "mean_ratio" in terms.keys():
+        assert terms["mean_ratio"].item() == pytest.approx(1, abs=1e-5)
+        assert terms["clip_fraction"].item() == 0
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_terms_are_finite_and_reach_their_own_network_only(name):
+    policy, critic, loss, batch = setup(name)
+    terms = loss(batch)
+    for key, parameters, others in (("loss_objective", policy, critic), ("loss_critic", critic, policy)):
+        assert math.isfinite(terms[key].item())
+        grads = torch.autograd.grad(terms[key], list(parameters.parameters()), retain_graph=True, allow_unused=True)
+        assert sum(g.abs().sum() for g in grads if g is not None) > 0
+        grads = torch.autograd.grad(terms[key], list(others.parameters()), retain_graph=True, allow_unused=True)
+        assert all(g is None for g in grads)
+
+
+def acting_terms(loss, policy, batch, change=0.05):
+    """Advantages, then a small change of the policy; returns log-ratios per robot summed over both heads."""
+    batch = write_advantages(loss, batch.copy())
+    with torch.no_grad():
+        for p in policy.parameters():
+            p.add_(change * torch.randn(p.shape))
+        new = policy.get_dist(batch.copy()).log_prob(batch)
+    keys = [("agents", "action", f"{head}_log_prob") for head in ("region", "offset")]
+    return batch, sum(new[k] for k in keys), sum(new[k] - batch[k] for k in keys)
+
+
+@pytest.mark.parametrize("name", ["ippo", "mappo", "vdppo"])
+def test_clipped_objective_has_one_ratio_per_robot(name):
+    policy, _, loss, batch = setup(name, normalize_advantage=False)
+    batch, _, log_ratio = acting_terms(loss, policy, batch)
+    ratio, advantage = log_ratio.exp(), batch[ADVANTAGE][..., 0]
+    assert ratio.shape == (5, 7, 3) and (ratio - 1).abs().max() > 0.2
+    expected = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
+    assert loss(batch)["loss_objective"].item() == pytest.approx(expected.item(), rel=1e-4)
+
+
+def test_trust_region_surrogate_is_unclipped_with_entropy_bonus():
+    policy, _, loss, batch = setup("matrpo", normalize_advantage=False, entropy_coeff=0.5)
+    batch, _, log_ratio = acting_terms(loss, policy, batch)
+    dist = policy.get_dist(batch.copy())
+    entropy = sum(head.entropy() for head in dist.dists.values()).mean()
+    expected = -(log_ratio.exp() * batch[ADVANTAGE][..., 0]).mean() - 0.5 * entropy
+    value, divergence = loss.surrogate(batch)
+    assert value.item() == pytest.approx(expected.item(), rel=1e-4)
+    assert divergence.item() == pytest.approx(policy_divergence(batch, dist).mean().item(), rel=1e-5)
+    assert divergence.item() > 1e-3
+
+
+def test_actor_critic_objective_per_robot_over_both_heads():
+    policy, _, loss, batch = setup("vda2c", normalize_advantage=False)
+    batch, log_prob, _ = acting_terms(loss, policy, batch)
+    terms = loss(batch)
+    expected = -(log_prob * batch[ADVANTAGE][..., 0]).mean()
+    assert terms["loss_objective"].item() == pytest.approx(expected.item(), rel=1e-4)
+    dist = policy.get_dist(batch.copy())
+    entropy = sum(head.entropy() for head in dist.dists.values()).mean()
+    assert terms["entropy"].item() == pytest.approx(entropy.item(), rel=1e-4)
+    assert set(loss.in_keys) >= {MAP, ("agents", "action", "region"), ("next", "agents", "reward")}
+
+
+def test_divergence_is_from_the_acting_policy_in_closed_form():
+    policy, _, loss, batch = setup("ippo", kl_coeff=0.2)
+    batch, _, _ = acting_terms(loss, policy, batch)
+    before = batch["agents", "params"].clone()
+    new = policy.module[0](batch.copy())["agents", "params"]
+    p, q = (x["region", "logits"].log_softmax(-1) for x in (before, new))
+    (m, s), (n, r) = ((x["offset", "loc"], x["offset", "scale"]) for x in (before, new))
+    expected = (p.exp() * (p - q)).sum(-1)
+    expected = expected + ((r / s).log() + (s**2 + (m - n) ** 2) / (2 * r**2) - 0.5).sum(-1)
+    terms = loss(batch)
+    assert terms["loss_kl"].item() == pytest.approx(0.2 * expected.mean().item(), rel=1e-4)
+    assert terms["loss_kl"].item() > 1e-4
+    assert (batch["agents", "params"] == before).all(), "the loss overwrote what the acting policy wrote"
+
+
+@pytest.mark.parametrize("divergence, factor", [(0.03, 1.5), (0.001, 0.5), (0.01, 1.0)])
+def test_penalty_follows_the_divergence(divergence, factor):
+    _, _, loss, _ = setup("mappo", kl_coeff=0.2)
+    loss.adapt_penalty(divergence)
+    assert loss.kl_coeff.item() == pytest.approx(0.2 * factor)
+
+
+def test_a_batch_without_acting_parameters_is_refused_by_name():
+    policy, _, loss, batch = setup("itrpo")
+    batch = write_advantages(loss, batch.copy())
+    del batch["agents", "params"]
+    with pytest.raises(KeyError, match="params"):
+        loss.surrogate(batch)
+
+
+def test_value_error_in_units_of_the_returns():
+    errors = []
+    for scale in (1e3, 1e5):
+        _, _, loss, batch = setup("matrpo")
+        batch = write_advantages(loss, batch.copy())
+        batch[TARGET] = batch[TARGET] * scale
+        errors.append(loss(batch)["loss_critic"].item())
+    assert errors[1] == pytest.approx(errors[0], rel=0.05)

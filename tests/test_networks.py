@@ -1,0 +1,234 @@
+"""The target generator and the critics: any team size, no order among robots, nobody unheard, right pixels."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+from toy_env import ToyEnv
+
+from maexp.agents import ModelConfig, make_policy
+from maexp.agents.critics import TEAM_VALUE, VALUE, build_critic
+from maexp.agents.encoder import STRIDE, add_rows, compact, pool_regions, resampling
+from maexp.agents.model import PRESETS, model_config
+
+PIXELS, SIDE = 29, 3
+CONV = ModelConfig(stem="conv", channels=8, grid_features=8, depth=2, heads=2, merge_maps=False, critic_hidden=16)
+MODELS = {"small": "small", "conv": CONV}
+
+
+def states(batch, robots, seed=0) -> TensorDict:
+    """Random observations whose regions cover most of the picture."""
+    generator = torch.Generator().manual_seed(seed)
+    pose = torch.rand(batch, robots, 4, generator=generator) * 2 - 1
+    line = (torch.arange(SIDE) * 2 + 1) / SIDE - 1
+    place = torch.stack(torch.meshgrid(0.9 * line, 0.6 * line, indexing="ij"))
+    goal = torch.rand(batch, robots, 2, generator=generator)
+    offsets = [(place - at[..., None, None]) / 2 for at in (pose[..., :2], goal)]
+    observation = {
+        "map": torch.randint(0, 256, (batch, robots, 4, PIXELS, PIXELS), generator=generator, dtype=torch.uint8),
+        "pose": pose,
+        "grid": torch.cat(offsets, dim=2),
+        "comm": torch.ones(batch, robots, robots, dtype=torch.bool),
+    }
+    return TensorDict({"agents": {"observation": observation}}, batch_size=[batch])
+
+
+@pytest.fixture(params=MODELS)
+def model(request):
+    return MODELS[request.param]
+
+
+@pytest.fixture
+def env():
+    return ToyEnv(num_envs=2, side=SIDE, pixels=PIXELS)
+
+
+def awake(network):
+    """Undo the quiet start, so that what must not depend on something cannot hide in small numbers."""
+    torch.manual_seed(1)
+    for p in network.parameters():
+        torch.nn.init.normal_(p, std=0.4)
+    return network
+
+
+def logits(policy, td) -> torch.Tensor:
+    with torch.no_grad():
+        return policy.module[0](td.clone())["agents", "params", "region", "logits"]
+
+
+@pytest.mark.parametrize("robots", [1, 2, 6, 8])
+def test_one_set_of_weights_serves_every_team_size(env, model, robots):
+    policy = make_policy(env, model)
+    td = policy(states(5, robots))
+    assert td["agents", "action", "region"].shape == (5, robots)
+    assert td["agents", "action", "region"].dtype == torch.int64
+    assert td["agents", "action", "offset"].shape == (5, robots, 2)
+    for head in ("region", "offset"):
+        assert td["agents", "action", f"{head}_log_prob"].shape == (5, robots)
+    for kind in ("local", "team", "mixed"):
+        assert build_critic(kind, env, model)(states(5, robots))[VALUE].shape == (5, robots, 1)
+
+
+def test_leading_shapes_make_no_difference(env, model):
+    policy = awake(make_policy(env, model))
+    td = states(6, 3)
+    flat = logits(policy, td)
+    torch.testing.assert_close(logits(policy, td.reshape(2, 3)), flat.unflatten(0, (2, 3)))
+    torch.testing.assert_close(logits(policy, td[2]), flat[2], atol=1e-5, rtol=1e-4)
+
+
+def permuted(td, order) -> TensorDict:
+    out = td.clone()
+    for name in ("map", "pose", "grid"):
+        out["agents", "observation", name] = td["agents", "observation", name][:, order]
+    out["agents", "observation", "comm"] = td["agents", "observation", "comm"][:, order][:, :, order]
+    return out
+
+
+def test_permuting_robots_permutes_logits_and_values(env, model):
+    order = torch.tensor([2, 0, 3, 1])
+    td = states(3, 4)
+    td["agents", "observation", "comm"][:, 0, 1] = False
+    other = permuted(td, order)
+    policy = awake(make_policy(env, model))
+    torch.testing.assert_close(logits(policy, other), logits(policy, td)[:, order], atol=2e-4, rtol=1e-3)
+    for kind in ("local", "team", "mixed"):
+        critic = awake(build_critic(kind, env, model))
+        a, b = critic(td.clone()), critic(other.clone())
+        torch.testing.assert_close(b[VALUE], a[VALUE][:, order], atol=2e-4, rtol=1e-3)
+        if kind == "mixed":
+            torch.testing.assert_close(b[TEAM_VALUE], a[TEAM_VALUE], atol=2e-4, rtol=1e-3)
+
+
+def changed(td, robot, name) -> TensorDict:
+    """The same states with one part of one robot's observation drawn anew."""
+    out = td.clone()
+    new = states(td.shape[0], td["agents", "observation", "pose"].shape[1], seed=9)
+    out["agents", "observation", name][:, robot] = new["agents", "observation", name][:, robot]
+    return out
+
+
+@pytest.mark.parametrize("name", ["map", "pose", "grid"])
+def test_only_robots_in_contact_matter(env, model, name):
+    policy = awake(make_policy(env, model))
+    td = states(3, 3)
+    before, after = logits(policy, td), logits(policy, changed(td, 2, name))
+    assert not torch.allclose(before[:, :2], after[:, :2])
+    td["agents", "observation", "comm"][:, :2, 2] = False
+    before, after = logits(policy, td), logits(policy, changed(td, 2, name))
+    assert torch.equal(before[:, :2], after[:, :2])
+    assert not torch.allclose(before[:, 2], after[:, 2])
+
+
+@pytest.mark.parametrize("name", ["map", "pose", "grid"])
+def test_team_critic_sees_every_robot_and_local_only_its_own(env, model, name):
+    td = states(3, 3)
+    td["agents", "observation", "comm"][:] = torch.eye(3, dtype=torch.bool)  # critics do not ask who hears whom
+    team, local = (awake(build_critic(kind, env, model)) for kind in ("team", "local"))
+    for robot in range(3):
+        other = changed(td, robot, name)
+        moved = {k: critic(td.clone())[VALUE] != critic(other.clone())[VALUE] for k, critic in
+                 (("team", team), ("local", local))}  # fmt: skip
+        assert moved["team"].all(), "a robot's value ignores what another one observes"
+        own = torch.arange(3) == robot
+        assert (moved["local"][..., 0] == own).all(), "a local value listens to others or not to its own"
+
+
+def test_policy_starts_near_uniform_and_modes_differ_from_samples(env):
+    torch.manual_seed(0)
+    policy = make_policy(env)
+    td = policy(states(64, 3))
+    probabilities = td["agents", "params", "region", "logits"].softmax(-1)
+    assert 0.5 / SIDE**2 < probabilities.min() and probabilities.max() < 2 / SIDE**2
+    assert len(td["agents", "action", "region"].unique()) == SIDE**2
+    scale = td["agents", "params", "offset", "scale"]
+    assert ((0.05 <= scale) & (scale <= 1)).all() and td["agents", "params", "offset", "loc"].abs().max() < 0.2
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        calm = policy(states(64, 3))
+    assert torch.equal(calm["agents", "action", "region"], probabilities.argmax(-1))
+    assert torch.equal(calm["agents", "action", "offset"], calm["agents", "params", "offset", "loc"])
+
+
+def test_stored_log_probabilities_are_those_of_the_stored_action(env, model):
+    policy = awake(make_policy(env, model))
+    td = ToyEnv(num_envs=4, side=SIDE, pixels=PIXELS).rollout(3, policy)
+    again = policy.get_dist(td.clone()).log_prob(td)
+    for head in ("region", "offset"):
+        key = ("agents", "action", f"{head}_log_prob")
+        torch.testing.assert_close(again[key], td[key], atol=1e-5, rtol=1e-5)
+
+
+def test_control_actions_of_the_direct_planner():
+    env = ToyEnv(num_envs=4, control=True)
+    policy = make_policy(env)
+    td = env.rollout(3, policy)
+    assert td["agents", "action", "control"].shape == (4, 3, 3, 2)
+    assert set(policy.in_keys) == {("agents", "observation", k) for k in ("map", "pose", "grid", "comm")}
+
+
+def test_rows_are_averaged_like_floats():
+    picture = torch.randint(0, 256, (2, 3, 11, 7), dtype=torch.uint8)
+    padded = torch.nn.functional.pad(picture.float(), (0, 0, 0, 1))
+    torch.testing.assert_close(add_rows(picture), padded.unflatten(2, (3, STRIDE)).mean(3) / 255)
+
+
+def test_a_lit_region_is_the_cell_of_that_region():
+    """A picture lit over one region of an oblong map must light that region's cells and no other's."""
+    pixels, side = 125, 8
+    half = torch.tensor([0.9, 0.3])  # the extent covers little of the square frame along y
+    centres = [(2 * torch.arange(side) + 1 - side) / side * reach for reach in half]
+    along = (torch.arange(pixels) * 2 + 1) / pixels - 1
+    ix, iy = 5, 2
+    inside = [(along - c[k]).abs() <= reach / side for c, k, reach in zip(centres, (ix, iy), half, strict=True)]
+    picture = (inside[0][:, None] & inside[1][None]).to(torch.uint8) * 255
+    cells = pool_regions(picture[None, None], *(c[None] for c in centres))[0, 0].T  # x, y
+    by_region = cells.unflatten(0, (side, -1)).unflatten(2, (side, -1)).mean((1, 3))
+    assert by_region.argmax() == ix * side + iy
+    assert by_region[ix, iy] > 0.8
+    by_region[ix - 1 : ix + 2, iy - 1 : iy + 2] = 0
+    assert by_region.max() < 0.01
+
+
+def test_resampling_keeps_constants_and_positions():
+    centres = torch.linspace(-0.7, 0.5, 4)[None]
+    weights = resampling(centres, 1 / 31 - 1, 2 / 31, 31)[0]
+    assert weights.shape == (31, 16)
+    torch.testing.assert_close(weights.sum(0), torch.ones(16))
+    source = (torch.arange(31) * 2 + 1) / 31 - 1
+    torch.testing.assert_close((source @ weights).unflatten(0, (4, 4)).mean(1), centres[0], atol=2e-3, rtol=0)
+
+
+def test_pooled_pictures_serve_in_place_of_pictures(env):
+    policy = awake(make_policy(env))
+    td = states(4, 3)
+    before = logits(policy, td)
+    observation = td["agents", "observation"]
+    observation["map"] = compact(observation["map"], observation["pose"], observation["grid"])
+    torch.testing.assert_close(logits(policy, td), before)
+
+
+def test_heads_of_the_paper_preset():
+    paper = PRESETS["paper"]
+    assert (paper.width, paper.depth, paper.stem, paper.channels) == (48, 2, "conv", 32)
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        (dict(heads=3, channels=16, grid_features=16), "model.heads=3"),
+        (dict(depth=0), "model.depth=0"),
+        (dict(stem="fft"), "model.stem='fft'"),
+    ],
+)
+def test_bad_sizes_are_named(given, message):
+    with pytest.raises(ValueError, match=message):
+        ModelConfig(**given)
+
+
+def test_unknown_preset_and_foreign_env_are_named():
+    with pytest.raises(ValueError, match="model='huge'"):
+        model_config("huge")
+    env = ToyEnv()
+    del env.observation_spec["agents", "observation", "comm"]
+    with pytest.raises(ValueError, match="comm"):
+        make_policy(env)
