@@ -1,0 +1,172 @@
+"""From settings to maps, environments and learners."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from maexp.agents.actor import make_policy
+from maexp.agents.algorithms import find_algorithm
+from maexp.agents.errors import UserError
+from maexp.agents.model import PRESETS
+from maexp.agents.schema import given
+from maexp.agents.updaters import Updater
+from maexp.envs import (
+    CommConfig,
+    ExplorationEnv,
+    ObservationConfig,
+    PlannerConfig,
+    PointCloudMap,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    make_map,
+    split,
+)
+from maexp.envs.scenarios import find_scenario
+
+
+@dataclass
+class MapSuite:
+    """The maps trained on and those held out for the evaluation (the same ones where the user brings the map)."""
+
+    train: list[PointCloudMap]
+    held_out: list[PointCloudMap]
+
+
+def pick_device(name: str) -> torch.device:
+    """The torch device of the setting `device`.
+
+    Raises:
+        UserError: not a device, or not one of this machine.
+    """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UserError(f"device={name} cannot be used here ({str(error).splitlines()[0]}): try device=cpu.") from error
+    return device
+
+
+def load_maps(scenario: Any, train: bool = True) -> MapSuite:
+    """The maps of a scenario's settings; those trained on are left out unless `train`.
+
+    Raises:
+        ValueError: an index that is none; MapError: a file that is no usable map.
+    """
+    row = find_scenario(scenario.name)
+    if row.build is None:
+        maps = [import_file(scenario)]
+        return MapSuite(maps, maps)
+    if scenario.path is not None:
+        raise UserError(
+            f"scenario.path={scenario.path} needs scenario=pointcloud; scenario={scenario.name} builds its own maps."
+        )
+    trained_on, held_out = split(scenario.name)
+    indices = _indices("scenario.maps", scenario.maps, trained_on)
+    others = _indices("scenario.held_out", scenario.held_out, held_out)
+    build = [make_map(scenario.name, index) for index in indices] if train else []
+    return MapSuite(build, [make_map(scenario.name, index) for index in others])
+
+
+def import_file(scenario: Any) -> PointCloudMap:
+    """The map of scenario=pointcloud."""
+    from maexp.envs.importing import import_map
+
+    if not scenario.path:
+        raise UserError("scenario=pointcloud needs a map: add scenario.path=FILE.")
+    return import_map(scenario.path, **given(scenario.importing))
+
+
+def _indices(name: str, value: Any, default: range) -> list[int]:
+    if value is None:
+        return list(default)
+    value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
+    indices = [value] if isinstance(value, int) else value
+    good = isinstance(indices, list) and indices and all(type(one) is int and one >= 0 for one in indices)
+    if not good:
+        raise UserError(f"{name}={value} must be a list of whole numbers, 0 or more, as [0,1,2].")
+    return indices
+
+
+def make_env(cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None) -> ExplorationEnv:
+    """The environment that the settings describe, on `maps`.
+
+    Raises:
+        ValueError: a setting out of range; MapError: no room for the team.
+    """
+    scenario = cfg.scenario
+    robot, radar = team_configs(cfg, num_robots)
+    return ExplorationEnv(
+        maps,
+        num_envs=num_envs or cfg.num_envs,
+        num_robots=num_robots,
+        device=pick_device(cfg.device),
+        seed=cfg.seed,
+        robot=robot,
+        radar=radar,
+        planner=PlannerConfig(**given(cfg.planner)),
+        reward=RewardConfig(**given(cfg.reward)),
+        observation=ObservationConfig(**given(cfg.observation)),
+        comm=CommConfig(**given(cfg.comm)),
+        local_steps=scenario.local_steps,
+        macro_steps=scenario.macro_steps,
+        collision=scenario.collision,
+        success_coverage=scenario.success_coverage,
+    )
+
+
+def team_configs(cfg: Any, num_robots: int) -> tuple[Any, Any]:
+    """Robot and radar of a team: one of each for all robots, or lists where `robot.team` tells robots apart.
+
+    An entry of `robot.team` holds settings of a robot, and under `radar` those of its radar. A team larger than
+    the list repeats it.
+    """
+    robot, radar = given(cfg.robot, "team"), given(cfg.radar)
+    if not cfg.robot.team:
+        return RobotConfig(**robot), RadarConfig(**radar)
+    entries = OmegaConf.to_container(cfg.robot.team)
+    _check_team(entries)
+    entries = [entries[i % len(entries)] for i in range(num_robots)]
+    robots = [RobotConfig(**(robot | {k: v for k, v in one.items() if k != "radar"})) for one in entries]
+    return robots, [RadarConfig(**(radar | one.get("radar", {}))) for one in entries]
+
+
+def _check_team(entries: Any) -> None:
+    allowed = [one.name for one in fields(RobotConfig)] + ["radar"]
+    if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+        raise UserError("robot.team must be a list of settings, as [{kind: ackermann}, {kind: differential}].")
+    for name in (name for one in entries for name in one):
+        if name not in allowed:
+            raise UserError(f"robot.team has no setting {name}: choose one of {', '.join(allowed)}.")
+
+
+@dataclass
+class Learner:
+    """The networks of a run and what trains them."""
+
+    policy: Any
+    critic: Any
+    updater: Updater
+
+
+def model_settings(cfg: Any):
+    """The ModelConfig of the settings: a preset with some values replaced."""
+    from dataclasses import replace
+
+    preset = cfg.model.preset or "small"
+    if preset not in PRESETS:
+        raise UserError(f"model.preset={preset} is unknown: choose one of {', '.join(PRESETS)}.")
+    return replace(PRESETS[preset], **given(cfg.model, "preset"))
+
+
+def make_learner(cfg: Any, env: ExplorationEnv) -> Learner:
+    """Policy, critic and updater of the settings, for the specs of `env`."""
+    row = find_algorithm(cfg.algorithm.name)
+    settings = row.configure(cfg.algorithm.preset or "default", **given(cfg.algorithm, "name", "preset"))
+    model = model_settings(cfg)
+    policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
+    return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))

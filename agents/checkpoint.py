@@ -1,0 +1,125 @@
+"""Checkpoints: written whole or not at all, the newest few and the best kept, loaded without unpickling."""
+
+import os
+import random
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from maexp.agents.errors import UserError
+
+NAME = re.compile(r"iteration_(\d+)\.pt")
+BEST = "best.pt"
+
+
+def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: bool = False) -> Path:
+    """Write `state` as the checkpoint of `iteration` and delete all but the newest `keep`.
+
+    Args:
+        folder: the run's `checkpoints/`
+        state: tensors, numbers, text and containers of these
+        best: write it as `best.pt` too
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"iteration_{iteration:06d}.pt"
+    for target in [path] + [folder / BEST] * best:
+        _write_atomically(target, state)
+    for old in list_checkpoints(folder)[keep:]:
+        old.unlink()
+    for leftover in folder.glob("*.tmp"):
+        leftover.unlink()
+    return path
+
+
+def _write_atomically(path: Path, state: dict) -> None:
+    """A kill at any moment leaves the old file or the new one: write aside, sync, rename, sync the folder."""
+    aside = path.with_suffix(".tmp")
+    with open(aside, "wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)
+    handle = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def list_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of a run by iteration, newest first, without the best."""
+    found = [path for path in folder.glob("iteration_*.pt") if NAME.fullmatch(path.name)]
+    return sorted(found, key=lambda path: int(NAME.fullmatch(path.name)[1]), reverse=True)
+
+
+def load_checkpoint(path: Path) -> dict:
+    """The state in one file, on the CPU.
+
+    Raises:
+        UserError: no such file, or not a whole checkpoint.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: give a run's folder or a checkpoint in it.")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file fails anywhere inside zip and pickle
+        raise UserError(f"{path} is not a whole checkpoint: it is damaged or something else.") from error
+    if not isinstance(state, dict) or "overrides" not in state:
+        raise UserError(f"{path} is not a checkpoint of MAexp.")
+    return state
+
+
+def find_checkpoint(place: str | Path) -> tuple[Path, dict]:
+    """(file, state) of a checkpoint file, or of the newest whole checkpoint of a run's folder.
+
+    A damaged one is passed over with a warning.
+
+    Raises:
+        UserError: there is none.
+    """
+    place = Path(place)
+    if place.is_file():
+        return place, load_checkpoint(place)
+    if not place.is_dir():
+        raise UserError(f"{place} does not exist: give a run's folder or a checkpoint in it.")
+    folder = place / "checkpoints" if (place / "checkpoints").is_dir() else place
+    for path in list_checkpoints(folder):
+        try:
+            return path, load_checkpoint(path)
+        except UserError as error:
+            warnings.warn(f"{error} Falling back to the one before.", stacklevel=2)
+    raise UserError(f"{place} holds no whole checkpoint: give the folder of a run of maexp train.")
+
+
+def random_state() -> dict[str, Any]:
+    """The states of the random generators of torch, NumPy and Python, as tensors and numbers."""
+    kind, keys, *rest = np.random.get_state()
+    version, words, gauss = random.getstate()
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [kind, torch.from_numpy(keys.astype(np.int64)), *rest],
+        "python": [version, list(words), gauss],
+    }
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Go on with the random numbers where `random_state` was taken."""
+    torch.set_rng_state(state["torch"])
+    if state["cuda"] and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(state["cuda"])
+    kind, keys, *rest = state["numpy"]
+    np.random.set_state((kind, keys.numpy().astype(np.uint32), *rest))
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words), gauss))
+
+
+def seed_everything(seed: int) -> None:
+    """Seed torch, NumPy and Python."""
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)

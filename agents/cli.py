@@ -1,0 +1,171 @@
+"""The command `maexp`: a verb, then Hydra overrides."""
+
+import importlib
+import os
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.errors import UserError
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb: what it does, examples, the module whose `run(cfg, folder, overrides)` does it, bare arguments."""
+
+    summary: str
+    examples: tuple[str, ...]
+    home: str
+    positional: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
+
+
+VERBS = {
+    "train": Verb(
+        "trains a team, then evaluates it beside the random policy",
+        ("maexp train algorithm=mappo scenario=maze", "maexp train resume=outputs/DATE/RUN",
+         "maexp train -m algorithm=ippo,mappo seed=0,1,2"),
+        "run_train",
+    ),
+    "evaluate": Verb(
+        "plays held-out episodes with a trained team or a classical policy",
+        ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate policy=nearest_frontier scenario=maze"),
+        "run_evaluate",
+    ),
+    "maps": Verb(
+        "lists, makes, imports, checks and draws maps",
+        ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
+         "maexp maps check floor.yaml", "maexp maps show map.npz"),
+        "run_maps",
+        ("action", "file"),
+        ("list", "make", "import", "check", "show"),
+    ),
+    "bench": Verb(
+        "measures throughput, as a table and JSON",
+        ("maexp bench env", "maexp bench env scenario=maze num_robots=2,4 num_envs=256"),
+        "run_bench",
+        ("action",),
+        ("env",),
+    ),
+}  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    warnings.showwarning = _show_warning
+    try:
+        return _run(words)
+    except UserError as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(f"maexp: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("maexp: interrupted.", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    if words[0] == "--version":
+        from importlib import metadata
+
+        print(f"maexp {metadata.version('maexp')}")
+        return 0
+    if words[0] not in VERBS:
+        raise UserError(f"{words[0]!r} is not a verb: choose one of {', '.join(VERBS)}.")
+    return run_verb(words[0], words[1:])
+
+
+def overview() -> str:
+    """What `maexp` alone prints."""
+    lines = ["maexp: multi-robot exploration with reinforcement learning on point-cloud maps", ""]
+    for name, verb in VERBS.items():
+        lines += [f"  {name:<10}{verb.summary}", *(f"  {'':<10}  {one}" for one in verb.examples), ""]
+    return "\n".join([*lines, "maexp VERB --help lists the settings and choices of a verb."])
+
+
+def run_verb(name: str, words: list[str]) -> int:
+    """Compose the settings of a verb, claim a folder and run it."""
+    from maexp.agents.overrides import find_override, make_overrides, split_flags
+
+    verb = VERBS[name]
+    flags, rest = split_flags(words)
+    _check_flags(name, flags)
+    if {"-h", "--help"} & set(flags):
+        from maexp.agents.help import verb_help
+
+        print(verb_help(name, verb))
+        return 0
+    multirun = bool({"-m", "--multirun"} & set(flags))
+    _check_action(name, verb, rest)
+    overrides = make_overrides(name, rest, verb.positional, multirun)
+    home = importlib.import_module(f"maexp.agents.{verb.home}")
+    if multirun:
+        from maexp.agents.sweep import run_sweep
+
+        return run_sweep(name, overrides)
+    prepared = home.prepare(overrides)
+    cfg = _compose(name, prepared)
+    if {"-c", "--cfg"} & set(flags):
+        from omegaconf import OmegaConf
+
+        print(OmegaConf.to_yaml(_settings(cfg)), end="")
+        return 0
+    home.check(_settings(cfg))
+    folder = _claim(cfg, home, overrides, chosen=find_override(overrides, "hydra.run.dir") is not None)
+    return home.run(_settings(cfg), folder, _task_overrides(prepared))
+
+
+def _compose(name: str, overrides: list[str]) -> Any:
+    from maexp.agents.compose import compose_config
+
+    return compose_config(name, overrides)
+
+
+def _settings(cfg: Any) -> Any:
+    """The settings without Hydra's own."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+
+
+def _task_overrides(overrides: list[str]) -> list[str]:
+    from maexp.agents.overrides import without
+
+    return without(overrides, "hydra", "resume", "checkpoint")
+
+
+def _claim(cfg: Any, home: Any, overrides: list[str], chosen: bool) -> Path:
+    from maexp.agents.run_folder import claim_folder
+
+    kept = home.folder(overrides)
+    return kept if kept is not None else claim_folder(cfg.hydra.run.dir, chosen)
+
+
+def _check_flags(name: str, flags: list[str]) -> None:
+    allowed = {"-h", "--help", "-c", "--cfg", "job"}
+    allowed |= {"-m", "--multirun"} if name == "train" else set()
+    for flag in flags:
+        if flag not in allowed:
+            known = ", ".join(sorted(one for one in allowed if one.startswith("--")))
+            raise UserError(f"maexp {name} has no option {flag}: choose one of {known}.")
+
+
+def _check_action(name: str, verb: Verb, rest: list[str]) -> None:
+    if verb.actions and (not rest or rest[0] not in verb.actions):
+        found = f"not {rest[0]!r}" if rest else "as in " + verb.examples[0]
+        raise UserError(f"maexp {name} needs one of {', '.join(verb.actions)}, {found}.")
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    """Our own warnings as a sentence; those of libraries are for their authors."""
+    if f"{os.sep}agents{os.sep}" in filename or f"{os.sep}envs{os.sep}" in filename:
+        print(f"maexp: warning: {message}", file=sys.stderr)

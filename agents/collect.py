@@ -1,0 +1,89 @@
+"""Experience: TorchRL's collector, made to continue where a checkpoint left it."""
+
+import time
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import Collector
+
+from maexp.envs.specs import REWARD_TERMS
+
+
+class TeamCollector(Collector):
+    """A Collector whose state holds the simulator and the observation the policy will see next.
+
+    TorchRL's own leaves both out, so a run resumed from it starts new episodes.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        carrier = self._carrier.exclude("collector").detach().clone()
+        return {
+            "frames": self._frames,
+            "iter": self._iter,
+            "env": self.env.state_dict(),
+            "carrier": carrier.to_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any], **kwargs) -> None:
+        self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        self.env.load_state_dict(state_dict["env"])
+        kept = TensorDict(state_dict["carrier"], batch_size=self.env.batch_size, device=self.env.device)
+        self._carrier = self._carrier.select("collector", strict=False).update(kept)
+
+
+def make_collector(env, policy, steps: int) -> TeamCollector:
+    """An endless collector of batches [envs, steps]."""
+    return TeamCollector(
+        env,
+        policy,
+        frames_per_batch=env.batch_size.numel() * steps,
+        total_frames=-1,
+        env_device=env.device,
+        policy_device=env.device,
+        storing_device=env.device,
+    )
+
+
+class Stopwatch:
+    """Seconds spent inside a module's forward passes, since the last look."""
+
+    def __init__(self, module: torch.nn.Module):
+        self.seconds = 0.0
+        module.register_forward_pre_hook(self._begin)
+        module.register_forward_hook(self._end)
+
+    def _begin(self, module, args) -> None:
+        self._begun = time.perf_counter()
+
+    def _end(self, module, args, output) -> None:
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        self.seconds += time.perf_counter() - self._begun
+
+    def read(self) -> float:
+        """The seconds since the last call."""
+        seconds, self.seconds = self.seconds, 0.0
+        return seconds
+
+
+def batch_statistics(batch: TensorDictBase) -> dict[str, float]:
+    """What the log says about a batch [envs, steps]: rewards per step, and how the episodes in it ended.
+
+    Means over ended episodes are NaN where none ended.
+    """
+    after, info = batch["next"], batch["next", "info"]
+    done = after["done"].squeeze(-1)
+    success = after["terminated"].squeeze(-1) & ~info["collided"].all(-1)
+    at_the_end = {
+        "coverage": info["coverage"].squeeze(-1),
+        "success_rate": success,
+        "collisions": info["collided"].sum(-1),
+        "path_length": info["path_length"].mean(-1),
+    }
+    return {
+        "reward": after["agents", "reward"].mean().item(),
+        **{f"reward_{term}": info[f"reward_{term}"].mean().item() for term in REWARD_TERMS},
+        "episodes": int(done.sum()),
+        **{name: value[done].float().mean().item() for name, value in at_the_end.items()},
+    }

@@ -1,0 +1,89 @@
+"""Hydra's composition with errors that people can read: which setting, which value, what to write instead."""
+
+import difflib
+import re
+from importlib import resources
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from maexp.agents.errors import UserError
+
+KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
+
+
+def group_choices(group: str) -> dict[str, str]:
+    """The choices of a group of `conf/` with the comment on their first line: {"maze": "125 m mazes ..."}."""
+    folder = resources.files("maexp.conf").joinpath(group)
+    files = sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name)
+    return {one.name[:-5]: one.read_text().splitlines()[0].removeprefix("#").strip() for one in files}
+
+
+def groups() -> list[str]:
+    """Names of the groups of `conf/`."""
+    folder = resources.files("maexp.conf")
+    return sorted(one.name for one in folder.iterdir() if one.is_dir() and not one.name.startswith("_"))
+
+
+def compose_config(verb: str, overrides: list[str]) -> DictConfig:
+    """The composed settings of a verb, with Hydra's own under `hydra`.
+
+    Raises:
+        UserError: an override that does not fit.
+    """
+    from maexp.agents.schema import register_schema
+
+    register_schema(verb)
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_module("maexp.conf", version_base="1.3"):
+            cfg = compose(verb, overrides, return_hydra_config=True)
+            missing = sorted(OmegaConf.missing_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error, verb)) from error
+    if missing:
+        raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
+    return cfg
+
+
+def explain(error: Exception, verb: str) -> str:
+    """One sentence for an error of Hydra or OmegaConf."""
+    text = f"{error}\n{error.__cause__ or ''}"
+    if found := re.search(r"Could not find '([^/']+)/([^']+)'", text):
+        group, choice = found.groups()
+        return f"{group}={choice} is unknown: choose one of {', '.join(group_choices(group))}."
+    if found := re.search(r"Could not override '([^']+)'", text):
+        return f"{found[1]} is not a setting of maexp {verb}{_suggest(found[1], verb)}."
+    if found := re.search(r"Value '(.*?)' of type '\w+' could not be converted to (\w+)\s+full_key: (\S+)", text, re.S):
+        value, kind, key = found.groups()
+        return f"{key}={value} must be {KINDS.get(kind, kind)}."
+    if found := re.search(r"Ambiguous value for argument '([^']+)'", text):
+        return f"{found[1]} gives several values: add -m to run one after another, or write one value."
+    lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc/docs" not in line]
+    return " ".join(dict.fromkeys(lines[:3])) + f" (see maexp {verb} --help)."
+
+
+def _suggest(name: str, verb: str) -> str:
+    """A close name among the verb's settings, or the settings beside it."""
+    from maexp.agents.schema import schema
+
+    names = _flat_names(OmegaConf.structured(schema(verb)))
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
+    if close:
+        return f": did you mean {close[0]}"
+    parent = name.rpartition(".")[0]
+    beside = [one for one in names if one.rpartition(".")[0] == parent]
+    return f": choose one of {', '.join(beside)}" if beside else f" (see maexp {verb} --help)"
+
+
+def _flat_names(node: DictConfig, prefix: str = "") -> list[str]:
+    names = []
+    for key in node:
+        names.append(prefix + key)
+        child = node._get_node(key)
+        if isinstance(child, DictConfig) and not child._is_missing() and not child._is_none():
+            names += _flat_names(child, f"{prefix}{key}.")
+    return names

@@ -1,0 +1,26 @@
+"""What went wrong on the user's side: one sentence, no traceback."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class UserError(Exception):
+    """A setting, file or folder that cannot be used. The message names it, says what was found and what to do."""
+
+
+@contextmanager
+def blame_input() -> Iterator[None]:
+    """Turn the errors that bad input raises in the layers below into `UserError`.
+
+    Wrap only the steps that read what the user gave (maps, settings, checkpoints): a ValueError in the middle
+    of training is a defect of ours and keeps its traceback.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        raise UserError(f"{error.strerror or error}{where}.") from error
+    except (ValueError, ImportError) as error:
+        raise UserError(str(error)) from error

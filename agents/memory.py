@@ -1,0 +1,29 @@
+"""Memory that a run will need, estimated before it starts."""
+
+import os
+
+from maexp.agents.errors import UserError
+
+COPIES = 3  # the collector's list of steps, the stacked batch, and the updater's selection
+
+
+def check_batch_memory(env, steps: int) -> None:
+    """Refuse batches that cannot fit.
+
+    Raises:
+        UserError: names the settings to lower.
+    """
+    specs = [env.observation_spec, env.full_action_spec]
+    one_step = sum(leaf.zero().nbytes for spec in specs for leaf in spec.values(True, True))
+    need = COPIES * 2 * one_step * steps  # each step is stored as it was and as it became
+    if env.device.type == "cuda":
+        import torch
+
+        have = torch.cuda.get_device_properties(env.device).total_memory
+    else:
+        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if need > have:
+        raise UserError(
+            f"One batch of num_envs={env.num_envs} x collector.steps={steps} needs about {need / 2**30:.1f} GiB, "
+            f"more than the {have / 2**30:.1f} GiB of {env.device}: lower num_envs or collector.steps."
+        )

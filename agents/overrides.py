@@ -1,0 +1,91 @@
+"""From the words of a command line to Hydra overrides: paths and lists are quoted, so that any file name works."""
+
+import re
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
+
+from maexp.agents.errors import UserError
+
+PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "hydra.run.dir", "hydra.sweep.dir")
+LISTS = {"evaluate": ("num_robots", "policy"), "bench": ("num_robots",)}
+
+
+def split_flags(words: list[str]) -> tuple[list[str], list[str]]:
+    """(flags that start with a dash, with the value of --cfg and the like, and the rest)."""
+    flags, rest = [], []
+    words = iter(words)
+    for word in words:
+        if not word.startswith("-") or "=" in word.split("-")[0]:
+            rest.append(word)
+            continue
+        flags.append(word)
+        if word in ("--cfg", "-c", "--package", "-p"):
+            flags.append(next(words, ""))
+    return flags, rest
+
+
+def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = (), multirun: bool = False) -> list[str]:
+    """Hydra overrides of the words after a verb.
+
+    Args:
+        verb: decides which settings take a list (num_robots=1,2,6)
+        words: name=value, or bare values for the settings in `positional`, in order
+        positional: settings that may be given without their name
+        multirun: commas mean a sweep, so they are left alone
+
+    Raises:
+        UserError: a bare word too many, or one that is no override even when quoted.
+    """
+    names = list(positional)
+    result = []
+    for word in words:
+        name, sign, value = word.partition("=")
+        if not sign or not re.fullmatch(r"[+~]*[\w./@:-]+", name) or (names and Path(word).exists()):
+            if not names:
+                raise UserError(f"{word!r} is no setting of maexp {verb}: write name=value (see maexp {verb} --help).")
+            name, value = names.pop(0), word
+        result.append(_make_override(verb, name, value, multirun))
+    return result
+
+
+def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
+    if name in PATHS and value not in ("", "null") and not _is_quoted(value):
+        sweep = multirun and "," in value and not Path(value).exists()
+        return f"{name}={value}" if sweep else f"{name}={quote(value)}"
+    if name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
+        return f"{name}=[{value}]"
+    plain = f"{name}={value}"
+    try:
+        OverridesParser.create().parse_override(plain)
+    except OverrideParseException:
+        return f"{name}={quote(value)}"
+    return plain
+
+
+def quote(text: str) -> str:
+    """`text` as a Hydra string that is neither parsed nor interpolated."""
+    escaped = re.sub(r"(\\*)'", lambda found: found[1] * 2 + r"\'", text)
+    escaped = re.sub(r"(\\+)$", lambda found: found[1] * 2, escaped)
+    return "'" + escaped.replace("${", r"\${") + "'"
+
+
+def _is_quoted(text: str) -> bool:
+    return len(text) >= 2 and text[0] == text[-1] and text[0] in "'\""
+
+
+def find_override(overrides: list[str], name: str) -> str | None:
+    """The value that the last override of `name` gives, unquoted; None if there is none."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    values = [one.value() for one in parsed if one.key_or_group == name and not one.is_delete()]
+    return None if not values or values[-1] is None else str(values[-1])
+
+
+def without(overrides: list[str], *names: str) -> list[str]:
+    """`overrides` less those of the settings or groups called `names`."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    roots = [one.key_or_group.split(".")[0] for one in parsed]
+    keys = [one.key_or_group for one in parsed]
+    rows = zip(overrides, roots, keys, strict=True)
+    return [word for word, root, key in rows if root not in names and key not in names]

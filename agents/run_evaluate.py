@@ -1,0 +1,118 @@
+"""`maexp evaluate`: held-out episodes with a trained team or classical policies, for one team size or several."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from maexp.agents.actor import make_policy
+from maexp.agents.build import load_maps, make_env, model_settings
+from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checks import check_counts, team_sizes
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.evaluate import EvaluationResult, evaluate, play
+from maexp.agents.overrides import find_override, without
+from maexp.agents.policies import POLICIES
+from maexp.agents.progress import Progress
+from maexp.agents.results import describe_run, print_results, write_results
+from maexp.agents.train import load_matching, write_config
+
+PICTURES = 4
+TRAINING_ONLY = (
+    "total_frames", "resume", "checkpoint_every", "checkpoint_keep", "evaluate_every", "collector", "logger",
+)  # fmt: skip
+
+
+def prepare(overrides: list[str]) -> list[str]:
+    """For checkpoint=RUN: the run's overrides as far as they matter here, then the new ones."""
+    place = find_override(overrides, "checkpoint")
+    policy = find_override(overrides, "policy")
+    if place is not None and policy is not None:
+        raise UserError(f"policy={policy} and checkpoint={place} were both given: give one of them.")
+    if place is None and policy is None:
+        raise UserError("Nothing to evaluate: give checkpoint=RUN or policy=nearest_frontier.")
+    if place is None:
+        return overrides
+    kept = without(find_checkpoint(place)[1]["overrides"], *TRAINING_ONLY)
+    chosen = [word.partition("=")[0] for word in overrides if "." not in word.partition("=")[0]]
+    return without(kept, *chosen) + overrides
+
+
+def folder(overrides: list[str]) -> None:
+    """Every evaluation has a folder of its own."""
+    return None
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for counts out of range and unknown policies."""
+    check_counts(cfg, "num_envs", "episodes")
+    team_sizes(cfg.num_robots)
+    for name in policy_names(cfg):
+        if name not in POLICIES:
+            raise UserError(f"policy={name} is unknown: choose one of {', '.join(POLICIES)}.")
+
+
+def policy_names(cfg: Any) -> list[str]:
+    """The classical policies asked for."""
+    if cfg.policy is None:
+        return []
+    return [cfg.policy] if isinstance(cfg.policy, str) else [str(one) for one in cfg.policy]
+
+
+def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """Evaluate, print the table, write results.json and a picture."""
+    with blame_input():
+        maps = load_maps(cfg.scenario, train=False).held_out
+        envs = [make_env(cfg, maps, size, min(cfg.num_envs, cfg.episodes)) for size in team_sizes(cfg.num_robots)]
+        policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0])}
+    write_config(cfg, where)
+    results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
+    report(cfg, results, maps, where / "results.json")
+    draw_ends(cfg, maps, next(iter(policies.values())), where / "picture.png")
+    print(f"Written to {where}: results.json, picture.png, config.yaml")
+    return 0
+
+
+def load_policy(cfg: Any, env: Any) -> Any:
+    """The policy of a checkpoint; its weights fit any team size."""
+    policy = make_policy(env, model_settings(cfg))
+    load_matching(policy, find_checkpoint(cfg.checkpoint)[1]["policy"])
+    return policy
+
+
+def bind(policy: Any, env: Any) -> Any:
+    """A policy to call: the classical ones are made for an env, the trained one fits every env."""
+    return POLICIES[policy](env) if isinstance(policy, str) else policy
+
+
+def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[EvaluationResult]:
+    """Each policy on the same episodes."""
+    results = []
+    for name, policy in policies.items():
+        with Progress(f"{name}, {env.num_robots} robots", cfg.episodes) as progress:
+            bound = bind(policy, env)
+            results.append(
+                evaluate(bound, env, cfg.episodes, name=name, seed=cfg.seed, advance=progress.advance)
+            )
+    return results
+
+
+def report(cfg: Any, results: list[EvaluationResult], maps: list, path: Path, **extra: float) -> None:
+    """The table on the terminal and the JSON beside it."""
+    seconds = sum(one.seconds for one in results)
+    write_results(path, results, describe_run(cfg, maps, seconds) | extra)
+    print_results(results, f"{cfg.scenario.name}: {cfg.episodes} held-out episodes")
+
+
+def draw_ends(cfg: Any, maps: list, policy: Any, path: Path) -> None:
+    """The last moment of the first few episodes, side by side."""
+    from PIL import Image
+
+    from maexp.envs.render import draw_env, draw_grid
+
+    count = min(PICTURES, cfg.episodes)
+    env = make_env(cfg, maps, team_sizes(cfg.num_robots)[0], count)
+    with torch.random.fork_rng([]):
+        torch.manual_seed(cfg.seed)
+        play(bind(policy, env), env, torch.arange(count, device=env.device))
+    Image.fromarray(draw_grid([draw_env(env, index) for index in range(count)])).save(path)

@@ -1,0 +1,105 @@
+"""`maexp train`: settings, a fresh or a resumed run, then the evaluation and the pictures."""
+
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checks import check_counts
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.overrides import find_override, without
+from maexp.agents.run_evaluate import evaluate_all, report
+from maexp.agents.run_folder import check_writable
+from maexp.agents.train import TrainingRun, train, write_config
+
+STOPPED = 130
+
+
+def prepare(overrides: list[str]) -> list[str]:
+    """For resume=RUN: that run's overrides, then the new ones."""
+    place = find_override(overrides, "resume")
+    if place is None:
+        return overrides
+    if find_override(overrides, "hydra.run.dir") is not None:
+        raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
+    return find_checkpoint(place)[1]["overrides"] + overrides
+
+
+def folder(overrides: list[str]) -> Path | None:
+    """The folder of the run that is resumed; None for a new one."""
+    place = find_override(overrides, "resume")
+    if place is None:
+        return None
+    found = Path(place).absolute()
+    found = found.parent if found.is_file() else found
+    found = found.parent if found.name == "checkpoints" else found
+    check_writable(found)
+    return found
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for counts out of range."""
+    check_counts(cfg, "num_envs", "num_robots", "total_frames", "checkpoint_every", "checkpoint_keep")
+    check_counts(cfg, "episodes", "evaluate_every", least=0)
+    check_counts(cfg.collector, "steps", prefix="collector.")
+
+
+def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """Train, evaluate, draw; says where everything is."""
+    saved = find_checkpoint(cfg.resume)[1] if cfg.resume else None
+    overrides = without(overrides, "resume")
+    with blame_input():
+        maps = load_maps(cfg.scenario)
+    write_config(cfg, where)
+    print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(maps.train)} maps), {cfg.num_envs} teams of "
+          f"{cfg.num_robots} robots; everything goes to {_short(where)}")  # fmt: skip
+    done = train(cfg, where, overrides, saved, maps)
+    if done.stopped:
+        print(f"Stopped after {done.frames:,} macro steps. Go on with: maexp train resume={_short(where)}")
+        return STOPPED
+    finish(done)
+    return 0
+
+
+def finish(done: TrainingRun) -> None:
+    """Evaluate the trained team and the random policy on the same episodes; write the summary and the pictures."""
+    cfg, where = done.cfg, done.folder
+    written = ["config.yaml", "metrics.csv", "checkpoints/"]
+    draw_curves(where)
+    written.append("curves.png")
+    if cfg.episodes:
+        env = make_env(cfg, done.suite.held_out, cfg.num_robots)
+        results = evaluate_all(cfg, env, {"trained": done.learner.policy, "random": "random"})
+        report(cfg, results, done.suite.held_out, where / "summary.json", training_seconds=round(done.seconds, 2))
+        written.append("summary.json")
+    draw_rollout(cfg, done, where / "rollout.gif")
+    written.append("rollout.gif")
+    print(f"Written to {_short(where)}: {', '.join(written)}")
+    print(f"Next: maexp evaluate checkpoint={_short(where)} num_robots=1,2,6,8")
+
+
+def draw_curves(where: Path) -> None:
+    """curves.png from metrics.csv."""
+    from maexp.agents.plots import draw_curves as draw
+
+    draw(where / "metrics.csv", where / "curves.png")
+
+
+def draw_rollout(cfg: Any, done: TrainingRun, path: Path) -> None:
+    """A film of the trained team in the first held-out episode."""
+    import torch
+
+    from maexp.envs.film import write_gif
+    from maexp.envs.render import record_episode
+
+    env = make_env(cfg, done.suite.held_out[:1], cfg.num_robots, num_envs=1)
+    with torch.random.fork_rng([]), torch.no_grad():
+        torch.manual_seed(cfg.seed)
+        env.set_episodes(torch.zeros(1, dtype=torch.int64, device=env.device))
+        write_gif(record_episode(env, done.learner.policy, every=None), path)
+
+
+def _short(path: Path) -> str:
+    """The path as one would type it here."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

@@ -1,0 +1,187 @@
+"""Types of the settings, registered with Hydra: a misspelt name or a word in a number's place is refused.
+
+Values live in `conf/`, types here. Where settings belong to a class of the layers below (`RobotConfig`,
+`ModelConfig`, ...), their names and types are read from that class, each optional: null keeps the value of the
+scenario or preset.
+"""
+
+import types
+from dataclasses import MISSING as NO_DEFAULT
+from dataclasses import dataclass, field, fields, make_dataclass
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.model import ModelConfig
+from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
+from maexp.envs.importing.options import ImportOptions
+
+PRIMITIVES = (int, float, bool, str)
+
+
+def optional_settings(*classes: type, **extra: Any) -> type:
+    """Dataclass with every field of `classes` optional, default null, and `extra` name=type fields likewise."""
+    named = {}
+    for cls in classes:
+        hints = get_type_hints(cls)
+        named |= {one.name: storable_type(hints[one.name]) for one in fields(cls) if one.init}
+    named |= extra
+    entries = [(name, kind, field(default=None)) for name, kind in named.items()]
+    return make_dataclass(f"{classes[0].__name__}Settings", entries)
+
+
+def storable_type(kind: Any) -> Any:
+    """The nearest type that OmegaConf can check, None allowed: Literal becomes str, a mixture with tuples Any."""
+    members = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    plain = {str if get_origin(one) is Literal else one for one in members if one is not type(None)}
+    if not plain.issubset(PRIMITIVES):
+        return Any
+    union = None
+    for one in sorted(plain, key=PRIMITIVES.index):
+        union = one if union is None else union | one
+    return union | None
+
+
+def given(node: Any, *leave_out: str) -> dict[str, Any]:
+    """The values of a settings node that are not null, without the names in `leave_out`."""
+    return {name: value for name, value in node.items() if value is not None and name not in leave_out}
+
+
+def setting(default: Any, text: str) -> Any:
+    """A field with its default and the line that `--help` prints."""
+    return field(default=default, metadata={"help": text})
+
+
+def describe(cls: type) -> list[tuple[str, Any, str]]:
+    """(name, default, line of help) of the top-level settings of a verb."""
+    documented = [one for one in fields(cls) if "help" in one.metadata]
+    return [(one.name, None if one.default is NO_DEFAULT else one.default, one.metadata["help"]) for one in documented]
+
+
+RobotSettings = optional_settings(RobotConfig, team=Any)  # team: a list of settings, one per robot
+ModelSettings = optional_settings(ModelConfig, preset=str | None)
+RadarSettings = optional_settings(RadarConfig)
+PlannerSettings = optional_settings(PlannerConfig)
+RewardSettings = optional_settings(RewardConfig)
+ObservationSettings = optional_settings(ObservationConfig)
+CommSettings = optional_settings(CommConfig)
+AlgorithmSettings = optional_settings(
+    *{type(row.settings): None for row in ALGORITHMS.values()}, name=str | None, preset=str | None
+)
+ImportSettings = optional_settings(ImportOptions)
+
+
+@dataclass
+class ScenarioSettings:
+    """Where the team explores. Null: what the table of scenarios says."""
+
+    name: str = MISSING
+    path: str | None = None  # the map of scenario=pointcloud
+    maps: Any = None  # indices trained on; null: all but the last fifth of the table's count
+    held_out: Any = None  # indices evaluated; null: the last fifth
+    local_steps: int | None = None  # control steps in one decision
+    macro_steps: int | None = None  # decisions in one episode
+    success_coverage: float = 0.95
+    collision: str = "centre"  # or footprint
+    importing: ImportSettings = field(default_factory=ImportSettings)
+
+
+@dataclass
+class CollectorSettings:
+    """How experience is gathered."""
+
+    steps: int = 15  # macro steps of every team in one iteration
+
+
+@dataclass
+class LoggerSettings:
+    """Where the metrics go besides metrics.csv."""
+
+    backends: list[str] = field(default_factory=list)
+    project: str = "maexp"
+    mode: str = "online"
+
+
+@dataclass
+class EnvSettings:
+    """Settings that every verb with an environment shares."""
+
+    scenario: ScenarioSettings = field(default_factory=ScenarioSettings)
+    robot: RobotSettings = field(default_factory=RobotSettings)
+    radar: RadarSettings = field(default_factory=RadarSettings)
+    planner: PlannerSettings = field(default_factory=PlannerSettings)
+    reward: RewardSettings = field(default_factory=RewardSettings)
+    observation: ObservationSettings = field(default_factory=ObservationSettings)
+    comm: CommSettings = field(default_factory=CommSettings)
+    num_envs: int = setting(32, "teams simulated at once")
+    seed: int = setting(0, "of everything random: maps' starts, networks, policy")
+    device: str = setting("auto", "cpu, cuda, cuda:1, ...; auto: cuda where there is one")
+
+
+@dataclass
+class LearnerSettings(EnvSettings):
+    """Settings of everything that has a network."""
+
+    algorithm: AlgorithmSettings = field(default_factory=AlgorithmSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)
+
+
+@dataclass
+class TrainSettings(LearnerSettings):
+    """`maexp train`."""
+
+    num_robots: int = setting(3, "robots in a team")
+    total_frames: int = setting(60_000, "macro steps of teams to train for")
+    episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
+    resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
+    checkpoint_every: int = setting(10, "iterations between two checkpoints")
+    checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")
+    evaluate_every: int = setting(0, "iterations between two evaluations on held-out maps; 0: only at the end")
+    collector: CollectorSettings = field(default_factory=CollectorSettings)
+    logger: LoggerSettings = field(default_factory=LoggerSettings)
+
+
+@dataclass
+class EvaluateSettings(LearnerSettings):
+    """`maexp evaluate`."""
+
+    num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
+    policy: Any = setting(None, "random or nearest_frontier; several as policy=random,nearest_frontier")
+    checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
+    episodes: int = setting(256, "episodes of each policy and team size")
+
+
+@dataclass
+class MapsSettings:
+    """`maexp maps`."""
+
+    action: str = MISSING
+    file: str | None = setting(None, "a map's file, or for make and show a scenario")
+    index: int = setting(0, "which map of the scenario")
+    out: str | None = setting(None, "file to write; default: in the run's folder")
+    num_robots: int = setting(3, "the team that must find room")
+    importing: ImportSettings = field(default_factory=ImportSettings)
+
+
+@dataclass
+class BenchSettings(LearnerSettings):
+    """`maexp bench`."""
+
+    action: str = MISSING
+    num_robots: Any = setting(None, "team sizes; default 2,4,6,8")
+    seconds: float = setting(5.0, "time measured per row [s]")
+
+
+SCHEMAS = {"train": TrainSettings, "evaluate": EvaluateSettings, "maps": MapsSettings, "bench": BenchSettings}
+
+
+def schema(verb: str) -> type:
+    """The dataclass of a verb's settings."""
+    return SCHEMAS[verb]
+
+
+def register_schema(verb: str) -> None:
+    """Make the types known to Hydra as `<verb>_schema`, the first entry of the verb's primary config."""
+    ConfigStore.instance().store(name=f"{verb}_schema", node=schema(verb))
