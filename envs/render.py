@@ -10,10 +10,11 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from maexp.envs.film import write_gif, write_mp4
-from maexp.envs.raster import MapRaster, map_raster
 from PIL import Image, ImageDraw, ImageFont
 from torchrl.envs.utils import step_mdp
+
+from maexp.envs.film import write_gif, write_mp4
+from maexp.envs.raster import MapRaster, map_raster
 
 __all__ = ["draw_frame", "draw_grid", "record_episode", "write_gif", "write_mp4"]
 
@@ -46,8 +47,7 @@ ROBOT_COLOURS = (
     (235, 160, 0),
     (20, 20, 20),
 )
-LIGHT = 0.4  # share of white in what a robot sees now
-TINT = 0.12  # and share of its colour
+LIGHT = 0.45  # share of white in what a robot sees now; a tint in its colour would blur the classes
 TRAIL_STEPS = 200  # local steps until a trail has faded away
 _TRAIL_BANDS = 20
 _SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture
@@ -157,12 +157,8 @@ def _point_colours(snapshot: dict, raster: MapRaster) -> np.ndarray:
     free, boundary = table[1 : 1 + raster.num_free], table[1 + raster.num_free : -1]
     free[:] = classes[np.minimum(np.count_nonzero(seen_free, axis=0), 2)]
     boundary[:] = np.where(seen_boundary.any(axis=0)[:, None], WALL_SEEN, WALL_UNSEEN)
-    now = np.flatnonzero(visible.any(axis=0))
-    if now.size:
-        sees = visible[:, now].astype(np.float32)
-        colours = np.array([robot_colour(i) for i in range(len(sees))], dtype=np.float32)
-        tint = sees.T @ colours / sees.sum(axis=0)[:, None]
-        free[now] = np.rint((1 - LIGHT - TINT) * free[now] + LIGHT * 255 + TINT * tint)
+    now = visible.any(axis=0)
+    free[now] = np.rint((1 - LIGHT) * free[now] + LIGHT * 255)
     return table
 
 
@@ -173,7 +169,7 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     """The picture of the points with everything that moves on top, smoothed."""
     large = picture.resize((raster.width * _AA, raster.height * _AA), Image.Resampling.NEAREST)
     unit = max(large.size) / 512  # line widths follow the picture's size
-    _draw_trails(large, raster.to_pixels(snapshot["trail"]) * _AA, unit)
+    _draw_trails(large, raster.to_pixels(_smooth(snapshot["trail"], snapshot["center"])) * _AA, unit)
     draw = ImageDraw.Draw(large, "RGBA")
     centers = raster.to_pixels(snapshot["center"]) * _AA
     for i, (x, y) in enumerate(centers):
@@ -194,9 +190,17 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     return large.reduce(_AA)
 
 
+def _smooth(trail, center) -> np.ndarray:
+    """Latest part of a trail (steps, robots, 2), smoothed: it may come off a grid. Ends at ``center``."""
+    trail = np.array(trail[-TRAIL_STEPS - 1 :], dtype=np.float64)
+    padded = np.pad(trail, ((3, 3), (0, 0), (0, 0)), mode="edge")
+    smooth = np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0).mean(axis=-1)
+    smooth[-1:] = center
+    return smooth
+
+
 def _draw_trails(large: Image.Image, trail: np.ndarray, unit: float) -> None:
     """Trails (steps, robots, 2) [px]: the latest TRAIL_STEPS steps in bands that fade with age."""
-    trail = trail[-TRAIL_STEPS - 1 :]
     edges = np.linspace(len(trail) - 1 - TRAIL_STEPS, len(trail) - 1, _TRAIL_BANDS + 1)
     edges = np.maximum(np.rint(edges).astype(int), 0)
     width = max(1, round(2 * unit))
