@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from oracle.motion import point_to_body
+from oracle.motion import depth_in_body
 
 PIXELS = 125
 
@@ -45,29 +45,25 @@ def shown_points(points, reach, corner, size: float, pixels: int = PIXELS) -> di
     shown: dict[tuple[int, int], list[int]] = {}
     for index, point in enumerate(points):
         shown.setdefault(nearest_pixel(point, corner, size), []).append(index)
+    flat = np.asarray(points, np.float64)[:, :2]
     for ix in range(pixels):
         for iy in range(pixels):
             if (ix, iy) in shown:
                 continue
-            x, y = pixel_center(ix, iy, corner, size)
-            best, gap = -1, math.inf
-            for index, point in enumerate(points):
-                away = math.hypot(float(point[0]) - x, float(point[1]) - y)
-                if away <= reach[index] and away < gap:
-                    best, gap = index, away
-            if best >= 0:
-                shown[ix, iy] = [best]
+            away = np.hypot(*(flat - pixel_center(ix, iy, corner, size)).T)
+            nearest = int(np.argmin(away))
+            if away[nearest] <= reach[nearest]:
+                shown[ix, iy] = [nearest]
     return shown
 
 
-def footprint(state, length: float, width: float, corner, size: float, pixels: int = PIXELS) -> np.ndarray:
-    """Bool (pixels, pixels): pixels whose centre lies in the body."""
-    drawn = np.zeros((pixels, pixels), bool)
-    for ix in range(pixels):
-        for iy in range(pixels):
-            inside = point_to_body(pixel_center(ix, iy, corner, size), state, length, width) <= 0.0
-            drawn[ix, iy] = inside
-    return drawn
+def footprint(state, length: float, width: float, corner, size: float) -> np.ndarray:
+    """Signed depth [m] of every pixel centre in the body, (125, 125): above 0 inside, below 0 outside."""
+    depth = np.zeros((PIXELS, PIXELS))
+    for ix in range(PIXELS):
+        for iy in range(PIXELS):
+            depth[ix, iy] = depth_in_body(pixel_center(ix, iy, corner, size), state, length, width)
+    return depth
 
 
 def fade(age: int) -> float:
