@@ -1,0 +1,102 @@
+"""Map merging against the oracle, and its laws (design 4.2)."""
+
+import numpy as np
+import pytest
+import torch
+from oracle import team
+
+import maexp.kernels as mk
+
+pytestmark = pytest.mark.kernels
+
+SIZES = [(1, 1, 7), (2, 3, 11), (3, 5, 2), (2, 31, 5), (1, 32, 6), (3, 33, 4), (2, 40, 9), (1, 65, 3)]
+
+
+def draw(envs: int, robots: int, points: int, heard: float = 0.3):
+    """`(seen, comm)` at random."""
+    rng = np.random.default_rng(envs + 7 * robots)
+    return rng.random((envs, robots, points)) < 0.2, rng.random((envs, robots, robots)) < heard
+
+
+def merge(seen, comm) -> np.ndarray:
+    got = mk.merge_maps(torch.from_numpy(np.ascontiguousarray(seen)), torch.from_numpy(np.ascontiguousarray(comm)))
+    assert got.dtype == torch.bool and got.shape == seen.shape
+    return got.numpy()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("heard", [0.0, 0.3, 1.0])
+def test_agrees_with_the_oracle(size, heard):
+    seen, comm = draw(*size, heard)
+    got = merge(seen, comm)
+    np.testing.assert_array_equal(got, team.merge_maps(seen, comm))
+    if heard == 0.0:
+        np.testing.assert_array_equal(got, seen)
+    if heard == 1.0:
+        np.testing.assert_array_equal(got, np.broadcast_to(seen.any(1, keepdims=True), seen.shape))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_monotone(size):
+    seen, comm = draw(*size)
+    got = merge(seen, comm)
+    assert not (seen & ~got).any()  # nobody forgets
+    more = seen | (np.random.default_rng(1).random(size) < 0.1)
+    assert not (got & ~merge(more, comm)).any()
+    wider = comm | (np.random.default_rng(2).random(comm.shape) < 0.2)
+    assert not (got & ~merge(seen, wider)).any()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_idempotent_where_hearing_is_transitive(size):
+    """Among groups in which everyone hears everyone, telling twice tells nothing new."""
+    seen, _ = draw(*size)
+    group = np.random.default_rng(3).integers(0, 3, (size[0], size[1]))
+    comm = group[:, :, None] == group[:, None, :]
+    once = merge(seen, comm)
+    np.testing.assert_array_equal(merge(once, comm), once)
+
+
+def test_one_exchange_is_one_hop():
+    seen = np.eye(4, dtype=bool)[None]
+    chain = np.zeros((1, 4, 4), bool)
+    chain[0, 1, 0] = chain[0, 2, 1] = chain[0, 3, 2] = True  # i hears i - 1
+    once = merge(seen, chain)[0]
+    assert once.astype(int).tolist() == [[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1]]
+    thrice = merge(merge(merge(seen, chain), chain), chain)[0]
+    assert thrice[3].all() and not thrice[0, 1:].any()  # news travels one way only
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_permuting_robots_points_or_envs_permutes_the_result(size):
+    seen, comm = draw(*size)
+    rng, got = np.random.default_rng(4), merge(seen, comm)
+    env, robot, point = (rng.permutation(n) for n in size)
+    np.testing.assert_array_equal(merge(seen[:, robot], comm[:, robot][:, :, robot]), got[:, robot])
+    np.testing.assert_array_equal(merge(seen[:, :, point], comm), got[:, :, point])
+    np.testing.assert_array_equal(merge(seen[env], comm[env]), got[env])
+
+
+@pytest.mark.parametrize("size", [(0, 3, 5), (2, 3, 0), (0, 1, 0)])
+def test_nothing_to_merge(size):
+    assert merge(np.zeros(size, bool), np.ones((size[0], size[1], size[1]), bool)).shape == size
+
+
+def test_inputs_are_left_alone_and_misfits_refused():
+    seen, comm = (torch.from_numpy(a) for a in draw(2, 3, 5))
+    kept = seen.clone(), comm.clone()
+    mk.merge_maps(seen, comm)
+    assert torch.equal(seen, kept[0]) and torch.equal(comm, kept[1])
+    for bad in (comm[:1], comm[:, :2], comm[:, :, :2]):
+        with pytest.raises(ValueError, match="do not fit"):
+            mk.merge_maps(seen, bad)
+
+
+@pytest.mark.parametrize("robots", [1, 31, 32, 33, 64, 70])
+def test_flags_of_any_team_survive_packing(robots):
+    seen = torch.from_numpy(draw(2, robots, 9)[0])
+    from maexp.kernels.api import _pack
+
+    words = _pack(seen, 1)
+    assert words.shape == (2, -(-robots // 32), 9) and words.dtype == torch.int32
+    assert torch.equal(mk.unpack_flags(words, robots), seen)
