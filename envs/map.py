@@ -184,8 +184,7 @@ def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:
             members = archive.infolist()
             if sum(member.file_size for member in members) > MAX_FILE_BYTES or len(members) > 64:
                 raise MapError(
-                    f"{path} unpacks to more than {MAX_FILE_BYTES / 2**30:g} GiB or 64 arrays; "
-                    "no MAexp map is so large"
+                    f"{path} unpacks to more than {MAX_FILE_BYTES / 2**30:g} GiB or 64 arrays; no MAexp map is so large"
                 )
             for member in members:
                 _check_member(path, archive, member)

@@ -27,7 +27,8 @@ def draw_map(world: PointCloudMap, path: str | os.PathLike, *, size: int = 900) 
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     (xmin, ymin), (xmax, ymax) = world.extent
     axes.set_title(
-        f"{world.name}: {xmax - xmin:.1f} x {ymax - ymin:.1f} m at {world.resolution:g} m, {world.free_area:,.0f} m² free\n"
+        f"{world.name}: {xmax - xmin:.1f} x {ymax - ymin:.1f} m at {world.resolution:g} m, "
+        f"{world.free_area:,.0f} m² free\n"
         f"{len(world.free):,} free, {len(world.boundary):,} boundary, {len(world.obstacles):,} obstacle points",
         fontsize=9,
     )

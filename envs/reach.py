@@ -103,7 +103,7 @@ def find_leaks(world: PointCloudMap) -> Leaks:
     rim = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
     outside = np.isin(pieces, np.unique(rim[rim > 0]))
     inside = raster.paint(world.free, 0.75 * world.free_spacing) & outside
-    mouths = ndimage.binary_dilation(inside, iterations=6, mask=outside)
+    mouths = ndimage.binary_dilation(inside, iterations=6, mask=outside) & ~inside
     return Leaks(np.flatnonzero(outside[raster.nearest(world.free)]), raster, mouths)
 
 

@@ -10,6 +10,7 @@ from maexp.envs.checker import check_map, repair_map
 from maexp.envs.map import MapError, PointCloudMap, check_file
 from maexp.envs.scenarios import find_scenario
 
+from .arrays import read_npy_triple, read_npz_map
 from .finish import finish_grid
 from .occupancy import read_occupancy
 from .options import ImportOptions, make_options
@@ -53,6 +54,10 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
     if suffix in GRIDS:
         grid = read_occupancy(path, options, report)
         return finish_grid(grid, _scenario(options, "pointcloud"), name, options, report)
+    if suffix == ".npz":
+        return read_npz_map(path, options, report)
+    if suffix == ".npy":
+        return read_npy_triple(path, options, report)
     raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported")
 
 
@@ -64,7 +69,8 @@ def _check(world: PointCloudMap, options: ImportOptions, report: ImportReport) -
     """The checker's verdict; what it finds is repaired once, and an unusable map is an error."""
     verdict = check_map(world, num_robots=options.num_robots)
     if not verdict.ok or verdict.warnings:
-        world, steps = repair_map(world)
+        threshold = None if options.min_passage is None else options.min_passage / 2
+        world, steps = repair_map(world, threshold=threshold)
         for step in steps:
             report.add("repair", step)
         verdict = check_map(world, num_robots=options.num_robots)
