@@ -16,6 +16,7 @@ from .lattice import grid_points, largest_component, make_generator
 SIZE = 288.0  # [m]
 RESOLUTIONS = (1.5, 1.6, 1.8, 2.0)  # [m]; each divides the tile
 DRIVABLE_CLEARANCE = 2.25  # [m]: three collision thresholds, what a start needs
+WATER = -3.0  # height of a pond or river [m]: obstacles, though below ground
 STEEPEST = 0.3  # slope a car climbs
 
 Rect = tuple[float, float, float, float]  # u0, v0, u1, v1
@@ -75,7 +76,6 @@ def build_outdoor(index: int, *, scenario: str) -> PointCloudMap:
     scene = Scene(RESOLUTIONS[int(rng.integers(len(RESOLUTIONS)))], rng)
     theme = ("centre", "housing", "campus", "country")[int(rng.integers(4))]
     _lay_town(scene, _THEMES[theme])
-    scene.plant()
     ground = _terrain(scene, 14.0 if theme == "country" else 6.0)
     free = _drivable(scene, ground)
     obstacle_height = ground + np.nan_to_num(scene.height, nan=0.0)
@@ -133,6 +133,7 @@ def _lay_town(scene: Scene, theme: dict) -> None:
     for lines, swap in ((across, False), (along, True)):
         for position, half in lines:
             _line_street(scene, position, half, swap, theme["cars"])
+    scene.plant()
     if rng.random() < theme["river"]:
         _cut_river(scene, along)
 
@@ -161,7 +162,7 @@ def _cut_river(scene: Scene, along: list[tuple[float, float]]) -> None:
     half = rng.uniform(6, 11)
     water = offset < half
     scene.height[(offset < half + 7)] = np.nan  # banks one can drive along
-    scene.height[water] = -1.0
+    scene.height[water] = WATER
     for k, (position, street) in enumerate(along):
         if k % 3 != 2:
             scene.height[water & (np.abs(scene.v - position) < street)] = np.nan
@@ -288,7 +289,7 @@ def _park(scene: Scene, rect: Rect) -> None:
     if rng.random() < 0.4:
         u, v, radius = (u0 + u1) / 2, (v0 + v1) / 2, 0.22 * min(u1 - u0, v1 - v0)
         for k in range(4):
-            scene.disc(u + rng.uniform(-6, 6), v + rng.uniform(-6, 6), radius * rng.uniform(0.6, 1) + k, -0.5)
+            scene.disc(u + rng.uniform(-6, 6), v + rng.uniform(-6, 6), radius * rng.uniform(0.6, 1) + k, WATER)
 
 
 def _square(scene: Scene, rect: Rect) -> None:
