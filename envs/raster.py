@@ -70,7 +70,7 @@ def map_raster(map, size: int) -> MapRaster:
 
 def _build(map, size: int) -> MapRaster:
     (xmin, ymin), (xmax, ymax) = map.extent
-    border = MARGIN * max(xmax - xmin, ymax - ymin) + 0.5 * float(np.max(map.free_spacing))
+    border = MARGIN * max(xmax - xmin, ymax - ymin) + REACH * float(np.max(map.free_spacing))
     span = np.array([xmax - xmin, ymax - ymin]) + 2.0 * border
     scale = size / span.max()
     width, height = np.maximum(np.ceil(span * scale - 1e-6).astype(int), 8)
@@ -111,18 +111,20 @@ def _pixel_centers(width: int, height: int, scale: float, corner) -> np.ndarray:
 
 def _nearest(points, spacing, centers) -> tuple[np.ndarray, np.ndarray]:
     """For each pixel the point nearest in units of its spacing: index and that distance (inf: none)."""
-    if len(points) == 0:
-        return np.zeros(len(centers), dtype=np.int64), np.full(len(centers), np.inf)
+    nearest, share = np.zeros(len(centers), dtype=np.int64), np.full(len(centers), np.inf)
     spacing = np.asarray(spacing, dtype=np.float64)
-    uniform = spacing.max() <= 1.01 * spacing.min()
-    count = 1 if uniform else min(4, len(points))
-    distance, index = cKDTree(np.asarray(points)[:, :2]).query(
-        centers, k=[*range(1, count + 1)], p=np.inf, distance_upper_bound=REACH * spacing.max()
-    )  # the maximum norm: lattice points paint squares
-    share = distance / np.append(spacing, 1.0)[index]  # misses carry index len(points) and distance inf
-    best = np.argmin(share, axis=1)[:, None]
-    index, share = np.take_along_axis(index, best, 1)[:, 0], np.take_along_axis(share, best, 1)[:, 0]
-    return np.minimum(index, len(points) - 1), share
+    levels = np.rint(2.0 * np.log2(spacing)).astype(int)  # a search per density, or fine hides coarse
+    for level in np.unique(levels):
+        members = np.flatnonzero(levels == level)
+        distance, index = cKDTree(np.asarray(points)[members, :2]).query(
+            centers, p=np.inf, distance_upper_bound=REACH * spacing[members].max()
+        )  # the maximum norm: lattice points paint squares
+        found = np.flatnonzero(index < len(members))
+        point = members[index[found]]
+        closer = distance[found] / spacing[point] < share[found]
+        found, point = found[closer], point[closer]
+        nearest[found], share[found] = point, distance[found] / spacing[point]
+    return nearest, share
 
 
 def _without(points, others) -> np.ndarray:
