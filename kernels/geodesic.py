@@ -32,12 +32,14 @@ wp_skip = wp.constant(wp.int32(SKIP))
 def _clear_distance(
     # Query:
     stop: wp.array(dtype=wp.int32),  # [item]
+    lanes: int,
     # Out:
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
 ):
-    item, cell = wp.tid()
+    item, lane = wp.tid()
     if stop[item] != wp_skip:
-        distance[item, cell] = wp_unreached
+        for cell in range(lane, distance.shape[1], lanes):
+            distance[item, cell] = wp_unreached
 
 
 @wp.func
@@ -196,9 +198,11 @@ class DistanceSearch:
             grid_of_row: int32 [rows], which grid (map) a row has now.
             width, height: int32 [grids], cells of each grid along x and y.
         """
-        launch(_clear_distance, self.distance.shape, [self.stop], [self.distance])
+        items = self.distance.shape[0]
+        lanes = 1 if self.distance.device.is_cpu else 256
+        launch(_clear_distance, (items, lanes), [self.stop, lanes], [self.distance])
         launch(
-            _flood_distance, self.distance.shape[0],
+            _flood_distance, items,
             [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
             [self.straight_queue, self.diagonal_queue, self.distance],
         )  # fmt: skip

@@ -62,11 +62,17 @@ def _assign_grids(
 
 @wp.kernel(enable_backward=False)
 def _clear_known(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    lanes: int,
     # Out:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
 ):
-    row, cell = wp.tid()
-    known[row, cell] = wp_unknown
+    row, lane = wp.tid()
+    m = grid_of_row[row]
+    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
+        known[row, cell] = wp_unknown
 
 
 @wp.kernel(enable_backward=False)
@@ -79,16 +85,19 @@ def _paint_points(
     flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
     rows_per_env: int,
     value: wp.uint8,
+    lanes: int,
     # Out:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
 ):
     """Gives `value` to the cells of known points; with one row an env, what any robot knows counts."""
-    row, point = wp.tid()
+    row, lane = wp.tid()
     e = row / rows_per_env
     m = map_id[e]
-    if point < point_begin[m + 1] - point_begin[m]:
-        if is_known(flags, e, row % rows_per_env, point, wp.where(rows_per_env > 1, 1, 0)):
-            known[row, point_cell[point_begin[m] + point]] = value
+    first = point_begin[m]
+    limited = wp.where(rows_per_env > 1, 1, 0)
+    for point in range(lane, point_begin[m + 1] - first, lanes):
+        if is_known(flags, e, row % rows_per_env, point, limited):
+            known[row, point_cell[first + point]] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -96,20 +105,44 @@ def _fill_voids(
     # Map:
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    lanes: int,
     # State in and out:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
 ):
     """Cells without a point of their own (a cloud is no lattice) take the state of their stand-in."""
-    row, cell = wp.tid()
+    row, lane = wp.tid()
     m = grid_of_row[row]
-    if cell < grids.width[m] * grids.height[m]:
-        other = grids.stand_in[grids.cell_begin[m] + cell]
+    first = grids.cell_begin[m]
+    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
+        other = grids.stand_in[first + cell]
         if other >= 0 and other != cell:
             known[row, cell] = known[row, other]
 
 
 @wp.kernel(enable_backward=False)
-def _mask_passable(
+def _open_cells(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # State in:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    through_unknown: int,
+    lanes: int,
+    # Out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    row, lane = wp.tid()
+    m = grid_of_row[row]
+    source = known_of_row[row]
+    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
+        state = known[source, cell]
+        open = state == wp_free or (state == wp_unknown and through_unknown != 0)
+        passable[row, cell] = wp.where(open, wp.uint8(1), wp.uint8(0))
+
+
+@wp.kernel(enable_backward=False)
+def _close_cells(
     # Map:
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
@@ -118,30 +151,31 @@ def _mask_passable(
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
     radius: wp.array(dtype=wp.float32),  # [mask row], distance to keep from known obstacle cells [m]
     margin: float,  # the same, on top, in cells
-    through_unknown: int,
+    lanes: int,
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
-    row, cell = wp.tid()
+    """Closes what lies too near to known obstacles (threads that write the same cell write the same)."""
+    row, lane = wp.tid()
     m = grid_of_row[row]
     w = grids.width[m]
     h = grids.height[m]
-    ok = wp.uint8(0)
-    if cell < w * h:
-        source = known_of_row[row]
-        state = known[source, cell]
-        if state == wp_free or (state == wp_unknown and through_unknown != 0):
-            ok = wp.uint8(1)
-            r = radius[row] / grids.cell[m] + margin
-            reach = int(wp.ceil(r))
+    source = known_of_row[row]
+    r = radius[row] / grids.cell[m] + margin
+    reach = int(wp.ceil(r))
+    for cell in range(lane, w * h, lanes):
+        if known[source, cell] == wp_obstacle:
             x = cell % w
             y = cell / w
             for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
                 for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-                    gap = float((v - y) * (v - y) + (u - x) * (u - x))
-                    if gap < r * r and known[source, v * w + u] == wp_obstacle:
-                        ok = wp.uint8(0)
-    passable[row, cell] = ok
+                    if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
+                        passable[row, v * w + u] = wp.uint8(0)
+
+
+def lanes_on(device: wp.Device) -> int:
+    """Threads that share a row of cells: one on the CPU, where a thread costs more than a cell."""
+    return 1 if device.is_cpu else 256
 
 
 class KnownGrids:
@@ -172,25 +206,27 @@ class KnownGrids:
         self.maps, self.grids, self.map_id = maps, grids, map_id
         self.free_flags, self.boundary_flags = free_flags, boundary_flags
         self.rows_per_env = rows_per_env
+        self.lanes = lanes_on(map_id.device)
         rows = map_id.shape[0] * rows_per_env
         self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=map_id.device)
         self.grid_of_row = wp.zeros(rows, dtype=wp.int32, device=map_id.device)
 
     def paint(self, launch) -> None:
         """Brings `known` up to date; ``launch(kernel, dim, inputs, outputs)`` launches or records."""
-        rows, cells = self.known.shape
+        rows = self.known.shape[0]
         launch(_assign_grids, rows, [self.map_id, self.rows_per_env], [self.grid_of_row])
-        launch(_clear_known, (rows, cells), [], [self.known])
+        dim = (rows, self.lanes)
+        launch(_clear_known, dim, [self.grids, self.grid_of_row, self.lanes], [self.known])
         layers = [
             (self.maps.free_begin, self.grids.free_cell, self.free_flags, FREE),
             (self.maps.boundary_begin, self.grids.boundary_cell, self.boundary_flags, OBSTACLE),
         ]
         for begin, cell, flags, value in layers:
             launch(
-                _paint_points, (rows, flags.shape[2]),
-                [self.map_id, begin, cell, flags, self.rows_per_env, wp.uint8(value)], [self.known],
+                _paint_points, dim,
+                [self.map_id, begin, cell, flags, self.rows_per_env, wp.uint8(value), self.lanes], [self.known],
             )  # fmt: skip
-        launch(_fill_voids, (rows, cells), [self.grids, self.grid_of_row], [self.known])
+        launch(_fill_voids, dim, [self.grids, self.grid_of_row, self.lanes], [self.known])
 
 
 class PassableGrids:
@@ -225,8 +261,8 @@ class PassableGrids:
     def paint(self, launch) -> None:
         """Brings `passable` up to date with `known`."""
         launch(_assign_grids, self.grid_of_row.shape, [self.known.map_id, self.masks], [self.grid_of_row])
-        launch(
-            _mask_passable, self.passable.shape,
-            [self.known.grids, self.grid_of_row, self.known.known, self.known_of_row, self.radius,
-             self.margin, self.through_unknown], [self.passable],
-        )  # fmt: skip
+        grids, lanes = self.known.grids, self.known.lanes
+        dim = (self.passable.shape[0], lanes)
+        inputs = [grids, self.grid_of_row, self.known.known, self.known_of_row]
+        launch(_open_cells, dim, [*inputs, self.through_unknown, lanes], [self.passable])
+        launch(_close_cells, dim, [*inputs, self.radius, self.margin, lanes], [self.passable])
