@@ -5,7 +5,7 @@ import os
 import sys
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from maexp.agents.errors import UserError
@@ -94,7 +94,8 @@ def overview() -> str:
 
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
-    from maexp.agents.overrides import find_override, make_overrides, split_flags
+    from maexp.agents.overrides import find_override, make_overrides, split_flags, without
+    from maexp.agents.run_folder import claim_folder, remove_if_empty
 
     verb = VERBS[name]
     flags, rest = split_flags(words)
@@ -120,8 +121,13 @@ def run_verb(name: str, words: list[str]) -> int:
         print(OmegaConf.to_yaml(_settings(cfg)), end="")
         return 0
     home.check(_settings(cfg))
-    folder = _claim(cfg, home, overrides, chosen=find_override(overrides, "hydra.run.dir") is not None)
-    return home.run(_settings(cfg), folder, _task_overrides(prepared))
+    chosen = find_override(overrides, "hydra.run.dir") is not None
+    folder = home.folder(overrides, partial(claim_folder, cfg.hydra.run.dir, chosen))
+    try:
+        return home.run(_settings(cfg), folder, without(prepared, "hydra", "resume", "checkpoint"))
+    except UserError:
+        remove_if_empty(folder)
+        raise
 
 
 def _compose(name: str, overrides: list[str]) -> Any:
@@ -135,19 +141,6 @@ def _settings(cfg: Any) -> Any:
     from omegaconf import OmegaConf
 
     return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
-
-
-def _task_overrides(overrides: list[str]) -> list[str]:
-    from maexp.agents.overrides import without
-
-    return without(overrides, "hydra", "resume", "checkpoint")
-
-
-def _claim(cfg: Any, home: Any, overrides: list[str], chosen: bool) -> Path:
-    from maexp.agents.run_folder import claim_folder
-
-    kept = home.folder(overrides)
-    return kept if kept is not None else claim_folder(cfg.hydra.run.dir, chosen)
 
 
 def _check_flags(name: str, flags: list[str]) -> None:

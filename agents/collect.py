@@ -4,10 +4,12 @@ import time
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from maexp.envs.specs import REWARD_TERMS
+
+_SEPARATOR = "/"
 
 
 class TeamCollector(Collector):
@@ -17,19 +19,22 @@ class TeamCollector(Collector):
     """
 
     def state_dict(self) -> dict[str, Any]:
-        carrier = self._carrier.exclude("collector").detach().clone()
-        return {
-            "frames": self._frames,
-            "iter": self._iter,
-            "env": self.env.state_dict(),
-            "carrier": carrier.to_dict(),
-        }
+        """Counts, the simulator, and the observation at hand, as containers of tensors."""
+        seen = {_SEPARATOR.join(key): self._carrier.get(key).clone() for key in self._seen_keys()}
+        return {"frames": self._frames, "iter": self._iter, "env": self.env.state_dict(), "seen": seen}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs) -> None:
-        self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        """Go on where `state_dict` was called; ValueError if the simulator's state does not fit."""
         self.env.load_state_dict(state_dict["env"])
-        kept = TensorDict(state_dict["carrier"], batch_size=self.env.batch_size, device=self.env.device)
-        self._carrier = self._carrier.select("collector", strict=False).update(kept)
+        self._frames, self._iter = state_dict["frames"], state_dict["iter"]
+        for key in self._seen_keys():
+            self._carrier.set(key, state_dict["seen"][_SEPARATOR.join(key)].to(self.env.device))
+
+    def _seen_keys(self) -> list[tuple[str, ...]]:
+        """What a reset returns: observation and done flags."""
+        specs = (self.env.full_observation_spec, self.env.full_done_spec)
+        keys = [key for spec in specs for key in spec.keys(True, True)]
+        return [key if isinstance(key, tuple) else (key,) for key in keys]
 
 
 def make_collector(env, policy, steps: int) -> TeamCollector:

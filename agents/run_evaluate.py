@@ -1,5 +1,6 @@
 """`maexp evaluate`: held-out episodes with a trained team or classical policies, for one team size or several."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,9 @@ def prepare(overrides: list[str]) -> list[str]:
     return without(kept, *chosen) + overrides
 
 
-def folder(overrides: list[str]) -> None:
-    """Every evaluation has a folder of its own."""
-    return None
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
+    """Every evaluation has a new folder of its own."""
+    return claim()
 
 
 def check(cfg: Any) -> None:

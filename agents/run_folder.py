@@ -33,6 +33,12 @@ def claim_folder(wanted: str, chosen: bool) -> Path:
     return folder
 
 
+def remove_if_empty(folder: Path | None) -> None:
+    """A run that failed before it wrote anything leaves no folder behind."""
+    if folder is not None and folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
 def _create_new(folder: Path) -> Path:
     number = 1
     while True:

@@ -1,5 +1,6 @@
 """`maexp train`: settings, a fresh or a resumed run, then the evaluation and the pictures."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,11 @@ def prepare(overrides: list[str]) -> list[str]:
     return find_checkpoint(place)[1]["overrides"] + overrides
 
 
-def folder(overrides: list[str]) -> Path | None:
-    """The folder of the run that is resumed; None for a new one."""
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
+    """The folder of the run that is resumed, or a new one."""
     place = find_override(overrides, "resume")
     if place is None:
-        return None
+        return claim()
     found = Path(place).absolute()
     found = found.parent if found.is_file() else found
     found = found.parent if found.name == "checkpoints" else found

@@ -162,6 +162,7 @@ class MapsSettings:
     index: int = setting(0, "which map of the scenario")
     out: str | None = setting(None, "file to write; default: in the run's folder")
     num_robots: int = setting(3, "the team that must find room")
+    repair: bool = setting(False, "check: mend what can be mended and write the mended map")
     importing: ImportSettings = field(default_factory=ImportSettings)
 
 

@@ -46,8 +46,9 @@ def train(
             run.iteration += 1
             row |= run.evaluate_if_due()
             log.write(run.timed(row, collected, policy_watch.read(), begin))
+            average = run.smooth(row["coverage"])
             run.keep(row, log, last=bool(stop) or run.iteration == run.iterations)
-            progress.show(min(run.frames, cfg.total_frames), f"coverage {run.smooth(row['coverage']):.3f}")
+            progress.show(min(run.frames, cfg.total_frames), f"coverage {average:.3f}")
     log.close()
     run.stopped = bool(stop)
     return run
@@ -144,8 +145,8 @@ class TrainingRun:
         due = last or self.iteration % self.cfg.checkpoint_every == 0
         if due:
             log.sync()
-            best = score > self.best
-            self.best = max(self.best, score) if best else self.best
+            best = score > self.best  # false where the score is NaN
+            self.best = score if best else self.best
             self.save(best)
 
     def smooth(self, coverage: float) -> float:

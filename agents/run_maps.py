@@ -1,0 +1,102 @@
+"""`maexp maps`: list scenarios, make and import maps, check, repair and draw them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+from maexp.agents.checks import check_counts
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.overrides import find_override
+from maexp.agents.schema import given
+from maexp.envs.checker import check_map, repair_map
+from maexp.envs.map import PointCloudMap
+from maexp.envs.map_plot import draw_map
+from maexp.envs.scenarios import SCENARIOS, make_map
+
+UNUSABLE = 1
+FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy"
+
+
+def prepare(overrides: list[str]) -> list[str]:
+    return overrides
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
+    """A new folder, except for the list."""
+    return None if find_override(overrides, "action") == "list" else claim()
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for what is missing or out of range, before a folder is made."""
+    check_counts(cfg, "num_robots")
+    check_counts(cfg, "index", least=0)
+    if cfg.action != "list" and not cfg.file:
+        raise UserError(f"maexp maps {cfg.action} needs a {'scenario' if cfg.action == 'make' else 'file'} after it.")
+    if cfg.action == "make" and cfg.file not in SCENARIOS:
+        raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(_generated())}.")
+    if cfg.out and Path(cfg.out).exists():
+        raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
+    if cfg.out and cfg.action != "show" and Path(cfg.out).suffix != ".npz":
+        raise UserError(f"out={cfg.out} must end in .npz.")
+
+
+def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
+    """Do what `action` says; 1 where the map turned out unusable."""
+    if cfg.action == "list":
+        print_scenarios()
+        return 0
+    with blame_input():
+        world, story = read_map(cfg)
+        report = check_map(world, num_robots=cfg.num_robots)
+        if cfg.repair and cfg.action == "check":
+            world, steps = repair_map(world)
+            story = "\n".join(f"repair: {step}" for step in steps or ["nothing to mend"])
+            report = check_map(world, num_robots=cfg.num_robots)
+        print("\n".join(part for part in (story, report.table()) if part))
+        written = write_files(cfg, where, world)
+    (where / "report.txt").write_text(report.table() + "\n")
+    print(f"Written: {', '.join(str(one) for one in written)}")
+    if report.ok and cfg.action in ("make", "import"):
+        print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}")
+    return 0 if report.ok else UNUSABLE
+
+
+def write_files(cfg: Any, where: Path, world: PointCloudMap) -> list[Path]:
+    """The map (unless it was only looked at) and its picture, in the run's folder or where `out` says."""
+    out = Path(cfg.out) if cfg.out else where / (f"{world.name}.png" if cfg.action == "show" else f"{world.name}.npz")
+    written = []
+    if cfg.action in ("make", "import") or cfg.repair:
+        world.save(out)
+        written.append(out)
+    picture = out if cfg.action == "show" else where / f"{world.name}.png"
+    written.append(draw_map(world, picture))
+    return written
+
+
+def read_map(cfg: Any) -> tuple[PointCloudMap, str]:
+    """The map of a scenario's name or of a file, and what the import did."""
+    from maexp.envs.importing import import_map_with_report
+
+    if cfg.file in SCENARIOS and not Path(cfg.file).exists():
+        return make_map(cfg.file, cfg.index), ""
+    if cfg.action in ("check", "show") and cfg.file.endswith(".npz"):
+        return PointCloudMap.load(cfg.file), ""
+    options = {"num_robots": cfg.num_robots} | given(cfg.importing)
+    world, report = import_map_with_report(cfg.file, **options)
+    return world, report.table()
+
+
+def _generated() -> list[str]:
+    return [name for name, one in SCENARIOS.items() if one.build is not None]
+
+
+def print_scenarios() -> None:
+    """The table of scenarios and the formats of files."""
+    print(f"{'scenario':<26}{'maps':>6}{'spacing m':>11}{'size m':>8}{'radar m':>9}{'speed m/s':>11}  local x macro steps")
+    for name, one in SCENARIOS.items():
+        size = "yours" if one.size is None else f"{one.size:g}"
+        steps = f"{one.local_steps} x {one.macro_steps or 'from the free area'}"
+        print(f"{name:<26}{one.count or 'yours':>6}{one.resolution:>11g}{size:>8}{one.radar_range:>9g}"
+              f"{one.max_speed:>11g}  {steps}")  # fmt: skip
+    print(f"\nFiles that can be imported: {FORMATS}")

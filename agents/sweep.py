@@ -1,0 +1,57 @@
+"""`maexp train -m`: every combination of the listed values, through Hydra's sweeper and launchers."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from maexp.agents import run_train
+from maexp.agents.compose import compose_config, explain
+from maexp.agents.errors import UserError
+from maexp.agents.overrides import find_override, without
+from maexp.agents.run_folder import claim_folder
+from maexp.agents.schema import register_schema
+
+
+def run_sweep(verb: str, overrides: list[str]) -> int:
+    """Run all jobs, each in its own folder under one new folder; a job that fails ends the sweep after its batch."""
+    if find_override(overrides, "resume") is not None:
+        raise UserError("resume continues one run: leave out -m.")
+    register_schema(verb)
+    chosen = find_override(overrides, "hydra.sweep.dir")
+    folder = claim_folder(chosen or _default_folder(verb), chosen is not None)
+    words = [*without(overrides, "hydra.sweep.dir"), f"hydra.sweep.dir='{folder}'"]
+    job = hydra.main(version_base="1.3", config_path="pkg://maexp.conf", config_name=verb)(_run_job)
+    with mock.patch.object(sys, "argv", [f"maexp {verb}", "-m", *words]), _raise_errors():
+        try:
+            job()
+        except (HydraException, OmegaConfBaseException) as error:
+            raise UserError(explain(error, verb)) from error
+    print(f"All runs are in {folder}")
+    return 0
+
+
+def _raise_errors():
+    """Hydra prints tracebacks and exits unless it is told to raise."""
+    return mock.patch.dict(os.environ, HYDRA_FULL_ERROR="1")
+
+
+def _default_folder(verb: str) -> str:
+    return OmegaConf.select(compose_config(verb, []), "hydra.sweep.dir")
+
+
+def _run_job(cfg: Any) -> None:
+    settings = HydraConfig.get()
+    overrides = list(settings.overrides.task)
+    print(f"Run {settings.job.num}: {' '.join(overrides)}")
+    run_train.check(cfg)
+    status = run_train.run(cfg, Path(settings.runtime.output_dir), overrides)
+    if status:
+        raise KeyboardInterrupt
