@@ -5,6 +5,8 @@ import warp as wp
 from maexp.kernels.dynamics import rectangle_distance, rectangles_gap
 from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 
 @wp.func
 def hits_boundary(

@@ -8,6 +8,8 @@ import warp as wp
 
 from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 
 @wp.func
 def wrap_angle(theta: float) -> float:

@@ -9,6 +9,8 @@ import warp as wp
 
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 
 @wp.func
 def many_bits(word: int) -> bool:

@@ -5,6 +5,8 @@ import warp as wp
 from maexp.kernels.dynamics import curvature, heading_change, rectangle_distance, rectangles_gap
 from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
 
 

@@ -7,6 +7,8 @@ import warp as wp
 
 from maexp.kernels.types import PI, Maps, Robots, point_xy
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 TRIES = wp.constant(64)
 START_CLEARANCE = wp.constant(3.0)
 """Starts keep this many collision thresholds from the boundary and from other robots."""
