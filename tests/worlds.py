@@ -40,7 +40,7 @@ def room(width: int, height: int, kind: str = "lattice", seed: int = 0, spacing:
 def turned(points, angle: float, shift=(0.0, 0.0)) -> np.ndarray:
     """Points turned about the origin, then moved."""
     c, s = math.cos(angle), math.sin(angle)
-    result = np.array(points, np.float64)
+    result = np.asarray(points).astype(np.float64)
     result[:, :2] = result[:, :2] @ np.array([[c, s], [-s, c]]) + np.asarray(shift)
     return result
 
