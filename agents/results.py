@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from maexp.agents.evaluate import EvaluationResult
 
+WIDTH = 116  # columns the table needs; a narrower terminal wraps lines, which is still readable
 PACKAGES = ("maexp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
 COLUMNS = {
     "exploration_ratio": "coverage",
-    "coverage_step_85": "steps to 85 %",
-    "coverage_step_95": "steps to 95 %",
-    "mutual_overlap_85": "overlap at 85 %",
+    "coverage_step_85": "85 % at step",
+    "coverage_step_95": "95 % at step",
+    "mutual_overlap_85": "overlap",
     "success_rate": "success",
     "collisions": "collisions",
     "path_length": "path [m]",
@@ -81,15 +83,15 @@ def _without_nan(value: Any) -> Any:
 
 def print_results(results: list[EvaluationResult], title: str) -> None:
     """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("policy")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("policy", no_wrap=True)
     for column in COLUMNS.values():
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", no_wrap=True)
     for name, result in zip(result_names(results), results, strict=True):
         summary = result.summary()
         total = summary["exploration_ratio"]["n"]
         table.add_row(name, *(_cell(metric, summary[metric], total) for metric in COLUMNS))
-    Console(width=None if os.environ.get("COLUMNS") else max(110, Console().width)).print(table)
+    Console(width=max(WIDTH, Console().width)).print(table)
 
 
 def _cell(metric: str, value: dict, total: int) -> str:

@@ -109,11 +109,11 @@ def draw_ends(cfg: Any, maps: list, policy: Any, path: Path) -> None:
     """The last moment of the first few episodes, side by side."""
     from PIL import Image
 
-    from maexp.envs.render import draw_env, draw_grid
+    from maexp.envs.render import draw_frame, draw_grid
 
     count = min(PICTURES, cfg.episodes)
     env = make_env(cfg, maps, team_sizes(cfg.num_robots)[0], count)
     with torch.random.fork_rng([]):
         torch.manual_seed(cfg.seed)
         play(bind(policy, env), env, torch.arange(count, device=env.device))
-    Image.fromarray(draw_grid([draw_env(env, index) for index in range(count)])).save(path)
+    Image.fromarray(draw_grid([draw_frame(env.snapshot(index)) for index in range(count)])).save(path)

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-
 from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.overrides import find_override
@@ -93,7 +92,8 @@ def _generated() -> list[str]:
 
 def print_scenarios() -> None:
     """The table of scenarios and the formats of files."""
-    print(f"{'scenario':<26}{'maps':>6}{'spacing m':>11}{'size m':>8}{'radar m':>9}{'speed m/s':>11}  local x macro steps")
+    head = f"{'scenario':<26}{'maps':>6}{'spacing m':>11}{'size m':>8}{'radar m':>9}{'speed m/s':>11}"
+    print(head + "  local x macro steps")
     for name, one in SCENARIOS.items():
         size = "yours" if one.size is None else f"{one.size:g}"
         steps = f"{one.local_steps} x {one.macro_steps or 'from the free area'}"
