@@ -1,0 +1,265 @@
+"""Classical planners, batched on the env's device: the yardstick for what is learned.
+
+A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
+All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way
+from every robot to every target. They differ in which target each robot takes. How it is approached they share:
+where the env drives by `wavefront` the goal is the target; where it drives by plain DWA, the farthest point in
+sight on the way to it, near enough to brake for.
+
+Sources and tuning: docs/planners.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from tensordict.nn import TensorDictModule
+
+from maexp.envs import ExplorationEnv
+from maexp.envs.navigation import Navigation
+from maexp.kernels.assignment import FORBIDDEN, assign_targets
+
+DWELL = 3  # decisions beside a target that does not go away before it is given up
+REGION_COUNT = 64
+BETA = 1.0  # cost_utility: one radar range of travel is worth this share of a disc full of unknown cells
+RRT_SAMPLES = 512
+RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
+REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What targets are chosen from. K targets per robot; those that are absent are infinitely far.
+
+    Attributes:
+        travel: float32 [E, N, K], way from robot to target [m].
+        points: float32 [E, N, K, 2], where the targets are [m].
+        size: float32 [E, N, K], frontier cells behind each.
+        alive: bool [E, N], robots that still move.
+        nav: the env's grids.
+    """
+
+    travel: torch.Tensor
+    points: torch.Tensor
+    size: torch.Tensor
+    alive: torch.Tensor
+    nav: Navigation
+
+    def spread(self, per_row: torch.Tensor) -> torch.Tensor:
+        """[E, R, K] of what is known -> [E, N, K] of the robots."""
+        return per_row.expand(-1, self.travel.shape[1], -1)
+
+    def gain(self) -> torch.Tensor:
+        """Share of unknown cells in radar range of each target: float32 [E, N, K] in [0, 1]."""
+        nav = self.nav
+        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
+        return self.spread(nav.count_unknown(nav.radar_range)) / disc.view(-1, 1, 1)
+
+
+def choose_nearest(scene: Scene) -> torch.Tensor:
+    """Each robot its nearest target (Yamauchi 1997)."""
+    return scene.travel.argmin(-1)
+
+
+def choose_in_turn(scene: Scene, gain: torch.Tensor, cost: torch.Tensor) -> torch.Tensor:
+    """Pairs in order of gain - cost; a target taken lowers the gain of others that can be seen from there.
+
+    One round per robot: it depends on the rounds before, all envs take it together (Burgard et al. 2005).
+    """
+    robots = scene.travel.shape[1]
+    chosen = torch.zeros_like(scene.travel[..., 0], dtype=torch.long)
+    waiting = torch.ones_like(scene.alive)
+    for _ in range(robots):
+        value = torch.where(waiting.unsqueeze(-1), gain - cost, -torch.inf)
+        best = value.flatten(1).argmax(1)
+        robot, target = best // value.shape[2], best % value.shape[2]
+        chosen[torch.arange(len(best)), robot] = target
+        waiting[torch.arange(len(best)), robot] = False
+        here = scene.points[torch.arange(len(best)), robot, target]
+        far = (scene.points - here.view(-1, 1, 1, 2)).norm(dim=-1) / scene.nav.radar_range
+        gain = gain * far.clamp(max=1.0)
+    return chosen
+
+
+def choose_by_utility(scene: Scene) -> torch.Tensor:
+    """Unknown area around the target against the way there."""
+    return choose_in_turn(scene, scene.gain(), BETA * scene.travel / scene.nav.radar_range)
+
+
+def choose_by_tree(scene: Scene) -> torch.Tensor:
+    """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
+    nav = scene.nav
+    found = scene.spread(nav.grow_trees(RRT_SAMPLES, 0.5 * nav.radar_range)) & scene.travel.isfinite()
+    found = found | ~found.any(-1, keepdim=True)  # no tree of the team found any: all frontiers count
+    near = (scene.points - nav.centers().unsqueeze(2)).norm(dim=-1) <= nav.radar_range
+    gain = scene.gain() * torch.where(near, RRT_HYSTERESIS, 1.0)
+    cost = torch.where(found, BETA * scene.travel / nav.radar_range, torch.inf)
+    return choose_in_turn(scene, gain, cost)
+
+
+def choose_by_area(scene: Scene) -> torch.Tensor:
+    """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
+    travel = torch.where(scene.alive.unsqueeze(-1), scene.travel, torch.inf)
+    own = travel.argmin(1, keepdim=True) == torch.arange(travel.shape[1], device=travel.device).view(1, -1, 1)
+    mine = torch.where(own, travel, torch.inf)
+    has_own = mine.isfinite().any(-1)
+    return torch.where(has_own, mine.argmin(-1), travel.argmin(-1))
+
+
+def choose_by_assignment(scene: Scene) -> torch.Tensor:
+    """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
+    finite = scene.travel.isfinite()
+    scale = 100.0 / scene.nav.cell_of_env().view(-1, 1, 1)  # hundredths of a cell
+    cost = torch.where(finite, (scene.travel * scale).clamp(max=FORBIDDEN - 1), FORBIDDEN).to(torch.int32)
+    match = assign_targets(cost)
+    return torch.where(match >= 0, match, scene.travel.argmin(-1))
+
+
+def choose_by_force(scene: Scene) -> torch.Tensor:
+    """The target whose way starts off closest to the force: pulls along the ways, pushes between robots.
+
+    A target pulls with its frontier cells over its way squared, the gradient of the multi-target potential
+    -size / way of MMPF (Yu et al. 2021), which takes geodesic ways in place of straight lines.
+    """
+    nav = scene.nav
+    at = nav.centers()
+    ways = nav.first_points(3.0) - at.unsqueeze(2)
+    ways = ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    cell = nav.cell_of_env().view(-1, 1, 1)
+    pull = torch.where(scene.travel.isfinite(), scene.size / (scene.travel / cell).clamp_min(1.0) ** 2, 0.0)
+    force = (pull.unsqueeze(-1) * ways).sum(2)
+    apart = at.unsqueeze(2) - at.unsqueeze(1)
+    gap = apart.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    push = REPULSION * (1.0 - gap / nav.radar_range).clamp_min(0.0) * scene.alive.view(*scene.alive.shape, 1, 1).mT
+    force = force + pull.sum(-1, keepdim=True) * (push * apart / gap).sum(2)
+    along = (ways * force.unsqueeze(2)).sum(-1) / force.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    return torch.where(scene.travel.isfinite(), pull * (1.0 + along), -torch.inf).argmax(-1)
+
+
+class FrontierPlanner:
+    """A choice of targets as a policy; calling it plans for all envs.
+
+    Args:
+        env: the env to plan for.
+        choose: `Scene` -> int64 [E, N], the target of each robot.
+        ahead: how far away a goal may be where plain DWA drives to it [m]; default: what a robot drives in a
+            macro step from standstill, at most its radar's range.
+    """
+
+    def __init__(
+        self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor], ahead: float | None = None
+    ):
+        self.env, self.choose, self.nav = env, choose, Navigation(env)
+        if ahead is None:
+            accel = min(r.max_accel for r in env.robot_configs)
+            threshold = max(r.collision_threshold for r in env.robot_configs)
+            ahead = min(0.5 * accel * (0.1 * env.local_steps) ** 2 + threshold, self.nav.radar_range)
+        shape = (env.num_envs, env.num_robots)
+        self.reach = torch.full(shape, float(ahead), device=env.device)
+        blocks = (env.num_envs, self.nav.rows, self.nav.num_blocks)
+        self.dwell = torch.zeros(blocks, dtype=torch.int32, device=env.device)
+
+    @torch.no_grad()
+    def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
+        nav = self.nav
+        nav.update()
+        travel = self._give_up(nav.travel())
+        cells = nav.target.expand(-1, self.env.num_robots, -1)
+        scene = Scene(
+            travel=travel,
+            points=nav.points(cells.clamp_min(0)),
+            size=nav.size.expand(-1, self.env.num_robots, -1).float(),
+            alive=nav.alive(),
+            nav=nav,
+        )
+        chosen = self.choose(scene).unsqueeze(-1)
+        found = travel.gather(2, chosen).squeeze(-1).isfinite()
+        goal_cell = torch.where(found, cells.gather(2, chosen).squeeze(-1), -1)
+        elsewhere = self._roam()
+        if self.env.planner_config.name == "wavefront":
+            goal = torch.where(found.unsqueeze(-1), nav.points(goal_cell.clamp_min(0)), elsewhere)
+        else:
+            goal = nav.waypoints(goal_cell, elsewhere, self.reach)
+        return nav.to_action(goal)
+
+    def _give_up(self, travel: torch.Tensor) -> torch.Tensor:
+        """Drop targets that robots stood beside in vain: what is unknown there cannot be seen from there."""
+        nav = self.nav
+        near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
+        self.dwell[nav.state["macro_step"] == 0] = 0
+        beside = travel <= near
+        self.dwell += beside.any(1, keepdim=True) if nav.rows == 1 else beside
+        kept = travel.masked_fill(self.dwell >= DWELL, torch.inf)
+        # Nothing else left: try them all once more.
+        again = ~kept.isfinite().flatten(1).any(1)
+        self.dwell[again] = 0
+        return torch.where(again.view(-1, 1, 1), travel, kept)
+
+    def _roam(self) -> torch.Tensor:
+        """Where robots without a target go [m]: anywhere, [E, N, 2]."""
+        m = self.nav.state["map_id"].long()
+        lower, upper = self.nav.lower[m].unsqueeze(1), self.nav.upper[m].unsqueeze(1)
+        return lower + keyed_uniform(self.env, 2) * (upper - lower)
+
+
+def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
+    """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone: no generator's
+    state, and the same for env i in any batch."""
+    state = env.simulation.tensors
+    robots = torch.arange(env.num_robots * count, device=env.device).view(1, env.num_robots, count)
+    key = torch.zeros((env.num_envs, 1, 1), dtype=torch.int64, device=env.device)
+    for part in (*(state[name].view(-1, 1, 1) for name in ("seed", "env_id", "episode", "macro_step")), robots):
+        key = _mix(key + part)
+    return ((key >> 40) & 0xFFFFFF).float() / float(1 << 24)
+
+
+def _mix(x: torch.Tensor) -> torch.Tensor:
+    """Finaliser of splitmix64 (Steele et al. 2014) on int64, which wraps as uint64 does."""
+    x = x + (0x9E3779B97F4A7C15 - (1 << 64))
+    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * (0xBF58476D1CE4E5B9 - (1 << 64))
+    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * (0x94D049BB133111EB - (1 << 64))
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
+
+
+class RandomPolicy:
+    """A region and an offset drawn evenly for every robot."""
+
+    def __init__(self, env: ExplorationEnv):
+        self.env = env
+
+    @torch.no_grad()
+    def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        draw = keyed_uniform(self.env, 3)
+        region = (draw[..., 0] * REGION_COUNT).long()
+        return region, 2.0 * draw[..., 1:] - 1.0
+
+
+def _as_module(make: Callable, env: ExplorationEnv) -> TensorDictModule:
+    if env.planner_config.name == "direct":
+        raise ValueError("planner=direct takes controls, and this policy picks goals: use planner=dwa or wavefront")
+    return TensorDictModule(
+        make(env),
+        in_keys=[("agents", "observation", "pose")],
+        out_keys=[("agents", "action", "region"), ("agents", "action", "offset")],
+    )
+
+
+CHOICES: dict[str, Callable[[Scene], torch.Tensor]] = {
+    "nearest_frontier": choose_nearest,
+    "cost_utility": choose_by_utility,
+    "potential_field": choose_by_force,
+    "rrt_frontiers": choose_by_tree,
+    "voronoi": choose_by_area,
+    "hungarian": choose_by_assignment,
+}
+"""Choice of targets of every planner."""
+
+POLICIES: dict[str, Callable[[ExplorationEnv], TensorDictModule]] = {
+    "random": partial(_as_module, RandomPolicy),
+    **{name: partial(_as_module, partial(FrontierPlanner, choose=choose)) for name, choose in CHOICES.items()},
+}
+"""Name -> callable(env) -> policy."""

@@ -1,0 +1,222 @@
+"""What a planner needs to know of a running env: known grids, distances, targets and ways, as torch tensors.
+
+A `Navigation` reads an `ExplorationEnv` and never writes to it. `update` brings everything up to date for all
+envs at once, on the env's device, without a loop over envs or robots.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import torch
+import warp as wp
+
+from maexp.envs.environment import ExplorationEnv
+from maexp.envs.nav_grid import bank_nav_grids
+from maexp.kernels import targets
+from maexp.kernels.frontier import mark_frontier
+from maexp.kernels.geodesic import STRAIGHT, UNREACHED
+from maexp.kernels.known_grid import KnownGrids, PassableGrids
+from maexp.kernels.tree import _grow_tree
+from maexp.kernels.types import REGIONS
+from maexp.kernels.wavefront import MARGIN_CELLS, PathSearch
+
+BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
+
+
+class Navigation:
+    """Known grids, distances and targets of all envs of an `ExplorationEnv`.
+
+    R rows per env hold what is known: 1 where all communicate, else N (a robot knows what it has heard). K is
+    the number of blocks of the largest map. Attributes below are valid after `update`.
+
+    Attributes:
+        known: uint8 [E, R, C], `UNKNOWN`, `FREE` or `OBSTACLE` by cell (iy * width + ix).
+        frontier: uint8 [E, R, C], known free cells with an unknown neighbour.
+        distance: int32 [E, N, C], way from each robot over known free cells, 10 a cell; `UNREACHED` elsewhere.
+        target: int64 [E, R, K], the cell to go to for each block with frontier cells; -1 = none.
+        size: int32 [E, R, K], frontier cells in the block.
+    """
+
+    def __init__(self, env: ExplorationEnv):
+        sim = env.simulation
+        self.state, self.device = sim.tensors, env.device
+        self.num_envs, self.num_robots = env.num_envs, env.num_robots
+        self.launch = partial(wp.launch, device=str(env.device))
+        nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
+        self.grids, cells = nav
+        limited = env.comm_config.limited
+        self.rows = self.num_robots if limited else 1
+        prefix = "known" if limited else "seen"
+        self.arrays = {
+            name: wp.from_torch(self.state[name], dtype=kind)
+            for name, kind in (
+                ("map_id", wp.int32), ("active", wp.int32), ("collided", wp.int32), ("center", wp.vec3),
+                (f"{prefix}_free", wp.int32), (f"{prefix}_boundary", wp.int32),
+            )
+        }  # fmt: skip
+        self.known_grids = KnownGrids(
+            sim.maps, self.grids, self.arrays["map_id"], self.arrays[f"{prefix}_free"],
+            self.arrays[f"{prefix}_boundary"], self.rows, cells,
+        )  # fmt: skip
+        threshold = np.array([[r.collision_threshold for r in env.robot_configs]], np.float32)
+        masks, mask_of_robot = np.unique(threshold, axis=1, return_inverse=True)
+        if limited:
+            masks, mask_of_robot = threshold, np.arange(self.num_robots)
+        radius = np.repeat(masks, self.num_envs, axis=0)
+        self.passable = PassableGrids(self.known_grids, radius, MARGIN_CELLS, through_unknown=False)
+        self.paths = PathSearch(self.passable, mask_of_robot.reshape(-1))
+        self._size_blocks(env, float(threshold.max()))
+        self._make_views(cells)
+        self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
+        self.radar_range = max(r.range for r in env.radar_configs)
+        self.clearance = float(sim.robot_tensors["clearance"].max())
+
+    def _size_blocks(self, env: ExplorationEnv, threshold: float) -> None:
+        cell, width, height = (getattr(self.grids, name).numpy() for name in ("cell", "width", "height"))
+        reach = min(r.range for r in env.radar_configs)
+        block = np.maximum(2, np.round(reach / cell / BLOCKS_PER_RANGE)).astype(np.int32)
+        search = np.ceil(threshold / cell + MARGIN_CELLS).astype(np.int32) + 1
+        self.block, self.search = (wp.array(v, dtype=wp.int32, device=str(env.device)) for v in (block, search))
+        self.num_blocks = int((-(-width // block) * -(-height // block)).max())
+
+    def _make_views(self, cells: int) -> None:
+        """Outputs as torch tensors that share memory with the kernels' arrays."""
+        e, n, r, k = self.num_envs, self.num_robots, self.rows, self.num_blocks
+        self.cell_size, self.width = (wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width"))
+        self.origin = wp.to_torch(self.grids.origin)
+        self.known = wp.to_torch(self.known_grids.known).view(e, r, cells)
+        self.frontier = torch.zeros_like(self.known)
+        self.distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
+        self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
+        self._target = torch.zeros((e * r, k), dtype=torch.int32, device=self.device)
+        self._size = torch.zeros_like(self._target)
+
+    def update(self) -> None:
+        """Bring everything up to date with the env."""
+        a, grids = self.arrays, self.grids
+        self.known_grids.paint(self.launch)
+        self.passable.paint(self.launch)
+        self.launch(
+            targets._locate_robots, (self.num_envs, self.num_robots),
+            inputs=[grids, a["map_id"], a["active"], a["collided"], a["center"], self.passable.passable,
+                    self.paths.row_of_item],
+            outputs=[self.paths.search.sources, self.paths.search.stop],
+        )  # fmt: skip
+        self.paths.flood(self.launch)
+        rows = self.known_grids.grid_of_row
+        frontier = wp.from_torch(self.frontier.flatten(0, 1))
+        mark_frontier(self.known_grids.known, rows, grids.width, grids.height, frontier)
+        self.launch(
+            targets._list_targets, tuple(self._target.shape),
+            inputs=[grids, rows, self.block, self.search, frontier, self.paths.search.distance, self.rows,
+                    self.num_robots],
+            outputs=[wp.from_torch(self._target), wp.from_torch(self._size)],
+        )  # fmt: skip
+        self.target = self._target.view(self.num_envs, self.rows, -1).long()
+        self.size = self._size.view(self.num_envs, self.rows, -1)
+
+    def count_unknown(self, radius: float) -> torch.Tensor:
+        """Unknown cells within ``radius`` [m] of every target: int32 [E, R, K]."""
+        count = torch.empty_like(self._target)
+        self.launch(
+            targets._count_unknown, tuple(count.shape),
+            inputs=[self.grids, self.known_grids.grid_of_row, self.known_grids.known,
+                    wp.from_torch(self._target), float(radius)],
+            outputs=[wp.from_torch(count)],
+        )  # fmt: skip
+        return count.view(self.num_envs, self.rows, -1)
+
+    def grow_trees(self, samples: int, branch: float) -> torch.Tensor:
+        """Targets that random trees of the robots came upon: bool [E, R, K].
+
+        Args:
+            samples: random points a tree grows toward.
+            branch: length of the longest branch [m].
+        """
+        found = torch.zeros_like(self._target)
+        items = self.num_envs * self.num_robots
+        node = torch.empty((items, samples, 2), device=self.device)
+        state = [wp.from_torch(self.state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
+        cells = branch / float(self.cell_size.max())
+        self.launch(
+            _grow_tree, items,
+            inputs=[self.grids, self.arrays["map_id"], self.block, *state, self.known_grids.known,
+                    self.paths.search.sources, self.rows, self.num_robots, samples, cells],
+            outputs=[wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
+        )  # fmt: skip
+        return found.view(self.num_envs, self.rows, -1) != 0
+
+    def alive(self) -> torch.Tensor:
+        """Robots that can still move: bool [E, N]."""
+        return (self.state["collided"] == 0) & (self.state["active"] != 0).unsqueeze(1)
+
+    def centers(self) -> torch.Tensor:
+        """Centres of the bodies [m]: float32 [E, N, 2]."""
+        return self.state["center"][..., :2]
+
+    def travel(self) -> torch.Tensor:
+        """Way from every robot to every target [m]: float32 [E, N, K], infinite where there is none."""
+        cells = self.target.clamp_min(0).expand(-1, self.num_robots, -1)
+        way = self.distance.gather(2, cells)
+        metres = way * (self.cell_of_env() / STRAIGHT).view(-1, 1, 1)
+        return torch.where((self.target >= 0) & (way < UNREACHED), metres, torch.inf)
+
+    def cell_of_env(self) -> torch.Tensor:
+        """Edge of a cell of each env's grid [m]: float32 [E]."""
+        return self.cell_size[self.state["map_id"].long()]
+
+    def points(self, cells: torch.Tensor) -> torch.Tensor:
+        """Centres of cells [m]: int64 [E, ...] -> float32 [E, ..., 2]."""
+        m = self.state["map_id"].long()
+        shape = (-1,) + (1,) * (cells.dim() - 1)
+        width = self.width[m].long().view(shape)
+        index = torch.stack([cells % width, cells // width], dim=-1) + 0.5
+        return self.origin[m].view(*shape, 2) + index * self.cell_size[m].view(*shape, 1)
+
+    def first_points(self, ahead: float) -> torch.Tensor:
+        """Points ``ahead`` [cells] in front of every robot on its way to every target: float32 [E, N, K, 2]."""
+        wanted = self.target.to(torch.int32).expand(-1, self.num_robots, -1).contiguous()
+        cell = torch.empty_like(wanted)
+        self.launch(
+            targets._first_cells, tuple(wanted.shape),
+            inputs=[self.grids, self.arrays["map_id"], self.paths.search.distance, wp.from_torch(wanted),
+                    int(STRAIGHT * ahead)],
+            outputs=[wp.from_torch(cell)],
+        )  # fmt: skip
+        return self.points(cell.clamp_min(0).long())
+
+    def waypoints(self, cells: torch.Tensor, points: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
+        """The farthest point in sight on every robot's way.
+
+        Args:
+            cells: int64 [E, N], where to; -1 = to the cell nearest to `points` that the robot can get to.
+            points: float32 [E, N, 2], where to [m], for robots without a cell.
+            reach: float32 [E, N], how far away a waypoint may be [m].
+
+        Returns:
+            float32 [E, N, 2]: waypoints [m].
+        """
+        a = self.arrays
+        goal = torch.where((cells >= 0).unsqueeze(-1), self.points(cells.clamp_min(0)), points).contiguous()
+        self._stop.copy_(cells)
+        result = goal.clone()
+        goal = wp.from_torch(goal, dtype=wp.vec2)
+        self.paths.trace(self.launch, goal)
+        self.paths.pick(
+            self.launch, a["active"], a["collided"], a["center"], goal, wp.from_torch(reach.contiguous()),
+            wp.from_torch(result, dtype=wp.vec2),
+        )  # fmt: skip
+        return result
+
+    def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
+        m = self.state["map_id"].long()
+        lower, side = self.lower[m].unsqueeze(1), (self.upper[m] - self.lower[m]).unsqueeze(1)
+        count = int(REGIONS)
+        share = (points - lower) / side.clamp_min(1e-9) * count
+        index = share.floor().clamp(0, count - 1)
+        offset = ((share - index) * 2.0 - 1.0).clamp(-1.0, 1.0)
+        index = index.long()
+        return index[..., 0] * count + index[..., 1], offset

@@ -1,0 +1,169 @@
+"""Targets of exploration: frontier cells gathered in square blocks, each with a cell to go to and what it offers.
+
+Rows are those of `KnownGrids`: one per env where the team shares what it knows, else one per robot. Blocks are
+numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the env's map.
+"""
+
+import warp as wp
+
+from maexp.kernels.frontier import UNKNOWN
+from maexp.kernels.geodesic import UNREACHED
+from maexp.kernels.known_grid import NavGrids, nav_cell
+from maexp.kernels.types import point_xy
+from maexp.kernels.wavefront import nearest_passable, step_back
+
+wp_unknown = wp.constant(wp.uint8(UNKNOWN))
+wp_unreached = wp.constant(wp.int32(UNREACHED))
+
+
+@wp.kernel(enable_backward=False)
+def _locate_robots(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    collided: wp.array2d(dtype=wp.int32),
+    center: wp.array2d(dtype=wp.vec3),
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+    row_of_item: wp.array(dtype=wp.int32),  # [item]
+    # Out:
+    sources: wp.array2d(dtype=wp.int32),  # [item, 1], -1 for robots that do not move any more
+    stop: wp.array(dtype=wp.int32),  # [item], -1: search everywhere
+):
+    e, i = wp.tid()
+    item = e * center.shape[1] + i
+    m = map_id[e]
+    stop[item] = -1
+    sources[item, 0] = -1
+    if active[e] != 0 and collided[e, i] == 0:
+        here = nav_cell(grids, m, point_xy(center[e, i]))
+        sources[item, 0] = nearest_passable(
+            passable, row_of_item[item], here, grids.width[m], grids.height[m]
+        )
+
+
+@wp.func
+def is_reached(
+    distance: wp.array2d(dtype=wp.int32), e: int, first: int, last: int, robots: int, cell: int
+) -> bool:
+    """Whether one of the robots `first` to `last` (not included) gets to a cell."""
+    found = wp.bool(False)
+    for i in range(first, last):
+        found = found or distance[e * robots + i, cell] < wp_unreached
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def _list_targets(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
+    search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
+    # State in:
+    frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
+    rows_per_env: int,
+    robots: int,
+    # Out:
+    target: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
+    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
+):
+    """The reached cell nearest to the middle of a block's frontier cells, in the block or close to it."""
+    row, k = wp.tid()
+    target[row, k] = -1
+    size[row, k] = 0
+    m = grid_of_row[row]
+    w = grids.width[m]
+    h = grids.height[m]
+    b = block[m]
+    across = (w + b - 1) / b
+    x0 = (k % across) * b
+    y0 = (k / across) * b
+    if y0 >= h:
+        return
+    x1 = wp.min(x0 + b, w)
+    y1 = wp.min(y0 + b, h)
+    count = wp.int32(0)
+    sum_x = wp.int32(0)
+    sum_y = wp.int32(0)
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            if frontier[row, y * w + x] != wp.uint8(0):
+                count += 1
+                sum_x += x
+                sum_y += y
+    if count == 0:
+        return
+    size[row, k] = count
+    e = row / rows_per_env
+    first = wp.where(rows_per_env > 1, row % rows_per_env, 0)
+    last = wp.where(rows_per_env > 1, first + 1, robots)
+    s = search[m]
+    best_gap = wp.int32(1 << 30)
+    for y in range(wp.max(y0 - s, 0), wp.min(y1 + s, h)):
+        for x in range(wp.max(x0 - s, 0), wp.min(x1 + s, w)):
+            # Compared after scaling by `count`, which keeps the mean in integers.
+            gap_x = wp.abs(x * count - sum_x)
+            gap_y = wp.abs(y * count - sum_y)
+            gap = gap_x * gap_x + gap_y * gap_y
+            if gap < best_gap and is_reached(distance, e, first, last, robots, y * w + x):
+                best_gap = gap
+                target[row, k] = y * w + x
+
+
+@wp.kernel(enable_backward=False)
+def _count_unknown(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    # State in:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    target: wp.array2d(dtype=wp.int32),  # [row, block]
+    radius: float,  # [m]
+    # Out:
+    unknown: wp.array2d(dtype=wp.int32),  # [row, block], unknown cells within the radius of the target
+):
+    row, k = wp.tid()
+    m = grid_of_row[row]
+    cell = target[row, k]
+    count = wp.int32(0)
+    if cell >= 0:
+        w = grids.width[m]
+        h = grids.height[m]
+        r = radius / grids.cell[m]
+        reach = int(r)
+        x = cell % w
+        y = cell / w
+        for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+            for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+                gap = float((v - y) * (v - y) + (u - x) * (u - x))
+                if gap <= r * r and known[row, v * w + u] == wp_unknown:
+                    count += 1
+    unknown[row, k] = count
+
+
+@wp.kernel(enable_backward=False)
+def _first_cells(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),
+    # State in:
+    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
+    target: wp.array3d(dtype=wp.int32),  # [env, robot, block], -1 = none
+    reach: int,  # length of the way to look ahead, 10 a cell
+    # Out:
+    cell: wp.array3d(dtype=wp.int32),  # [env, robot, block]; -1 = no way
+):
+    """The cell that lies `reach` ahead of the robot on its way to each target."""
+    e, i, k = wp.tid()
+    item = e * distance.shape[0] / map_id.shape[0] + i
+    m = map_id[e]
+    here = target[e, i, k]
+    if here >= 0:
+        if distance[item, here] >= wp_unreached:
+            here = -1
+    while here >= 0 and distance[item, wp.max(here, 0)] > reach:
+        here = step_back(distance, item, here, grids.width[m], grids.height[m])
+    cell[e, i, k] = here
