@@ -111,9 +111,9 @@ class CellEncoder(nn.Module):
                 nn.Conv2d(width // 2, width, 3, stride=2, padding=1), nn.ReLU(),
             )  # fmt: skip
         inputs = (channels if self.stem is None else width) + 2 * merge
-        self.cnn = nn.Sequential(
-            nn.Conv2d(inputs, width, 3, stride=2, padding=1), nn.ReLU(),
-            nn.Conv2d(width, width, 3, stride=2, padding=1), nn.ReLU(),
+        self.cnn = nn.Sequential(  # kernels of 4: with 3, a region would see its neighbours on one side only
+            nn.Conv2d(inputs, width, 4, stride=2, padding=1), nn.ReLU(),
+            nn.Conv2d(width, width, 4, stride=2, padding=1), nn.ReLU(),
         )  # fmt: skip
         self.grid = nn.Sequential(nn.Linear(13, config.grid_features), nn.ReLU())
 

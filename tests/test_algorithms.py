@@ -122,7 +122,7 @@ def test_a_loss_takes_a_collector_batch_in_user_code(name):
     assert sum(p.numel() for p in loss.parameters()) == sum(
         p.numel() for net in (policy, critic) for p in net.parameters()
     )
-    for batch in Collector(env, policy, frames_per_batch=12, total_frames=24):
+    for batch in Collector(env, policy, frames_per_batch=12, total_frames=24, auto_register_policy_transforms=False):
         terms = loss(batch)
         optimizer.zero_grad()
         sum(value for key, value in terms.items() if key.startswith("loss_")).backward()

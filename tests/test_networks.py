@@ -130,6 +130,9 @@ def test_team_critic_sees_every_robot_and_local_only_its_own(env, model, name):
         moved = {k: critic(td.clone())[VALUE] != critic(other.clone())[VALUE] for k, critic in
                  (("team", team), ("local", local))}  # fmt: skip
         assert moved["team"].all(), "a robot's value ignores what another one observes"
+        alone = td.clone()
+        alone["agents", "observation", "comm"][:] = True
+        assert torch.equal(team(alone)[VALUE], team(td.clone())[VALUE]), "a critic asks who hears whom"
         own = torch.arange(3) == robot
         assert (moved["local"][..., 0] == own).all(), "a local value listens to others or not to its own"
 
@@ -189,6 +192,22 @@ def test_a_lit_region_is_the_cell_of_that_region():
     assert by_region.max() < 0.01
 
 
+def test_features_of_a_lit_region_land_in_that_regions_cell(env, model):
+    encoder = make_policy(env, model).module[0].module.network.encoder
+    for p in encoder.parameters():
+        torch.nn.init.uniform_(p, 0, 0.1)  # no signs: every path counts
+    td = states(1, 1)
+    parts = [td["agents", "observation", name] for name in ("map", "pose", "grid", "comm")]
+    dark = torch.zeros_like(parts[0])
+    place = parts[1][0, 0, :2, None] + 2 * torch.stack((parts[2][0, 0, 0, :, 0], parts[2][0, 0, 1, 0]))
+    for ix, iy in ((0, 2), (2, 1)):
+        x, y = (int((place[axis, k] + 1) / 2 * PIXELS) for axis, k in enumerate((ix, iy)))
+        lit = dark.clone()
+        lit[..., x - 2 : x + 3, y - 2 : y + 3] = 255
+        change = encoder(lit, *parts[1:]) - encoder(dark, *parts[1:])
+        assert change.abs().sum(-1).argmax() == ix * SIDE + iy
+
+
 def test_resampling_keeps_constants_and_positions():
     centres = torch.linspace(-0.7, 0.5, 4)[None]
     weights = resampling(centres, 1 / 31 - 1, 2 / 31, 31)[0]
@@ -232,3 +251,25 @@ def test_unknown_preset_and_foreign_env_are_named():
     del env.observation_spec["agents", "observation", "comm"]
     with pytest.raises(ValueError, match="comm"):
         make_policy(env)
+
+
+def test_pictures_and_offsets_of_the_real_env_agree():
+    """The seam with `kernels/observe.py`: where pose and grid say robots and regions are, there they are drawn."""
+    from maexp.agents.encoder import region_centres
+    from maexp.envs import ExplorationEnv, make_map
+
+    maze = make_map("maze_small", 3)
+    env = ExplorationEnv([maze], num_envs=3, num_robots=2)
+    observation = env.rollout(2, make_policy(env))["agents", "observation"].flatten(0, 1).flatten(0, 1)
+    along = (torch.arange(125) * 2 + 1) / 125 - 1
+    own = (observation["map"][:, 2] == 255).float()
+    mass = own.sum((1, 2))
+    drawn = torch.stack(((own.sum(2) @ along) / mass, (own.sum(1) @ along) / mass), dim=-1)
+    torch.testing.assert_close(drawn, observation["pose"][:, :2], atol=2 / 125, rtol=0)
+    (low_x, low_y), (high_x, high_y) = maze.extent
+    for centres, low, high in zip(
+        region_centres(observation["pose"], observation["grid"]), (low_x, low_y), (high_x, high_y), strict=True
+    ):
+        side = 1.1 * max(high_x - low_x, high_y - low_y)
+        steps = ((torch.arange(8) + 0.5) / 8 - 0.5) * (high - low)
+        torch.testing.assert_close(centres, (2 * steps / side).expand(12, 8), atol=0.02, rtol=0)

@@ -80,15 +80,17 @@ def test_first_try_follows_the_natural_gradient():
     torch.testing.assert_close(moved, full * report["step_length"] / full.norm(), atol=1e-4, rtol=1e-2)
 
 
-@pytest.mark.parametrize("max_kl", [1e-3, 1e-2, 0.1])
+@pytest.mark.parametrize("max_kl", [1e-3, 1e-2, 0.1, 0.5])
 def test_accepted_step_stays_inside_and_improves(max_kl):
-    for seed in range(5):
+    """Damping near 0 makes the first length tried overshoot the region in some of these cases."""
+    for seed in range(10):
         bandit = Bandit(seed)
         before = bandit.closure()[0].item()
-        report = TRPO(bandit.net.parameters(), max_kl=max_kl, accept_ratio=0.1).step(bandit.closure)
+        optimizer = TRPO(bandit.net.parameters(), max_kl=max_kl, accept_ratio=0.1, damping=1e-4)
+        report = optimizer.step(bandit.closure)
         loss, divergence = bandit.closure()
         assert report["accepted"] == 1
-        assert 0.1 * max_kl < divergence.item() <= max_kl
+        assert 0 < divergence.item() <= max_kl
         assert before - loss.item() >= 0.1 * report["expected"] > 0
         assert report["kl"] == pytest.approx(divergence.item())
 
