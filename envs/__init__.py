@@ -1,5 +1,6 @@
 """Maps, scenarios and the TorchRL env."""
 
+from maexp.envs.checker import check_map
 from maexp.envs.config import (
     CommConfig,
     ObservationConfig,
@@ -9,6 +10,7 @@ from maexp.envs.config import (
     RobotConfig,
 )
 from maexp.envs.environment import ExplorationEnv
+from maexp.envs.importing import import_map
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.scenarios import SCENARIOS, make_map, split
 
@@ -23,6 +25,8 @@ __all__ = [
     "RadarConfig",
     "RewardConfig",
     "RobotConfig",
+    "check_map",
+    "import_map",
     "make_map",
     "split",
 ]

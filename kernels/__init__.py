@@ -4,13 +4,12 @@ Warp compiles a kernel at its first launch and keeps the result in a cache, so o
 first run waits.
 """
 
-import warp as wp
+from maexp.kernels.startup import start_warp
 
-wp.config.log_level = wp.LOG_WARNING  # its banner would stand in every table and pipe
-wp.init()
+start_warp()
 
-from maexp.kernels.api import merge_maps, unpack_flags, visible_points  # noqa: E402
-from maexp.kernels.frontier import frontier_cells  # noqa: E402
-from maexp.kernels.geodesic import geodesic_distance  # noqa: E402
+from maexp.kernels.api import merge_maps, unpack_flags, visible_points
+from maexp.kernels.frontier import frontier_cells
+from maexp.kernels.geodesic import geodesic_distance
 
 __all__ = ["frontier_cells", "geodesic_distance", "merge_maps", "unpack_flags", "visible_points"]

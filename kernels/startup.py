@@ -1,0 +1,31 @@
+"""Start Warp quietly: on a machine without a GPU its native code warns on every start that there is none."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+import warp as wp
+
+
+def start_warp() -> None:
+    """Initialise Warp without its banner."""
+    wp.config.log_level = wp.LOG_WARNING
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    with _silent_stderr():
+        wp.init()
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Native code writes to the file descriptor, past sys.stderr. Python exceptions still come through."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
