@@ -4,9 +4,10 @@ import re
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException, OverrideParseException
 
 from maexp.agents.errors import UserError
+from maexp.agents.schema import schema
 
 PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "hydra.run.dir", "hydra.sweep.dir")
 LISTS = {"evaluate": ("num_robots", "policy"), "bench": ("num_robots",)}
@@ -39,10 +40,12 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         UserError: a bare word too many, or one that is no override even when quoted.
     """
     names = list(positional)
+    known = {*schema(verb).__dataclass_fields__, "hydra"}
     result = []
     for word in words:
         name, sign, value = word.partition("=")
-        if not sign or not re.fullmatch(r"[+~]*[\w./@:-]+", name) or (names and Path(word).exists()):
+        setting = sign and re.fullmatch(r"[+~]*[\w./@:-]+", name)
+        if not setting or (names and re.split(r"[./]", name.lstrip("+~"))[0] not in known):
             if not names:
                 raise UserError(f"{word!r} is no setting of maexp {verb}: write name=value (see maexp {verb} --help).")
             name, value = names.pop(0), word
@@ -56,12 +59,13 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         return f"{name}={value}" if sweep else f"{name}={quote(value)}"
     if name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
-    plain = f"{name}={value}"
-    try:
-        OverridesParser.create().parse_override(plain)
-    except OverrideParseException:
-        return f"{name}={quote(value)}"
-    return plain
+    for word in (f"{name}={value}", f"{name}={quote(value)}"):
+        try:
+            OverridesParser.create().parse_override(word)
+            return word
+        except (OverrideParseException, HydraException):
+            continue
+    raise UserError(f"{name}={value} cannot be read as a setting: write name=value (see maexp {verb} --help).")
 
 
 def quote(text: str) -> str:

@@ -1,0 +1,113 @@
+"""Settings: every choice composes, and what does not fit is refused in one sentence."""
+
+import pytest
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.build import load_maps, make_env, make_learner, model_settings, team_configs
+from maexp.agents.compose import compose_config, group_choices, groups
+from maexp.agents.errors import UserError
+from maexp.agents.model import PRESETS
+from maexp.agents.overrides import find_override, make_overrides, quote, without
+from maexp.agents.schema import SCHEMAS
+from maexp.envs.scenarios import SCENARIOS
+
+
+def refusal(verb: str, *words: str) -> str:
+    with pytest.raises(UserError) as caught:
+        compose_config(verb, make_overrides(verb, list(words)))
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("group", groups())
+def test_every_choice_composes_and_is_described(group):
+    for choice, text in group_choices(group).items():
+        assert text, f"conf/{group}/{choice}.yaml has no description on its first line"
+        assert compose_config("train", [f"{group}={choice}"])[group] is not None
+
+
+def test_choices_match_the_tables_of_the_code():
+    assert set(group_choices("scenario")) == set(SCENARIOS)
+    assert set(group_choices("algorithm")) == set(ALGORITHMS)
+    assert set(group_choices("model")) == set(PRESETS)
+
+
+def test_every_verb_composes():
+    for verb in SCHEMAS:
+        words = ["action=list"] if verb in ("maps", "bench") else []
+        assert compose_config(verb, words).hydra.run.dir.endswith(f"-{verb}")
+
+
+@pytest.mark.parametrize(
+    ("word", "wanted"),
+    [
+        ("num_robots=three", ("num_robots=three", "whole number")),
+        ("num_robots=", ("num_robots=", "whole number")),
+        ("radar.range=far", ("radar.range=far", "a number")),
+        ("scenario=labyrinth", ("scenario=labyrinth", "maze_small")),
+        ("num_robot=3", ("num_robot ", "num_robots")),
+        ("radar.rang=3", ("radar.rang ", "radar.range")),
+        ("num_robots=1,2", ("num_robots=1,2", "-m")),
+        ("maze", ("'maze'", "name=value")),
+    ],
+)
+def test_one_clear_sentence(word, wanted):
+    message = refusal("train", word)
+    assert all(part in message for part in wanted), message
+
+
+NAMES = ["a b.yaml", "a=b (1).yaml", "it's.npz", "a,b.ply", "${x}.pcd", "back\\slash.xyz", "1e3"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_file_name_survives(name, tmp_path):
+    word = f"scenario.path={tmp_path / name}"
+    cfg = compose_config("train", make_overrides("train", ["scenario=pointcloud", word]))
+    assert cfg.scenario.path == str(tmp_path / name)
+    cfg = compose_config("maps", make_overrides("maps", ["import", name], ("action", "file")))
+    assert (cfg.action, cfg.file) == ("import", name)
+
+
+def test_quote_round_trip_of_trailing_backslashes():
+    assert find_override([f"file={quote(chr(92) * 3)}"], "file") == chr(92) * 3
+
+
+def test_lists_of_values_only_where_they_mean_a_list():
+    cfg = compose_config("evaluate", make_overrides("evaluate", ["num_robots=1,2", "policy=random,nearest_frontier"]))
+    assert (list(cfg.num_robots), list(cfg.policy)) == ([1, 2], ["random", "nearest_frontier"])
+
+
+def test_without_drops_groups_and_their_values():
+    words = ["scenario=maze", "scenario.path='x'", "seed=1"]
+    assert without(words, "scenario") == ["seed=1"]
+
+
+def test_settings_reach_the_env_and_the_networks():
+    words = ["num_envs=2", "radar.range=7", "robot.max_speed=3", "planner=wavefront", "reward.collision=5"]
+    words += ["scenario.macro_steps=4", "scenario.maps=[3]", "model.channels=8", "algorithm.lr=0.5", "comm.range=9"]
+    cfg = compose_config("train", words)
+    maps = load_maps(cfg.scenario)
+    assert [one.name for one in maps.train] == ["maze_small_3"]
+    env = make_env(cfg, maps.train, 2)
+    assert (env.num_envs, env.num_robots, env.macro_steps) == (2, 2, 4)
+    assert {one.range for one in env.radar_configs} == {7.0}
+    assert {one.max_speed for one in env.robot_configs} == {3.0}
+    assert (env.planner_config.name, env.reward_config.collision, env.comm_config.range) == ("wavefront", 5.0, 9.0)
+    assert model_settings(cfg).channels == 8
+    assert make_learner(cfg, env).updater.settings.lr == 0.5
+
+
+def test_a_team_of_different_robots():
+    cfg = compose_config("train", ["robot.team=[{kind: differential, radar: {range: 3}},{max_speed: 1}]"])
+    robots, radars = team_configs(cfg, 3)
+    assert [one.kind for one in robots] == ["differential", "ackermann", "differential"]
+    assert [one.range for one in radars] == [3, None, 3]
+    with pytest.raises(UserError, match="robot.team has no setting wings"):
+        team_configs(compose_config("train", ["robot.team=[{wings: 2}]"]), 3)
+
+
+@pytest.mark.parametrize("word", ["scenario.maps=[]", "scenario.maps=[-1]", "scenario.held_out=x"])
+def test_bad_indices(word):
+    with pytest.raises(UserError, match="must be a list of whole numbers"):
+        load_maps(compose_config("train", [word]).scenario)

@@ -1,0 +1,61 @@
+"""The package that is installed holds every folder and setting that the source does."""
+
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = ("kernels", "envs", "agents", "conf")
+
+
+def folders_with_code() -> set[str]:
+    found = {path.parent for room in ROOMS for path in (ROOT / room).rglob("*.py")}
+    return {"maexp." + ".".join(path.relative_to(ROOT).parts) for path in found}
+
+
+def test_every_folder_is_listed():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    assert set(listed) == folders_with_code()
+
+
+def test_no_folder_shadows_the_package():
+    assert not (ROOT / "maexp").exists()
+
+
+def test_imports_go_one_way():
+    above = {"kernels": ("envs", "agents", "conf"), "envs": ("agents", "conf"), "agents": (), "conf": ROOMS}
+    for room, others in above.items():
+        for path in (ROOT / room).rglob("*.py"):
+            text = path.read_text()
+            for other in others:
+                assert f"import maexp.{other}" not in text and f"from maexp.{other}" not in text, path
+
+
+def test_constraints_name_exact_versions():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    assert lines and all("==" in line and "+" not in line for line in lines)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines}
+    wanted = {one.partition(">=")[0].partition("[")[0].lower() for one in project["dependencies"]} - {"open3d"}
+    assert wanted <= pinned
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_code_and_settings(tmp_path):
+    source = tmp_path / "source"  # a copy: building leaves folders behind, and picks up those of last time
+    for room in ROOMS:
+        shutil.copytree(ROOT / room, source / room)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    command = [sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path, source]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    names = set(zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist())
+    wanted = {f"maexp/{path.relative_to(ROOT)}" for room in ROOMS for path in (ROOT / room).rglob("*.py")}
+    wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
+    assert wanted <= names, wanted - names
