@@ -11,6 +11,7 @@ REWARD = ("agents", "reward")
 ADVANTAGE = ("agents", "advantage")
 TARGET = ("agents", "value_target")
 TEAM_TARGET = ("team", "value_target")
+TEAM_ADVANTAGE = ("team", "advantage")
 
 
 class TeamGAE(GAE):
@@ -20,15 +21,21 @@ class TeamGAE(GAE):
     form the probability ratio of the joint action without a word.
     """
 
+    def set_keys(self, **keys) -> None:
+        """The advantage's key is the robots'; the team's own is kept beside its value."""
+        if "advantage" in keys:
+            self.robot_advantage = keys["advantage"]
+            keys = keys | {"advantage": TEAM_ADVANTAGE}
+        super().set_keys(**keys)
+
     def _prepare_signals(self, reward, done, terminated, value):
         return reward.sum(-2), done, terminated
 
     def forward(self, tensordict: TensorDictBase, **kwargs) -> TensorDictBase:
         tensordict = super().forward(tensordict, **kwargs)
-        key = self.tensor_keys.advantage
         robots = tensordict.get(("next", self.tensor_keys.reward)).shape[-2]
-        advantage = tensordict.get(key).unsqueeze(-2)
-        return tensordict.set(key, advantage.expand(*advantage.shape[:-2], robots, 1))
+        advantage = tensordict.get(self.tensor_keys.advantage).unsqueeze(-2)
+        return tensordict.set(self.robot_advantage, advantage.expand(*advantage.shape[:-2], robots, 1))
 
 
 def estimator_for(loss, gamma: float, lmbda: float, critic) -> GAE:

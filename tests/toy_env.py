@@ -30,11 +30,11 @@ class ToyEnv(EnvBase):
             map=Bounded(0, 255, (*team, 4, pixels, pixels), dtype=torch.uint8),
             pose=Unbounded((*team, 4)),
             grid=Unbounded((*team, 4, side, side)),
-            comm=Binary(shape=(*team, num_robots), dtype=torch.bool),
-            shape=lead,
+            comm=Binary(num_robots, shape=(*team, num_robots), dtype=torch.bool),
+            shape=team,
         )
         self.observation_spec = Composite(
-            agents=Composite(observation=observation, shape=lead),
+            agents=Composite(observation=observation, shape=team),
             team=Composite(map=Bounded(0, 255, (*lead, 3, pixels, pixels), dtype=torch.uint8), shape=lead),
             shape=lead,
         )
@@ -43,9 +43,9 @@ class ToyEnv(EnvBase):
             "region": region, "offset": Bounded(-1, 1, (*team, 2))
         }  # fmt: skip
         self.action_spec = Composite(
-            agents=Composite(action=Composite(**action, shape=lead), shape=lead), shape=lead
+            agents=Composite(action=Composite(**action, shape=team), shape=team), shape=lead
         )
-        self.reward_spec = Composite(agents=Composite(reward=Unbounded((*team, 1)), shape=lead), shape=lead)
+        self.reward_spec = Composite(agents=Composite(reward=Unbounded((*team, 1)), shape=team), shape=lead)
         flag = Binary(shape=(*lead, 1), dtype=torch.bool)
         self.done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=lead
@@ -100,20 +100,14 @@ class ToyEnv(EnvBase):
         place = torch.stack(torch.meshgrid(line, line, indexing="ij"))
         offsets = (place - pose[..., :2, None, None]) / 2
         maps = torch.stack((picture, picture // 2, torch.zeros_like(picture), torch.zeros_like(picture)), dim=2)
-        return TensorDict(
-            {
-                "agents": {
-                    "observation": {
-                        "map": maps,
-                        "pose": pose,
-                        "grid": torch.cat((offsets, offsets), dim=2),
-                        "comm": torch.ones(*team, self.num_robots, dtype=torch.bool),
-                    }
-                },
-                "team": {"map": maps.amax(1)[:, :3]},
-            },
-            batch_size=self.batch_size,
-        )
+        observation = {
+            "map": maps,
+            "pose": pose,
+            "grid": torch.cat((offsets, offsets), dim=2),
+            "comm": torch.ones(*team, self.num_robots, dtype=torch.bool),
+        }
+        agents = TensorDict({"observation": TensorDict(observation, batch_size=team)}, batch_size=team)
+        return TensorDict({"agents": agents, "team": {"map": maps.amax(1)[:, :3]}}, batch_size=self.batch_size)
 
     def _set_seed(self, seed):
         self.generator.manual_seed(seed or 0)
