@@ -4,8 +4,6 @@ import importlib
 import os
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -48,10 +46,10 @@ VERBS = {
     ),
     "bench": Verb(
         "measures throughput, as a table and JSON",
-        ("maexp bench env", "maexp bench env scenario=maze num_robots=2,4 num_envs=256"),
+        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels num_envs=256"),
         "run_bench",
         ("action",),
-        ("env",),
+        ("env", "kernels"),
     ),
 }  # fmt: skip
 
@@ -94,24 +92,8 @@ def overview() -> str:
     return "\n".join([*lines, "maexp VERB --help lists the settings and choices of a verb."])
 
 
-@contextmanager
-def _without_native_chatter() -> Iterator[None]:
-    """Warp's native library says on every start without a GPU that there is none; errors come as exceptions."""
-    kept = os.dup(2)
-    try:
-        with open(os.devnull, "w") as nowhere:
-            sys.stderr.flush()
-            os.dup2(nowhere.fileno(), 2)
-            yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-
-
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
-    with _without_native_chatter():
-        import maexp.kernels  # noqa: F401
     from maexp.agents.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.run_folder import claim_folder, remove_if_empty
 

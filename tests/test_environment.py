@@ -1,0 +1,338 @@
+"""ExplorationEnv: the contract of design 2."""
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from maexp.envs import (
+    CommConfig,
+    ExplorationEnv,
+    MapError,
+    ObservationConfig,
+    PlannerConfig,
+    PointCloudMap,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    make_map,
+)
+from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
+
+
+@pytest.fixture(scope="module")
+def maps():
+    return [make_map("maze_small", 0), make_map("maze_small", 1), make_map("random_obstacles", 0)]
+
+
+def actions(envs: int, robots: int, steps: int, seed: int = 1) -> list[dict]:
+    """Actions of env e that do not depend on how many envs there are."""
+    result = []
+    for t in range(steps):
+        region, offset = [], []
+        for e in range(envs):
+            g = torch.Generator().manual_seed(seed * 1000003 + t * 1009 + e)
+            region.append(torch.randint(64, (robots,), generator=g))
+            offset.append(torch.rand(robots, 2, generator=g) * 2 - 1)
+        result.append({"region": torch.stack(region), "offset": torch.stack(offset)})
+    return result
+
+
+def play(env, plan, reset=True):
+    """Step through a plan with resets of finished envs; returns the list of stepped tensordicts."""
+    td = env.reset() if reset else reset
+    out = []
+    for action in plan:
+        td = td.clone()
+        for name, value in action.items():
+            td["agents", "action", name] = value
+        stepped, td = env.step_and_maybe_reset(td)
+        out.append(stepped.clone())
+    return out
+
+
+def equal(a, b) -> bool:
+    return all(torch.equal(x, b[k]) for k, x in a.items(include_nested=True, leaves_only=True))
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+def test_specs(maps, robots):
+    check_env_specs(ExplorationEnv(maps, num_envs=2, num_robots=robots))
+
+
+def test_specs_direct_planner(maps):
+    env = ExplorationEnv(maps[0], num_envs=2, planner=PlannerConfig(name="direct"))
+    check_env_specs(env)
+    assert env.rollout(2)["agents", "action", "control"].shape == (2, 2, 3, 2)
+
+
+def test_keys_shapes_and_types(maps):
+    td = ExplorationEnv(maps, num_envs=5, num_robots=2).rollout(3)
+    expected = {
+        ("agents", "observation", "map"): ((5, 3, 2, 4, 125, 125), torch.uint8),
+        ("team", "map"): ((5, 3, 3, 125, 125), torch.uint8),
+        ("agents", "observation", "pose"): ((5, 3, 2, 4), torch.float32),
+        ("agents", "observation", "grid"): ((5, 3, 2, 4, 8, 8), torch.float32),
+        ("agents", "observation", "comm"): ((5, 3, 2, 2), torch.bool),
+        ("agents", "action", "region"): ((5, 3, 2), torch.int64),
+        ("agents", "action", "offset"): ((5, 3, 2, 2), torch.float32),
+        ("next", "agents", "reward"): ((5, 3, 2, 1), torch.float32),
+        ("next", "done"): ((5, 3, 1), torch.bool),
+        ("next", "terminated"): ((5, 3, 1), torch.bool),
+        ("next", "truncated"): ((5, 3, 1), torch.bool),
+    }
+    expected |= {("next", "info", n): ((5, 3, 1), t) for n, t in INFO_ENV.items()}
+    expected |= {("next", "info", n): ((5, 3, 2), t) for n, t in INFO_ROBOT.items()}
+    for key, (shape, dtype) in expected.items():
+        assert tuple(td[key].shape) == shape and td[key].dtype == dtype, key
+
+
+def test_info_is_blank_after_reset(maps):
+    td = ExplorationEnv(maps, num_envs=3).reset()
+    for name in INFO_ENV | INFO_ROBOT:
+        want = -1 if name.startswith("coverage_step") else 0
+        assert (td["info", name] == want).all(), name
+
+
+def test_history_is_not_aliased(maps):
+    env = ExplorationEnv(maps[0], num_envs=2)
+    td = env.rollout(4)
+    for key in ("map", "pose", "grid"):
+        now, then = td["agents", "observation", key], td["next", "agents", "observation", key]
+        assert torch.equal(now[:, 1:], then[:, :-1]), key
+        assert not torch.equal(now[:, 0], now[:, 1]), key
+    assert not torch.equal(td["next", "agents", "reward"][:, 0], td["next", "agents", "reward"][:, 1])
+
+
+def test_same_bits_for_any_number_of_envs_and_threads(maps):
+    plan = actions(6, 3, 4)
+    many = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=2, macro_steps=3), plan)
+    few = play(ExplorationEnv(maps, num_envs=2, seed=3, num_threads=1, macro_steps=3),
+               [{k: v[:2] for k, v in a.items()} for a in plan])  # fmt: skip
+    again = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=1, macro_steps=3), plan)
+    other = play(ExplorationEnv(maps, num_envs=6, seed=4, num_threads=1, macro_steps=3), plan)
+    for a, b, c in zip(many, few, again, strict=True):
+        assert equal(b, a[:2]) and equal(c, a)
+    assert not equal(many[0], other[0])
+
+
+def test_episodes_of_an_env_differ_and_resets_are_partial(maps):
+    env = ExplorationEnv(maps[0], num_envs=3, seed=0)
+    first = env.reset()
+    before = env.state_dict()
+    mask = torch.tensor([[False], [True], [False]])
+    env.reset(first.clone().set("_reset", mask))
+    after = env.state_dict()
+    for name in before:
+        if name == "seed":
+            continue
+        assert torch.equal(before[name][[0, 2]], after[name][[0, 2]]), name
+    assert not torch.equal(before["pose"][1], after["pose"][1])
+
+
+def test_evaluation_episodes_depend_on_their_number_alone(maps):
+    small, large = ExplorationEnv(maps, num_envs=2, seed=5), ExplorationEnv(maps, num_envs=4, seed=5)
+    large.rollout(2)
+    large.set_episodes(torch.tensor([9, 4, 7, 2]))
+    small.set_episodes(torch.tensor([4, 2]))
+    a, b = large.reset(), small.reset()
+    assert equal(a[[1, 3]], b)
+    assert torch.equal(large.simulation.tensors["map_id"][[1, 3]], small.simulation.tensors["map_id"])
+
+
+def test_state_continues_bit_for_bit(maps):
+    plan = actions(3, 3, 6)
+    env = ExplorationEnv(maps, num_envs=3, macro_steps=4)
+    td = env.reset()
+    for a in plan[:2]:
+        td = step(env, td, a)
+    saved = {k: v.clone() for k, v in env.state_dict().items()}
+    rest = [td := step(env, td, a) for a in plan[2:4]]
+    other = ExplorationEnv(maps, num_envs=3, macro_steps=4, seed=77)
+    other.reset()
+    other.load_state_dict(saved)
+    td = rest[0].clone()
+    again = []
+    for a in plan[2:4]:
+        td = step(other, td, a)
+        again.append(td)
+    assert all(equal(x, y) for x, y in zip(rest, again, strict=True))
+    with pytest.raises(ValueError, match="num_envs"):
+        ExplorationEnv(maps, num_envs=2).load_state_dict(saved)
+
+
+def step(env, td, action):
+    td = td.clone()
+    for name, value in action.items():
+        td["agents", "action", name] = value
+    return step_mdp(env.step(td)).clone()
+
+
+def test_rewards_are_the_sum_of_their_terms_and_coverage_grows(maps):
+    out = play(ExplorationEnv(maps, num_envs=4, macro_steps=8), actions(4, 3, 8))
+    before = torch.zeros(4, 1)
+    for td in out:
+        info = td["next", "info"]
+        total = sum(info[f"reward_{term}"] for term in REWARD_TERMS)
+        torch.testing.assert_close(td["next", "agents", "reward"][..., 0], total)
+        assert (info["coverage"] >= before).all() and (info["coverage"] <= 1).all()
+        before = info["coverage"]
+        assert all(torch.isfinite(v.float()).all() for v in td.values(True, True))
+
+
+def test_truncation_apart_from_termination(maps):
+    env = ExplorationEnv(maps[0], num_envs=2, macro_steps=2)
+    td = env.rollout(2, break_when_any_done=False)
+    assert td["next", "truncated"][:, 1].all() and not td["next", "terminated"].any()
+    assert not td["next", "done"][:, 0].any()
+
+
+def test_success_terminates_once_and_the_rest_of_the_macro_step_is_frozen():
+    env = ExplorationEnv(open_room(15.0), num_envs=4, num_robots=2, radar=RadarConfig(range=7.0), local_steps=30,
+                         robot=RobotConfig(collision_threshold=0.2), macro_steps=40)  # fmt: skip
+    td = env.reset()
+    for _ in range(40):
+        td = env.rand_action(td)
+        td = env.step(td)["next"]
+        if td["terminated"].any():
+            break
+    done = td["terminated"][:, 0]
+    assert done.any(), "no team explored an open room in 40 macro steps"
+    i = int(done.int().argmax())
+    torch.testing.assert_close(td["info", "reward_success"][i], torch.full((2,), 100.0 * 60.0 / 7000.0))
+    assert td["info", "local_steps"][i] == td["info", "coverage_step_95"][i]
+    assert not td["truncated"][i]
+
+
+def open_room(side: float) -> PointCloudMap:
+    ticks = np.arange(0.0, side + 2.0)
+    x, y = (a.ravel() for a in np.meshgrid(ticks, ticks, indexing="ij"))
+    wall = (x == 0) | (y == 0) | (x == side + 1) | (y == side + 1)
+    points = np.stack([x, y, 0 * x], axis=1).astype(np.float32)
+    return PointCloudMap(points[~wall], points[wall], 1.0, name="room", scenario="maze_small")
+
+
+def test_collided_robots_stay_and_pay_once():
+    env = ExplorationEnv(open_room(20.0), num_envs=8, num_robots=2, planner=PlannerConfig(name="direct"),
+                         radar=RadarConfig(range=4.0), macro_steps=20)  # fmt: skip
+    td = env.reset()
+    td["agents", "action", "control"] = torch.tensor([1.0, 0.0]).expand(8, 2, 2).clone()
+    paid = torch.zeros(8, 2)
+    stopped = None
+    for _ in range(4):
+        out = env.step(td.clone())
+        paid += out["next", "info", "reward_collision"]
+        hit = out["next", "info", "collided"]
+        if stopped is not None:
+            was, poses = stopped
+            assert torch.equal(poses[was], env.simulation.tensors["pose"][was])
+        stopped = hit.clone(), env.simulation.tensors["pose"].clone()
+        td = step_mdp(out)
+        td["agents", "action", "control"] = torch.tensor([1.0, 0.0]).expand(8, 2, 2).clone()
+    assert hit.any()
+    torch.testing.assert_close(paid, hit.float() * -200.0 * 60.0 / 7000.0)
+
+
+def test_bad_actions(maps):
+    env = ExplorationEnv(maps[0], num_envs=3)
+    td = env.reset()
+    td["agents", "action", "region"] = torch.full((3, 3), 10**12)
+    td["agents", "action", "offset"] = torch.full((3, 3, 2), 7.0)
+    env.step(td.clone())
+    (_, _), upper = maps[0].extent
+    assert torch.allclose(env.simulation.tensors["goal"], torch.tensor(upper)), "out of bounds is clamped"
+    td["agents", "action", "offset"][1, 0, 1] = float("nan")
+    with pytest.raises(ValueError, match="env 1 is NaN"):
+        env.step(td)
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        (dict(num_robots=0), "num_robots=0"),
+        (dict(num_envs=2.5), "num_envs=2.5"),
+        (dict(collision="soft"), "collision='soft'"),
+        (dict(success_coverage=0.0), "success_coverage=0.0"),
+        (dict(radar=RadarConfig(range=-1.0)), "radar.range=-1.0"),
+        (dict(robot=RobotConfig(kind="tank")), "robot.kind='tank'"),
+        (dict(robot=[RobotConfig()] * 2), "num_robots=3"),
+        (dict(planner=PlannerConfig(name="teleport")), "planner.name='teleport'"),
+        (dict(reward=RewardConfig(success=float("nan"))), "reward.success=nan"),
+        (dict(observation=ObservationConfig(map="all")), "observation.map='all'"),
+        (dict(comm=CommConfig(range=-1.0)), "comm.range=-1.0"),
+        (dict(num_envs=10**7), "lower num_envs"),
+        (dict(maps=[]), "maps=\\[\\]"),
+    ],
+)
+def test_bad_settings_are_named(maps, settings, words):
+    with pytest.raises(ValueError, match=words):
+        ExplorationEnv(**{"maps": maps[0], **settings})
+
+
+def test_no_room_for_the_team():
+    with pytest.raises(MapError, match="num_robots=40"):
+        ExplorationEnv(open_room(9.0), num_robots=40)
+
+
+def test_limited_communication(maps):
+    env = ExplorationEnv(maps[0], num_envs=2, num_robots=3, comm=CommConfig(range=1.0),
+                         observation=ObservationConfig(map="known"))  # fmt: skip
+    full = ExplorationEnv(maps[0], num_envs=2, num_robots=3, observation=ObservationConfig(map="known"))
+    a, b = env.rollout(3), full.rollout(3)
+    eye = torch.eye(3, dtype=torch.bool)
+    assert torch.equal(a["agents", "observation", "comm"], eye.expand(2, 3, 3, 3))
+    assert b["agents", "observation", "comm"].all()
+    explored = b["agents", "observation", "map"][:, :, :, 0]
+    assert torch.equal(explored[:, :, 0], explored[:, :, 2])
+    assert torch.equal(explored[:, :, 0], b["team", "map"][:, :, 0])
+    alone = a["agents", "observation", "map"][:, :, :, 0]
+    assert not torch.equal(alone[:, :, 0], alone[:, :, 2])
+
+
+@pytest.mark.parametrize("robots", [1, 40])
+def test_team_sizes(robots):
+    env = ExplorationEnv(make_map("maze", 0), num_envs=2, num_robots=robots, local_steps=3)
+    td = env.rollout(2)
+    assert td["next", "agents", "reward"].shape == (2, 2, robots, 1)
+    viewers = td["team", "map"][:, -1, 2]
+    seen = (td["agents", "observation", "map"][:, -1, :, 0] > 0).sum(1)
+    assert torch.equal(viewers.long(), seen.long()), "every pixel of a maze shows at most one free point"
+
+
+def test_heterogeneous_team(maps):
+    kinds = ["ackermann", "differential", "omnidirectional"]
+    team = [RobotConfig(kind=k, max_speed=2.0 + i) for i, k in enumerate(kinds)]
+    radars = [RadarConfig(range=4.0), RadarConfig(range=8.0), RadarConfig(range=6.0, fov=1.5)]
+    env = ExplorationEnv(maps[0], num_envs=3, robot=team, radar=radars)
+    td = env.rollout(4)
+    assert (td["next", "info", "path_length"][:, -1] > 0).any(0).all()
+    shot = env.snapshot(0)
+    for i, radar in enumerate(radars):
+        far = np.linalg.norm(shot["map"].free[shot["visible"][i], :2] - shot["center"][i], axis=1)
+        assert far.max() <= radar.range + 1e-3
+
+
+def test_snapshot_agrees_with_the_observation(maps):
+    env = ExplorationEnv(maps, num_envs=2, num_robots=2, seed=1)
+    td = env.rollout(3)
+    for e in range(2):
+        shot = env.snapshot(e)
+        coverage = shot["seen_free"].any(0).mean()
+        assert coverage == pytest.approx(td["next", "info", "coverage"][e, -1, 0].item(), abs=1e-6)
+        assert shot["coverage"] == pytest.approx(coverage)
+        for i in range(2):  # what is visible now lies in range and has been seen
+            points = shot["map"].free[shot["visible"][i], :2]
+            assert (np.linalg.norm(points - shot["center"][i], axis=1) <= 10.0 + 1e-4).all()
+            assert (shot["seen_free"][i] | ~shot["visible"][i]).all()
+        assert shot["trail"].shape[1:] == (2, 2) and len(shot["trail"]) == shot["local_step"] + 1
+
+
+def test_step_hook_sees_every_local_step(maps):
+    env = ExplorationEnv(maps[0], num_envs=1, local_steps=10)
+    seen = []
+    env.set_step_hook(lambda e: seen.append(int(e.simulation.tensors["local_step"][0])), every=4)
+    env.rollout(2)
+    assert seen == [0, 4, 8, 10, 14, 18, 20]
+    env.set_step_hook(None)
+    env.rollout(1)
+    assert len(seen) == 7
