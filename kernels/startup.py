@@ -9,7 +9,13 @@ import warp as wp
 
 
 def start_warp() -> None:
-    """Initialise Warp without its banner."""
+    """Initialise Warp without its banner, and so that several threads may launch the same kernel on the CPU.
+
+    With tiles in stack memory (Warp 1.19's default) every CPU kernel keeps a pointer to its own stack frame in
+    a static variable of its module and writes through it, whether it uses tiles or not: two shards in two
+    threads then write into each other's stack (a crash in debug mode, in release only as the optimiser likes).
+    """
+    wp.config.enable_tiles_in_stack_memory = False
     wp.config.log_level = wp.LOG_WARNING
     if torch.cuda.is_available():
         wp.init()

@@ -219,3 +219,16 @@ def test_dwa_takes_the_first_of_equal_candidates():
     place(env, pose, pose[..., :2] + torch.tensor([0.3, 0.0]))
     env.simulation.step(0, 1)
     assert env.simulation.tensors["control"].tolist() == [[[0.0, -1.0]]]
+
+
+def test_shards_may_launch_one_kernel_from_several_threads():
+    """Warp's tiles in stack memory share a static pointer between threads; the debug pass crashes with them on."""
+    import warp as wp
+
+    assert wp.config.enable_tiles_in_stack_memory is False
+    env = team_env(room(13, 11, "jittered", 1), 6, 2, num_threads=3, local_steps=2)
+    generator = torch.Generator().manual_seed(4)
+    env.reset()
+    for _ in range(40):
+        env.step(act(env, generator))
+    assert torch.isfinite(env.simulation.tensors["pose"]).all()
