@@ -136,7 +136,7 @@ def test_adaptive_spacing_is_fine_at_walls_and_keeps_the_area(index):
     assert set(np.unique(world.free_spacing)) == {1.0, 2.0} and 0.05 < coarse.mean() < 0.9
     assert len(world.free) + 3 * coarse.sum() + len(world.obstacles) == 125 * 125
     gap = np.linalg.norm(world.free[coarse][:, None, :2] - world.boundary[None, :, :2], axis=2).min()
-    assert gap > 1.5
+    assert gap > 2.0
     assert world.free_area == 125 * 125 - len(world.obstacles)
     free = rasterise(world, world.resolution)
     assert free.sum() == world.free_area and ndimage.label(free)[1] == 1
@@ -147,6 +147,12 @@ def test_random_obstacles_reach_their_density():
     assert 0.15 < min(share) and max(share) < 0.32
     statistics = [measure_map(make_map("random_obstacles", index)) for index in range(2)]
     assert all(row.loops > 5 and row.pillars > 5 for row in statistics)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_random_obstacles_leave_no_passage_under_four_free_points(index):
+    free, _ = on_grid(make_map("random_obstacles", index))
+    assert (ndimage.binary_opening(free, np.ones((4, 4))) == free).all()
 
 
 def test_floor_plans_have_walls_furniture_and_doors():
