@@ -232,3 +232,30 @@ def test_shards_may_launch_one_kernel_from_several_threads():
     for _ in range(40):
         env.step(act(env, generator))
     assert torch.isfinite(env.simulation.tensors["pose"]).all()
+
+
+@pytest.mark.parametrize("mode", ["centre", "footprint"])
+def test_collisions_of_robots_close_together(mode):
+    """Many crowds of three at random, near each other and near a wall, against the oracle."""
+    world = room(21, 21, "jittered", 3)
+    env = team_env(world, 150, 3, collision=mode, planner=PlannerConfig(name="direct"))
+    generator = torch.Generator().manual_seed(6)
+    pose = torch.zeros(150, 3, 4)
+    pose[..., :2] = 16.0 + torch.rand(150, 3, 2, generator=generator) * 1.6
+    pose[75:, :, 0] += 4.6
+    pose[..., 3] = torch.rand(150, 3, generator=generator) * 6.2 - 3.1
+    place(env, pose, pose[..., :2].clone())
+    env.simulation.step(0, 1)
+    lengths, widths = ([getattr(r, side) for r in env.robot_configs] for side in ("length", "width"))
+    thresholds = [r.collision_threshold if mode == "centre" else 0.0 for r in env.robot_configs]
+    close, hits = 0, 0
+    for e in range(150):
+        now = moment(env, e)
+        kinds = [r.kind for r in env.robot_configs]
+        states = [motion.rear_state(p, n, k) for p, n, k in zip(now.pose, lengths, kinds, strict=True)]
+        near = world.boundary[np.linalg.norm(world.boundary[:, :2] - now.center[0], axis=1) < 5.0]
+        want, margin = motion.collided(states, lengths, widths, thresholds, near, mode=mode)
+        sure = margin > 1e-5
+        np.testing.assert_array_equal(now.crashed[sure] != 0, want[sure])
+        hits, close = hits + want.sum(), close + (margin < 0.1).sum()
+    assert 50 < hits < 400 and close > 50
