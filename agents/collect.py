@@ -51,12 +51,22 @@ def make_collector(env, policy, steps: int) -> TeamCollector:
 
 
 class Stopwatch:
-    """Seconds spent inside a module's forward passes, since the last look."""
+    """Context that counts the seconds inside a module's forward passes."""
 
     def __init__(self, module: torch.nn.Module):
+        self.module = module
         self.seconds = 0.0
-        module.register_forward_pre_hook(self._begin)
-        module.register_forward_hook(self._end)
+
+    def __enter__(self) -> "Stopwatch":
+        self._hooks = (
+            self.module.register_forward_pre_hook(self._begin),
+            self.module.register_forward_hook(self._end),
+        )
+        return self
+
+    def __exit__(self, *error) -> None:
+        for hook in self._hooks:
+            hook.remove()
 
     def _begin(self, module, args) -> None:
         self._begun = time.perf_counter()
@@ -65,11 +75,6 @@ class Stopwatch:
         if torch.cuda.is_initialized():
             torch.cuda.synchronize()
         self.seconds += time.perf_counter() - self._begun
-
-    def read(self) -> float:
-        """The seconds since the last call."""
-        seconds, self.seconds = self.seconds, 0.0
-        return seconds
 
 
 def batch_statistics(batch: TensorDictBase) -> dict[str, float]:

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.build import load_maps, make_env
+from maexp.agents.build import make_env
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.checks import check_counts
-from maexp.agents.errors import UserError, blame_input
-from maexp.agents.overrides import find_override, without
+from maexp.agents.errors import UserError
+from maexp.agents.overrides import find_override
 from maexp.agents.run_evaluate import evaluate_all, report
 from maexp.agents.run_folder import check_writable
 from maexp.agents.train import TrainingRun, train, write_config
@@ -48,17 +48,15 @@ def check(cfg: Any) -> None:
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
     saved = find_checkpoint(cfg.resume)[1] if cfg.resume else None
-    overrides = without(overrides, "resume")
-    with blame_input():
-        maps = load_maps(cfg.scenario)
+    training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(cfg, where)
-    print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(maps.train)} maps), {cfg.num_envs} teams of "
-          f"{cfg.num_robots} robots; everything goes to {_short(where)}")  # fmt: skip
-    done = train(cfg, where, overrides, saved, maps)
-    if done.stopped:
-        print(f"Stopped after {done.frames:,} macro steps. Go on with: maexp train resume={_short(where)}")
+    print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
+          f"{cfg.num_robots} robots; everything goes to {_short(where)}", flush=True)  # fmt: skip
+    train(training)
+    if training.stopped:
+        print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={_short(where)}")
         return STOPPED
-    finish(done)
+    finish(training)
     return 0
 
 

@@ -22,22 +22,20 @@ from maexp.agents.progress import Progress
 from maexp.agents.results import plain
 
 
-def train(
-    cfg: Any, folder: Path, overrides: list[str], saved: dict | None = None, suite: MapSuite | None = None
-) -> "TrainingRun":
-    """Train until `total_frames`, from the start or from a checkpoint's state; every file goes to `folder`.
+def train(run: "TrainingRun") -> None:
+    """Train until `total_frames`, from where `run` is; every file goes to its folder.
 
     On the CPU a run that is stopped and resumed gives bit for bit what an uninterrupted one gives.
     """
-    run = TrainingRun.build(cfg, folder, overrides, saved, suite)
-    log = MetricsLog(folder, cfg.logger, kept=run.iteration, config=plain(cfg))
-    policy_watch = Stopwatch(run.learner.policy)
+    cfg = run.cfg
+    log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, config=plain(cfg))
     with stop_on_signals() as stop, Progress("training", cfg.total_frames, run.frames) as progress:
-        if saved is None:
+        if run.iteration == 0:
             run.save()
         while run.iteration < run.iterations and not stop:
             begin = time.perf_counter()
-            batch = run.collector.next()
+            with Stopwatch(run.learner.policy) as acting:
+                batch = run.collector.next()
             collected = time.perf_counter() - begin
             row = batch_statistics(batch)
             with name_iteration(run):
@@ -45,13 +43,12 @@ def train(
             run.collector.update_policy_weights_()
             run.iteration += 1
             row |= run.evaluate_if_due()
-            log.write(run.timed(row, collected, policy_watch.read(), begin))
+            log.write(run.timed(row, collected, acting.seconds, begin))
             average = run.smooth(row["coverage"])
             run.keep(row, log, last=bool(stop) or run.iteration == run.iterations)
             progress.show(min(run.frames, cfg.total_frames), f"coverage {average:.3f}")
     log.close()
     run.stopped = bool(stop)
-    return run
 
 
 @dataclass
@@ -77,18 +74,22 @@ class TrainingRun:
     stopped: bool = False
 
     @classmethod
-    def build(cls, cfg: Any, folder: Path, overrides: list[str], saved: dict | None, suite: MapSuite | None):
-        """Everything a run needs, at its start or as `saved` left it."""
+    def build(cls, cfg: Any, folder: Path, overrides: list[str], saved: dict | None = None) -> "TrainingRun":
+        """Everything a run needs, at its start or as `saved` left it; nothing is written yet.
+
+        Raises:
+            UserError: a setting, map or checkpoint that cannot be used.
+        """
         seed_everything(cfg.seed)
         with blame_input():
-            suite = suite or load_maps(cfg.scenario)
+            suite = load_maps(cfg.scenario)
             env = make_env(cfg, suite.train, cfg.num_robots)
             check_batch_memory(env, cfg.collector.steps)
             learner = make_learner(cfg, env)
             collector = make_collector(env, learner.policy, cfg.collector.steps)
-        run = cls(cfg, folder, overrides, suite, learner, collector)
-        if saved is not None:
-            run.restore(saved)
+            run = cls(cfg, folder, overrides, suite, learner, collector)
+            if saved is not None:
+                run.restore(saved)
         return run
 
     @property
@@ -121,9 +122,8 @@ class TrainingRun:
 
     def restore(self, saved: dict) -> None:
         """Go on where `save` was called."""
-        with blame_input():
-            load_matching(self.learner.policy, saved["policy"])
-            self.collector.load_state_dict(saved["collector"])
+        load_matching(self.learner.policy, saved["policy"])
+        self.collector.load_state_dict(saved["collector"])
         self.learner.updater.load_state_dict(saved["updater"])
         self.iteration, self.best = saved["iteration"], saved["best"]
         self.average, self.seconds = saved["average"], saved["seconds"]

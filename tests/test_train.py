@@ -1,0 +1,206 @@
+"""Training: the files of a run; stopped, killed or in one go, a run comes to the same bits."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
+from maexp.agents.cli import main
+from maexp.agents.logs import read_metrics
+
+TINY = [
+    "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3", "scenario.local_steps=5",
+    "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
+]  # fmt: skip
+BATCH = 6
+CLOCKS = ("seconds", "frames_per_second", "time_simulate", "time_policy", "time_advantage", "time_update")
+
+
+@pytest.fixture(autouse=True)
+def somewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(autouse=True)
+def no_film(monkeypatch):
+    """Pictures have tests of their own."""
+    monkeypatch.setattr("maexp.agents.run_train.draw_rollout", lambda *args: None)
+    monkeypatch.setattr("maexp.agents.run_train.draw_curves", lambda *args: None)
+
+
+def run(folder: str, iterations: int, *words: str) -> Path:
+    assert main(["train", *TINY, f"hydra.run.dir={folder}", f"total_frames={iterations * BATCH}", *words]) == 0
+    return Path(folder)
+
+
+def resume(folder: Path, iterations: int, *words: str) -> Path:
+    assert main(["train", f"resume={folder}", f"total_frames={iterations * BATCH}", *words]) == 0
+    return folder
+
+
+def assert_same(first, second, place="checkpoint") -> None:
+    """The same bits everywhere, but for clocks and the words of the command line."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), place
+        for name in first:
+            if name not in ("seconds", "overrides"):
+                assert_same(first[name], second[name], f"{place}/{name}")
+    elif torch.is_tensor(first):
+        assert first.dtype == second.dtype and torch.equal(first.nan_to_num(), second.nan_to_num()), place
+    elif isinstance(first, list | tuple):
+        assert len(first) == len(second), place
+        for index, pair in enumerate(zip(first, second, strict=True)):
+            assert_same(*pair, f"{place}/{index}")
+    else:
+        assert first == second or first != first, place
+
+
+def assert_same_runs(first: Path, second: Path) -> None:
+    assert_same(find_checkpoint(first)[1], find_checkpoint(second)[1])
+    rows = [read_metrics(one / "metrics.csv") for one in (first, second)]
+    assert len(rows[0]) == len(rows[1])
+    for pair in zip(*rows, strict=True):
+        assert_same(*({name: value for name, value in row.items() if name not in CLOCKS} for row in pair), "metrics")
+
+
+def test_the_files_of_a_run(capsys):
+    folder = run("a run", 3, "episodes=4", "checkpoint_keep=2", "evaluate_every=2")
+    rows = read_metrics(folder / "metrics.csv")
+    assert [row["iteration"] for row in rows] == [1, 2, 3]
+    assert [row["frames"] for row in rows] == [BATCH, 2 * BATCH, 3 * BATCH]
+    assert all(row[name] > 0 for row in rows for name in CLOCKS)
+    assert all(sum(row[name] for name in CLOCKS[2:]) < row["seconds"] for row in rows)
+    assert sum(row["episodes"] for row in rows) == 3 * 2  # 6 macro steps of 3 teams, 3 to an episode
+    assert rows[1]["held_out_coverage"] > 0 and rows[0]["held_out_coverage"] != rows[0]["held_out_coverage"]
+    assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2"]
+    assert (folder / "checkpoints" / "best.pt").is_file()
+    assert "num_robots: 2" in (folder / "config.yaml").read_text()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(summary) == {"trained", "random", "run"}
+    assert summary["trained"]["exploration_ratio"]["n"] == summary["random"]["exploration_ratio"]["n"] == 4
+    assert summary["run"]["maps"] == ["maze_small_70"]
+    printed = capsys.readouterr().out
+    assert "trained" in printed and "Next: maexp evaluate" in printed
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "matrpo"])
+def test_resumed_is_uninterrupted(algorithm):
+    whole = run("whole", 6, f"algorithm={algorithm}")
+    parts = resume(run("parts", 3, f"algorithm={algorithm}"), 6)
+    assert_same_runs(whole, parts)
+
+
+def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
+    whole = run("whole", 6)
+    broken = run("broken", 5)
+    newest = list_checkpoints(broken / "checkpoints")[0]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    resume(broken, 6)
+    assert "warning" in capsys.readouterr().err
+    assert_same_runs(whole, broken)
+
+
+def test_evaluations_in_between_change_nothing():
+    assert_same(
+        find_checkpoint(run("with", 4, "evaluate_every=1"))[1]["updater"],
+        find_checkpoint(run("without", 4))[1]["updater"],
+    )
+
+
+def test_a_checkpoint_of_another_network_is_refused(capsys):
+    folder = run("run", 1)
+    capsys.readouterr()
+    assert main(["evaluate", f"checkpoint={folder}", "model.channels=4", "episodes=1", "hydra.run.dir=e"]) == 2
+    assert "another network" in capsys.readouterr().err
+    assert not Path("e").exists()
+    assert main(["train", f"resume={folder}", "num_robots=3"]) == 2
+    assert "num_robots" in capsys.readouterr().err
+
+
+def test_evaluate_goes_by_the_runs_own_settings():
+    folder = run("run", 1, "radar.range=6")
+    assert main(["evaluate", f"checkpoint={folder}", "episodes=2", "num_robots=1,3", "hydra.run.dir=e"]) == 0
+    config = Path("e/config.yaml").read_text()
+    assert "range: 6.0" in config and "macro_steps: 3" in config
+    assert set(json.loads(Path("e/results.json").read_text())) == {"trained N=1", "trained N=3", "run"}
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_is_named(monkeypatch, capsys):
+    from maexp.agents.updaters import GradientUpdater
+
+    learn, calls = GradientUpdater.update, []
+
+    def fail(self, *batches, **settings):
+        calls.append(1)
+        if len(calls) == 3:
+            raise ArithmeticError("loss_critic became nan.")
+        return learn(self, *batches, **settings)
+
+    monkeypatch.setattr(GradientUpdater, "update", fail)
+    assert main(["train", *TINY, "hydra.run.dir=run", f"total_frames={5 * BATCH}"]) == 2
+    message = capsys.readouterr().err
+    assert "iteration 3" in message and "loss_critic" in message
+    assert find_checkpoint("run")[1]["iteration"] == 2
+
+
+def test_too_much_memory_is_refused_before_the_run(capsys):
+    assert main(["train", *TINY, "collector.steps=100000000", "hydra.run.dir=run"]) == 2
+    assert "lower num_envs or collector.steps" in capsys.readouterr().err
+
+
+PROGRAM = """
+import sys, torch
+torch.set_num_threads(1)
+import maexp.agents.run_train as run_train
+run_train.draw_rollout = run_train.draw_curves = lambda *args: None
+from maexp.agents.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def start(*words: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-c", PROGRAM, "train", *words], stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_rows(folder: Path, count: int, process: subprocess.Popen) -> None:
+    path = folder / "metrics.csv"
+    while process.poll() is None and (not path.is_file() or len(path.read_text().splitlines()) <= count):
+        time.sleep(0.005)
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_with_a_checkpoint():
+    process = start(*TINY, "hydra.run.dir=run", "total_frames=600000", "checkpoint_every=100000")
+    wait_for_rows(Path("run"), 2, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    assert find_checkpoint("run")[1]["iteration"] >= 2
+    assert "Traceback" not in process.stderr.read()
+
+
+@pytest.mark.slow
+def test_killed_at_random_moments_and_resumed(tmp_path):
+    """kill -9 while the run trains, logs or saves; after each, resume; at the end the bits of one go."""
+    iterations, rng, kills = 30, random.Random(os.environ.get("MAEXP_KILL_SEED", 0)), 0
+    whole = run("whole", iterations, "checkpoint_every=1")
+    words = [*TINY, "hydra.run.dir=killed", f"total_frames={iterations * BATCH}", "checkpoint_every=1"]
+    folder = tmp_path / "killed"
+    for attempt in range(int(os.environ.get("MAEXP_KILLS", 4))):
+        process = start(*words) if attempt == 0 else start(f"resume={folder}")
+        done = find_checkpoint(folder)[1]["iteration"] if attempt else 0
+        wait_for_rows(folder, min(done + 2, iterations - 1), process)
+        time.sleep(rng.random() * 0.2)
+        kills += process.poll() is None
+        process.kill()
+        process.wait()
+    assert kills >= 2
+    resume(folder, iterations)
+    assert_same_runs(whole, folder)
