@@ -1,0 +1,373 @@
+"""Plots of runs and evaluations: learning curves, coverage over time, metrics, share of each robot.
+
+Okabe-Ito colours with a line style or marker each, so that they can be told apart in grey and by the colour-blind.
+Figures are drawn without pyplot: no display, no global state. The file's ending chooses the format (png, pdf, svg).
+"""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)), "-", "--")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+LOOK = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E0E0E0",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.6,
+}
+WIDE = 3.6  # inches of a panel
+
+# title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
+CURVES = (
+    ("Coverage at the end of an episode", "%", 100, [("coverage", "training"), ("held_out_coverage", "held out")]),
+    ("Reward of a robot", "per macro step", 1, [("reward", "total"), ("return", "return")]),
+    (
+        "Reward by term",
+        "per macro step",
+        1,
+        [(f"reward_{term}", term) for term in ("explore", "overlap", "time", "success", "collision")],
+    ),
+    ("Success rate", "%", 100, [("success_rate", "95 % coverage reached")]),
+    ("Collisions", "robots per episode", 1, [("collisions", "collided robots")]),
+    ("Path of a robot", "m per episode", 1, [("path_length", "path length")]),
+    ("Critic loss", "reward²", 1, [("loss_critic", "critic")]),
+    (
+        "Policy loss",
+        "",
+        1,
+        [("loss_objective", "objective"), ("loss_entropy", "entropy bonus"), ("loss_kl", "KL penalty")],
+    ),
+    ("Entropy of the policy", "nat", 1, [("entropy", "both heads")]),
+    ("Change of the policy per update", "nat", 1, [("kl", "KL divergence")]),
+    ("Explained variance of the critic", "share", 1, [("explained_variance", "explained")]),
+    ("Speed", "macro steps / s", 1, [("frames_per_second", "speed")]),
+)
+
+# metric, title, unit, scale factor
+METRICS = (
+    ("exploration_ratio", "Coverage at the end", "%", 100),
+    ("success_rate", "Success rate", "%", 100),
+    ("coverage_step_85", "Time to 85 % coverage", "local steps of 0.1 s", 1),
+    ("coverage_step_95", "Time to 95 % coverage", "local steps of 0.1 s", 1),
+    ("mutual_overlap_85", "Overlap at 85 % coverage", "%", 100),
+    ("mutual_overlap_95", "Overlap at 95 % coverage", "%", 100),
+    ("collisions", "Collisions", "robots per episode", 1),
+    ("path_length", "Path of a robot", "m per episode", 1),
+    ("reward_variance", "Spread of reward over robots", "reward, unscaled", 1),
+)
+
+
+# Learning curves
+
+
+def draw_curves(runs, path) -> Path:
+    """Learning curves of one run, of several seeds, or of several algorithms; returns the path.
+
+    Args:
+        runs: a ``metrics.csv``, a run's folder, or a list of rows (dicts); a list of files or folders are seeds
+            of one setting: mean and, shaded, standard deviation; a dict name -> any of these compares settings.
+        path: picture to write.
+
+    Columns that are missing, or never have a value, are left out. Single runs are shown as they are (faint)
+    and as a moving average.
+
+    Raises:
+        ValueError: no rows, or none of the known columns has a value (named).
+    """
+    groups = runs if isinstance(runs, dict) else {"": runs}
+    groups = {str(name): _read_seeds(seeds) for name, seeds in groups.items()}
+    tables = [table for seeds in groups.values() for table in seeds]
+    if not tables:
+        raise ValueError("runs is empty; give at least one metrics.csv")
+    shown = [
+        (title, unit, factor, [entry for entry in columns if any(_has_values(table, entry[0]) for table in tables)])
+        for title, unit, factor, columns in CURVES
+    ]
+    shown = [panel for panel in shown if panel[3]]
+    if not shown:
+        known = sorted({name for table in tables for name in table})
+        raise ValueError(f"{path}: none of the columns {', '.join(known) or '(none)'} is known or has values")
+    with rc_context(LOOK):
+        figure, axes = _panels(len(shown))
+        for ax, (title, unit, factor, columns) in zip(axes, shown, strict=True):
+            lines = [(name, seeds, column, label) for column, label in columns for name, seeds in groups.items()]
+            if len(groups) > 1:  # colours tell settings apart, so one column each
+                lines = [line for line in lines if line[2] == columns[0][0]]
+                title = f"{title}: {columns[0][1]}" if len(columns) > 1 else title
+            for k, (name, seeds, column, label) in enumerate(lines):
+                _draw_seeds(ax, seeds, column, factor, name or label, k)
+            _finish(ax, title, unit, legend=len(lines) > 1 and (len(groups) == 1 or ax is axes[0]))
+            ax.set_xlabel(_x_label(tables))
+            ax.xaxis.set_major_locator(MaxNLocator(5))
+            ax.xaxis.set_major_formatter(EngFormatter(sep=""))
+        return _save(figure, path)
+
+
+def _read_seeds(source) -> list[dict[str, np.ndarray]]:
+    """Tables, column -> float64 (rows,), of a file, a folder, a list of rows or a list of files and folders."""
+    if isinstance(source, str | Path):
+        return [_read_table(Path(source))]
+    source = list(source)
+    if source and isinstance(source[0], dict):
+        return [_columns(source)]
+    return [_read_table(Path(one)) for one in source]
+
+
+def _read_table(path: Path) -> dict[str, np.ndarray]:
+    path = path / "metrics.csv" if path.is_dir() else path
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist; give a run's metrics.csv or its folder")
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]  # a torn last line is left out
+    if not rows:
+        raise ValueError(f"{path} has no rows; the run has not finished an iteration yet")
+    return _columns(rows)
+
+
+def _columns(rows: list[dict]) -> dict[str, np.ndarray]:
+    names = {name: None for row in rows for name in row if name}
+    return {name: np.array([_number(row.get(name)) for row in rows]) for name in names}
+
+
+def _number(value) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def _has_values(table: dict, column: str) -> bool:
+    return column in table and bool(np.isfinite(table[column]).any())
+
+
+def _x_label(tables: list[dict]) -> str:
+    return "macro steps of teams" if all("frames" in table for table in tables) else "iteration"
+
+
+def _x_values(table: dict, length: int) -> np.ndarray:
+    for name in ("frames", "iteration"):
+        if name in table:
+            return table[name]
+    return np.arange(1, length + 1, dtype=float)
+
+
+def _draw_seeds(ax, seeds: list[dict], column: str, factor: float, label: str, k: int) -> None:
+    """One line: a run and its moving average, or the mean of several seeds and their standard deviation."""
+    curves = []
+    for table in seeds:
+        if _has_values(table, column):
+            y = factor * table[column]
+            good = np.isfinite(y)
+            curves.append((_x_values(table, len(y))[good], y[good]))
+    if not curves:
+        return
+    look = {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
+    if len(curves) == 1:
+        (x, y), sparse = curves[0], len(curves[0][0]) < 8
+        ax.plot(
+            x,
+            _smooth(y),
+            label=label,
+            **look,
+            **({"marker": MARKERS[k % len(MARKERS)], "markersize": 4} if sparse else {}),
+        )
+        if not sparse:
+            ax.plot(x, y, color=look["color"], alpha=0.25, linewidth=0.8)
+        return
+    start, stop = max(x[0] for x, _ in curves), min(x[-1] for x, _ in curves)
+    grid = np.linspace(start, stop, max(len(x) for x, _ in curves)) if stop > start else np.array([start])
+    values = np.stack([np.interp(grid, x, _smooth(y)) for x, y in curves])
+    mean, spread = values.mean(axis=0), values.std(axis=0)
+    ax.plot(grid, mean, label=f"{label} ({len(curves)} seeds)", **look)
+    ax.fill_between(grid, mean - spread, mean + spread, color=look["color"], alpha=0.2, linewidth=0)
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Moving average over a twentieth of the run, shorter at its ends."""
+    half = len(values) // 40
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    first = np.maximum(np.arange(len(values)) - half, 0)
+    last = np.minimum(np.arange(len(values)) + half + 1, len(values))
+    return (sums[last] - sums[first]) / (last - first)
+
+
+# Coverage over time
+
+
+def draw_coverage(curves: dict, path) -> Path:
+    """Mean coverage over time with the 95 % interval of the mean, one line a policy; returns the path.
+
+    Args:
+        curves: name -> (seconds (records,), coverage (episodes, records) in [0, 1]), as
+            ``CoverageRecorder.curves`` returns them.
+        path: picture to write.
+
+    Raises:
+        ValueError: no curves, or shapes that do not fit (named).
+    """
+    if not curves:
+        raise ValueError("curves is empty; give at least one policy")
+    with rc_context(LOOK):
+        figure = Figure(figsize=(5.2, 3.4), layout="constrained")
+        ax = figure.subplots()
+        for k, (name, (seconds, coverage)) in enumerate(curves.items()):
+            seconds, coverage = np.asarray(seconds, dtype=float), np.atleast_2d(np.asarray(coverage, dtype=float))
+            if coverage.shape[1:] != seconds.shape:
+                raise ValueError(
+                    f"curves[{name!r}]: coverage has shape {coverage.shape}, which must be (episodes, {len(seconds)})"
+                )
+            mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
+            colour, style = COLOURS[k % len(COLOURS)], STYLES[k % len(STYLES)]
+            ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
+            ax.fill_between(
+                seconds, np.clip(mean - error, 0, 100), np.clip(mean + error, 0, 100), color=colour, alpha=0.2,
+                linewidth=0,
+            )  # fmt: skip
+        for mark in (85, 95):
+            ax.axhline(mark, color="#808080", linewidth=0.8, linestyle=(0, (2, 2)))
+        ax.set_ylim(0, 101)
+        ax.set_xlim(left=0)
+        ax.set_xlabel("time [s]")
+        _finish(ax, "Coverage over time, mean and its 95 % interval", "%", legend=True)
+        return _save(figure, path)
+
+
+# Metrics
+
+
+def draw_summary(summary, path) -> Path:
+    """Metrics of each policy as bars with 95 % intervals; returns the path.
+
+    Args:
+        summary: a ``summary.json`` or ``results.json``, or its content ``{policy: {metric: {mean, ci95, n}}}``.
+        path: picture to write.
+
+    A coverage that not every episode reached says by how many it was: the mean is over those.
+
+    Raises:
+        ValueError: no policy with a known metric.
+    """
+    if isinstance(summary, str | Path):
+        summary = json.loads(Path(summary).read_text())
+    known = {metric for metric, *_ in METRICS}
+    policies = {name: one for name, one in summary.items() if isinstance(one, dict) and known & one.keys()}
+    shown = [row for row in METRICS if any(_mean(one, row[0]) is not None for one in policies.values())]
+    if not shown:
+        raise ValueError(
+            f"the summary has no metric that can be drawn; found {', '.join(map(str, summary)) or 'nothing'}"
+        )
+    with rc_context(LOOK):
+        figure, axes = _panels(len(shown), height=2.1 + 0.1 * len(policies))
+        for ax, (metric, title, unit, factor) in zip(axes, shown, strict=True):
+            _draw_bars(ax, policies, metric, factor)
+            ax.set_title(title, loc="left")
+            ax.set_xlabel(unit)
+        return _save(figure, path)
+
+
+def _mean(metrics: dict, name: str) -> float | None:
+    value = metrics.get(name, {}).get("mean")
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def _draw_bars(ax, policies: dict, metric: str, factor: float) -> None:
+    """A horizontal bar a policy, the first on top, with its value; and of how many episodes where some are missing."""
+    total = max((one.get("exploration_ratio", {}).get("n") or 0) for one in policies.values())
+    partial = False
+    for row, metrics in enumerate(policies.values()):
+        mean, value = _mean(metrics, metric), metrics.get(metric, {})
+        count = value.get("n", 0)
+        if mean is None:
+            ax.text(0, row, f" never reached (0 of {total})" if total else " no value", va="center", fontsize=8)
+            continue
+        low, high = (factor * (mean if end is None else end) for end in value.get("ci95", (mean, mean)))
+        ax.barh(row, factor * mean, height=0.62, color=COLOURS[row % len(COLOURS)], alpha=0.85)
+        ax.errorbar(
+            factor * mean, row, xerr=[[max(factor * mean - low, 0)], [max(high - factor * mean, 0)]], color="black",
+            capsize=3, linewidth=1.2,
+        )  # fmt: skip
+        partial |= 0 < count < total
+        label = f"{factor * mean:.3g}" + (f" ({count} of {total})" if 0 < count < total else "")
+        ax.annotate(label, (max(high, factor * mean), row), (5, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_yticks(range(len(policies)), list(policies))
+    ax.set_ylim(len(policies) - 0.4, -0.6)
+    ax.set_xlim(0, ax.dataLim.xmax * (1.75 if partial else 1.3) or 1.0)
+    ax.grid(False, axis="y")
+
+
+def draw_contributions(contributions: dict, path) -> Path:
+    """Share of each robot in what its team discovered, mean and 95 % interval of the mean; returns the path.
+
+    Args:
+        contributions: policy -> (episodes, robots), as ``CoverageRecorder.contributions`` returns them. Robots
+            are ranked within each episode (the busiest first), since their numbers mean nothing.
+        path: picture to write.
+
+    Raises:
+        ValueError: no policies.
+    """
+    if not contributions:
+        raise ValueError("contributions is empty; give at least one policy")
+    with rc_context(LOOK):
+        figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+        ax = figure.subplots()
+        width = 0.8 / len(contributions)
+        largest = 0
+        for k, (name, shares) in enumerate(contributions.items()):
+            shares = 100 * -np.sort(-np.asarray(shares, dtype=float), axis=1)
+            mean, error = shares.mean(axis=0), 1.96 * shares.std(axis=0) / np.sqrt(len(shares))
+            place = np.arange(1, len(mean) + 1) - 0.4 + width * (k + 0.5)
+            ax.bar(place, mean, 0.92 * width, label=name, color=COLOURS[k % len(COLOURS)], alpha=0.85)
+            ax.errorbar(place, mean, yerr=error, color="black", linestyle="none", capsize=2, linewidth=1)
+            largest = max(largest, len(mean))
+        ax.axhline(100 / largest, color="#606060", linewidth=1, linestyle=(0, (4, 2)), label="equal shares")
+        ax.set_xticks(range(1, largest + 1))
+        ax.grid(False, axis="x")
+        ax.set_xlabel("robot, by its share within the episode")
+        _finish(ax, "Share of each robot in the exploration", "% of what the team discovered", legend=True)
+        return _save(figure, path)
+
+
+# Figures
+
+
+def _panels(count: int, height: float = 2.5) -> tuple[Figure, list]:
+    """A figure with ``count`` panels in rows of up to three."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(WIDE * columns, height * rows), layout="constrained")
+    axes = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    return figure, axes[:count]
+
+
+def _finish(ax, title: str, unit: str, legend: bool) -> None:
+    ax.set_title(title, loc="left")
+    ax.set_ylabel(unit)
+    entries = len(ax.get_legend_handles_labels()[0]) if legend else 0
+    if entries > 3:  # room above the lines
+        low, high = ax.get_ylim()
+        ax.set_ylim(low, high + 0.12 * -(-entries // 2) * (high - low))
+        ax.legend(loc="upper left", ncols=2)
+    elif entries:
+        ax.legend()
+
+
+def _save(figure: Figure, path) -> Path:
+    path = Path(path)
+    figure.savefig(path, dpi=150)
+    return path
