@@ -66,7 +66,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         maps = load_maps(cfg.scenario, train=False).held_out
         envs = [make_env(cfg, maps, size, min(cfg.num_envs, cfg.episodes)) for size in team_sizes(cfg.num_robots)]
         policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0])}
-    write_config(cfg, where)
+    write_config(cfg, where, "evaluate", overrides)
     results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
     report(cfg, results, maps, where / "results.json")
     draw_ends(cfg, maps, next(iter(policies.values())), where / "picture.png")

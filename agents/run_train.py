@@ -49,7 +49,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
     saved = find_checkpoint(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
-    write_config(cfg, where)
+    write_config(cfg, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
           f"{cfg.num_robots} robots; everything goes to {_short(where)}", flush=True)  # fmt: skip
     train(training)

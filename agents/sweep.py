@@ -34,8 +34,23 @@ def run_sweep(verb: str, overrides: list[str]) -> int:
             job()
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(explain(error, verb)) from error
-    print(f"All runs are in {folder}")
+    combine_curves(folder)
+    print(f"All runs are in {folder}, their curves together in curves.png")
     return 0
+
+
+def combine_curves(folder: Path) -> None:
+    """curves.png of all runs below `folder`: one line per setting, the seeds averaged."""
+    from maexp.agents.plots import draw_curves
+
+    settings: dict[str, list[Path]] = {}
+    for config in sorted(folder.glob("*/config.yaml")):
+        words = config.read_text().splitlines()[0].split()[3:]
+        swept = " ".join(word for word in words if not word.startswith("seed="))
+        settings.setdefault(swept or "all", []).append(config.parent)
+    common = set.intersection(*(set(name.split()) for name in settings)) if len(settings) > 1 else set()
+    named = {" ".join(w for w in name.split() if w not in common): runs for name, runs in settings.items()}
+    draw_curves(named, folder / "curves.png")
 
 
 def _raise_errors():

@@ -216,6 +216,7 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def write_config(cfg: Any, folder: Path) -> None:
-    """config.yaml: the composed settings."""
-    OmegaConf.save(cfg, folder / "config.yaml")
+def write_config(cfg: Any, folder: Path, verb: str, overrides: list[str]) -> None:
+    """config.yaml: the command as a comment, then all settings that it came to."""
+    command = f"# maexp {verb} {' '.join(overrides)}".rstrip()
+    (folder / "config.yaml").write_text(f"{command}\n{OmegaConf.to_yaml(cfg)}")
