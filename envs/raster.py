@@ -56,7 +56,7 @@ _cache: OrderedDict[tuple[int, int], tuple[weakref.ref, MapRaster]] = OrderedDic
 
 
 def map_raster(map, size: int) -> MapRaster:
-    """Raster of a :class:`PointCloudMap` within ``size`` x ``size`` pixels; kept for the last few maps."""
+    """Raster of a :class:`PointCloudMap`, ``size`` pixels wide and at most as high; kept for the last few maps."""
     key = (id(map), size)
     if key in _cache and _cache[key][0]() is map:  # an id is reused once its map is gone
         _cache.move_to_end(key)
@@ -73,8 +73,8 @@ def _build(map, size: int) -> MapRaster:
     border = MARGIN * max(xmax - xmin, ymax - ymin) + REACH * float(np.max(map.free_spacing))
     span = np.array([xmax - xmin, ymax - ymin]) + 2.0 * border
     scale = size / span.max()
-    width, height = np.maximum(np.ceil(span * scale - 1e-6).astype(int), 8)
-    corner = (float(xmin - border), float(ymax + border))
+    width, height = size, max(int(np.ceil(span[1] * scale - 1e-6)), 8)
+    corner = (float(0.5 * (xmin + xmax) - 0.5 * size / scale), float(ymax + border))
 
     hidden = _without(map.obstacles, map.boundary)
     spacing_hidden = np.asarray(map.obstacle_spacing)[hidden]

@@ -80,7 +80,7 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
     height = raster.height + strip.height
     frame = Image.new("RGB", (size + size % 2, height + height % 2), STRIP)  # even sides, for video codecs
     frame.paste(NOTHING, (0, 0, frame.width, raster.height))
-    frame.paste(picture, ((size - raster.width) // 2, 0))
+    frame.paste(picture, (0, 0))
     frame.paste(strip, (0, raster.height))
     return np.array(frame)
 

@@ -75,8 +75,8 @@ def test_columns_without_values_are_left_out_and_gaps_bridged(tmp_path, figures)
 
 
 def test_a_torn_last_line_is_left_out(tmp_path, figures):
-    path = write_csv(tmp_path, {"frames": [1, 2, 3], "coverage": [0.1, 0.2, 0.3]})
-    path.write_text(path.read_text() + "4")
+    path = write_csv(tmp_path, {"frames": [1, 2, 3], "coverage": [0.1, 0.2, 0.3], "entropy": [5, 5, 5]})
+    path.write_text(path.read_text() + "4,0.9")
     draw_curves(path, tmp_path / "curves.png")
     np.testing.assert_allclose(figures[0].axes[0].lines[0].get_xdata(), [1, 2, 3])
 

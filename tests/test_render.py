@@ -65,7 +65,7 @@ def team(place: PointCloudMap, num_robots=2, **changes) -> dict:
 def colour_at(frame, place, position, size=SIZE) -> tuple:
     raster = map_raster(place, size)
     column, row = np.floor(raster.to_pixels(position)).astype(int)
-    return tuple(frame[row, column + (size - raster.width) // 2].tolist())
+    return tuple(frame[row, column].tolist())
 
 
 def index_of(points, position) -> int:
