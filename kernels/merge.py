@@ -132,8 +132,10 @@ def _hear_robots(
     for other in range(center.shape[1]):
         heard = wp.length(center[e, i] - center[e, other]) <= comm_range
         if heard and line_of_sight != 0 and other != i:
-            for j in range(maps.occluder_begin[m], maps.occluder_begin[m + 1]):
-                if segment_distance(maps.occluder[j], center[e, i], center[e, other]) < maps.occluder_radius[j]:
+            # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
+            width = 0.70710678 * maps.resolution[m]
+            for j in range(maps.boundary_begin[m], maps.boundary_begin[m + 1]):
+                if segment_distance(maps.boundary[j], center[e, i], center[e, other]) < width:
                     heard = False
                     break
         if other == i:

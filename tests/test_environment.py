@@ -289,6 +289,16 @@ def test_limited_communication(maps):
     assert not torch.equal(alone[:, :, 0], alone[:, :, 2])
 
 
+@pytest.mark.parametrize("radius", [0.0, "auto"])
+def test_walls_block_what_must_be_in_sight(radius):
+    env = ExplorationEnv(make_map("maze", 0), num_envs=16, num_robots=3, comm=CommConfig(line_of_sight=True),
+                         radar=RadarConfig(obstacle_radius=radius), local_steps=1)  # fmt: skip
+    comm = env.reset()["agents", "observation", "comm"]
+    assert comm.diagonal(dim1=1, dim2=2).all() and torch.equal(comm, comm.transpose(1, 2))
+    apart = comm.sum() - 16 * 3
+    assert apart < 16, "robots at random places of a maze hardly ever see each other"
+
+
 @pytest.mark.parametrize("robots", [1, 40])
 def test_team_sizes(robots):
     env = ExplorationEnv(make_map("maze", 0), num_envs=2, num_robots=robots, local_steps=3)
