@@ -55,8 +55,11 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
 
 def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
     if name in PATHS and value not in ("", "null") and not _is_quoted(value):
-        sweep = multirun and "," in value and not Path(value).exists()
-        return f"{name}={value}" if sweep else f"{name}={quote(value)}"
+        if multirun and "," in value and not Path(value).exists():
+            return f"{name}={value}"
+        if name == "scenario.path":  # kept with the run, which may be resumed from another folder
+            value = str(Path(value).expanduser().absolute())
+        return f"{name}={quote(value)}"
     if name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
     for word in (f"{name}={value}", f"{name}={quote(value)}"):
