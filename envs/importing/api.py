@@ -11,10 +11,12 @@ from maexp.envs.map import MapError, PointCloudMap, check_file
 from maexp.envs.scenarios import find_scenario
 
 from .arrays import read_npy_triple, read_npz_map
-from .finish import finish_grid
+from .clouds import CLOUDS, read_cloud
+from .finish import crop_grid, finish_map
 from .occupancy import read_occupancy
 from .options import ImportOptions, make_options
 from .report import ImportReport
+from .sources import GridSource
 
 GRIDS = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".tif", ".tiff")
 
@@ -52,17 +54,18 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
     suffix = path.suffix.lower()
     name = options.name or path.stem
     if suffix in GRIDS:
-        grid = read_occupancy(path, options, report)
-        return finish_grid(grid, _scenario(options, "pointcloud"), name, options, report)
+        grid = crop_grid(read_occupancy(path, options, report), options, report)
+        scenario = find_scenario("pointcloud" if options.scenario == "auto" else options.scenario)
+        return finish_map(GridSource(grid), scenario, name, options, report)
+    if suffix in CLOUDS:
+        source, scenario = read_cloud(path, options, report)
+        return finish_map(source, scenario, name, options, report)
     if suffix == ".npz":
         return read_npz_map(path, options, report)
     if suffix == ".npy":
         return read_npy_triple(path, options, report)
-    raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported")
-
-
-def _scenario(options: ImportOptions, automatic: str):
-    return find_scenario(automatic if options.scenario == "auto" else options.scenario)
+    known = ", ".join((*GRIDS, *CLOUDS, ".npz", ".npy"))
+    raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported; {known} can")
 
 
 def _check(world: PointCloudMap, options: ImportOptions, report: ImportReport) -> PointCloudMap:

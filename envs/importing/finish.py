@@ -10,37 +10,41 @@ from scipy.spatial import cKDTree
 from maexp.envs.checker import START_CLEARANCE
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.reach import count_room
-from maexp.envs.scenarios import Scenario
+from maexp.envs.scenarios import Scenario, find_scenario
 
-from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, resample, seal, thin_walls
+from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, seal, thin_walls
 from .options import ImportOptions
 from .report import ImportReport
+from .sources import Source
 
 STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of the scenario's
 KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
 
 
-def finish_grid(grid: Grid, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport):
-    """The map of a grid; raises MapError where no resolution leaves room for the team."""
-    grid = crop_grid(grid, options, report)
+def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport):
+    """The map of a source of grids; raises MapError where no resolution leaves room for the team."""
     if options.resolution is not None:
-        if options.resolution < grid.cell * (1 - 1e-6):
+        cleaned = _Cleaned(_grid_at(source, options.resolution, report), scenario, options)
+        if cleaned.start.cell > options.resolution * (1 + 1e-6):
             report.warn(
-                f"resolution {options.resolution:g} m is finer than the file's {grid.cell:g} m: kept the file's"
+                f"resolution {options.resolution:g} m is finer than the file's: kept its {cleaned.start.cell:g} m"
             )
-        cleaned = _Cleaned(resample(grid, options.resolution), scenario, options)
+        elif options.resolution < source.finest * (1 - 1e-6):
+            report.warn(f"resolution {options.resolution:g} m is finer than the points allow, {source.finest:g} m")
         _require_room(cleaned, options, scenario)
         reason = "as set"
     else:
-        cleaned, reason = _choose_resolution(grid, scenario, options)
-    report.add(
-        "resolution",
-        f"{cleaned.start.cell:g} m a cell, {reason}",
-        before=grid.labels.size,
-        after=cleaned.start.labels.size,
-    )
+        cleaned, reason = _choose_resolution(source, scenario, options, report)
+    report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
     cleaned.tell(report)
     return _to_map(cleaned.grid, scenario, name, options, report)
+
+
+def _grid_at(source: Source, cell: float, report: ImportReport) -> Grid:
+    grid = source.at(cell)
+    if not grid.count(FREE):
+        raise MapError(f"{report.path}: no cell of {cell:g} m is free; check units, up, floor and crop")
+    return grid
 
 
 def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
@@ -96,14 +100,17 @@ class _Cleaned:
         report.add("seal", f"{self.sealed:,} unknown cells that touch free space became walls", left, left)
 
 
-def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -> tuple[_Cleaned, str]:
+def _choose_resolution(
+    source: Source, scenario: Scenario, options: ImportOptions, report: ImportReport
+) -> tuple[_Cleaned, str]:
     """The coarsest cells that keep the free area and give the team room.
 
     Coarse cells swallow doors and narrow rooms: the finest candidate, at most a third of the scenario's
     resolution, tells how much area there is to keep.
     """
     base = scenario.resolution
-    sizes = sorted({max(base * step, grid.cell) for step in STEPS_DOWN}, reverse=True)
+    sizes = sorted({max(base * step, source.finest) for step in STEPS_DOWN}, reverse=True)
+    grid = _grid_at(source, sizes[-1], report)
     area = grid.count(FREE) * grid.cell**2
     coarsest = math.ceil(math.sqrt(area / options.max_points) / 0.05) * 0.05
     if coarsest > sizes[0]:
@@ -112,7 +119,7 @@ def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -
 
     def clean(size: float) -> _Cleaned:
         if size not in tried:
-            tried[size] = _Cleaned(resample(grid, size), scenario, options)
+            tried[size] = _Cleaned(_grid_at(source, size, report), scenario, options)
         return tried[size]
 
     finest = next((size for size in sizes if size <= sizes[0] / 3), sizes[-1])
@@ -131,11 +138,14 @@ def _choose_resolution(grid: Grid, scenario: Scenario, options: ImportOptions) -
 def _require_room(cleaned: _Cleaned, options: ImportOptions, scenario: Scenario) -> None:
     if cleaned.room >= options.num_robots:
         return
+    small = find_scenario("indoor_small")
+    hint = "use a finer resolution, fewer robots, or check units, up and floor"
+    if scenario.body_length > small.body_length:
+        hint += f", or take the {small.body_length:g} x {small.body_width:g} m robot of scenario=indoor_small"
     raise MapError(
         f"found {cleaned.area:,.1f} m2 of free space that a {scenario.body_length:g} x {scenario.body_width:g} m robot "
         f"can use at {cleaned.start.cell:g} m, with room for {cleaned.room} of num_robots={options.num_robots} "
-        f"(starts {START_CLEARANCE * scenario.collision_threshold:g} m from walls and each other); use a finer "
-        "resolution, fewer robots, a smaller robot (scenario), or check units, up and floor"
+        f"(starts {START_CLEARANCE * scenario.collision_threshold:g} m from walls and each other); {hint}"
     )
 
 
