@@ -44,7 +44,9 @@ def bench_env(cfg: Any, where: Path) -> None:
             rows[-1]["seconds_per_step_one_env"] = measure_latency(cfg, maps, size)
             progress.show(2 * k + 2, f"{size} robots")
     _write(where / "bench_env.json", cfg, rows)
-    table = Table(title=f"scenario={cfg.scenario.name}, {cfg.num_envs} envs, {rows[0]['threads']} CPU threads")
+    console = Console()
+    console.print(f"throughput: scenario={cfg.scenario.name}, {cfg.num_envs} envs, {rows[0]['threads']} CPU threads")
+    table = Table()
     for name in ("N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"):
         table.add_column(name, justify="right")
     for row in rows:
@@ -56,15 +58,15 @@ def bench_env(cfg: Any, where: Path) -> None:
             f"{row['memory_per_env'] / 1e6:.2f}",
             f"{row['first_step_seconds']:.1f}",
         )
-    console = Console()
     console.print(table)
+    console.print("seconds per local step of one env, beside the paper's table")
     console.print(latency_table(rows))
     console.print(f"written to {where / 'bench_env.json'}")
 
 
 def latency_table(rows: list[dict]) -> Table:
     """The paper's table II: seconds per local step of one env."""
-    table = Table(title="seconds per local step, one env")
+    table = Table()
     table.add_column("platform")
     for row in rows:
         table.add_column(f"N = {row['num_robots']}", justify="right")
@@ -146,7 +148,8 @@ def bench_kernels(cfg: Any, where: Path) -> None:
     columns = {size: kernel_times(cfg, maps, size) for size in sizes}
     rows = [{"num_robots": size, "microseconds_per_robot": times} for size, times in columns.items()]
     _write(where / "bench_kernels.json", cfg, rows)
-    table = Table(title=f"us per robot and launch, scenario={cfg.scenario.name}, {cfg.num_envs} envs, one thread")
+    Console().print(f"us per robot and launch: scenario={cfg.scenario.name}, {cfg.num_envs} envs, one thread")
+    table = Table()
     table.add_column("kernel")
     for size in sizes:
         table.add_column(f"N = {size}", justify="right")

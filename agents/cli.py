@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from maexp.agents.errors import UserError
+from maexp.agents.memory import keep_freed_memory
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -58,6 +59,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
     warnings.showwarning = _show_warning
+    keep_freed_memory()
     try:
         return _run(words)
     except UserError as error:
