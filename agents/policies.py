@@ -167,11 +167,12 @@ class FrontierPlanner:
         """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
         nav = self.nav
         nav.update()
-        travel = self._give_up(nav.travel())
         cells = nav.target.expand(-1, self.env.num_robots, -1)
+        points = nav.points(cells.clamp_min(0))
+        travel = self._give_up(nav.travel(), points)
         scene = Scene(
             travel=travel,
-            points=nav.points(cells.clamp_min(0)),
+            points=points,
             size=nav.size.expand(-1, self.env.num_robots, -1).float(),
             alive=nav.alive(),
             nav=nav,
@@ -186,12 +187,12 @@ class FrontierPlanner:
             goal = nav.waypoints(goal_cell, elsewhere, self.reach)
         return nav.to_action(goal)
 
-    def _give_up(self, travel: torch.Tensor) -> torch.Tensor:
+    def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Drop targets that robots stood beside in vain: what is unknown there cannot be seen from there."""
         nav = self.nav
         near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
         self.dwell[nav.state["macro_step"] == 0] = 0
-        beside = travel <= near
+        beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near)
         self.dwell += beside.any(1, keepdim=True) if nav.rows == 1 else beside
         kept = travel.masked_fill(self.dwell >= DWELL, torch.inf)
         # Nothing else left: try them all once more.

@@ -20,7 +20,7 @@ from maexp.kernels.geodesic import STRAIGHT, UNREACHED
 from maexp.kernels.known_grid import KnownGrids, PassableGrids
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
-from maexp.kernels.wavefront import MARGIN_CELLS, PathSearch
+from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
 
 BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 
@@ -60,13 +60,10 @@ class Navigation:
             sim.maps, self.grids, self.arrays["map_id"], self.arrays[f"{prefix}_free"],
             self.arrays[f"{prefix}_boundary"], self.rows, cells,
         )  # fmt: skip
-        threshold = np.array([[r.collision_threshold for r in env.robot_configs]], np.float32)
-        masks, mask_of_robot = np.unique(threshold, axis=1, return_inverse=True)
-        if limited:
-            masks, mask_of_robot = threshold, np.arange(self.num_robots)
-        radius = np.repeat(masks, self.num_envs, axis=0)
-        self.passable = PassableGrids(self.known_grids, radius, MARGIN_CELLS, through_unknown=False)
-        self.paths = PathSearch(self.passable, mask_of_robot.reshape(-1))
+        threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("threshold", "clearance"))
+        radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
+        self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
+        self.paths = PathSearch(self.passable, mask_of_robot)
         self._size_blocks(env, float(threshold.max()))
         self._make_views(cells)
         self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
@@ -181,8 +178,8 @@ class Navigation:
         cell = torch.empty_like(wanted)
         self.launch(
             targets._first_cells, tuple(wanted.shape),
-            inputs=[self.grids, self.arrays["map_id"], self.paths.search.distance, wp.from_torch(wanted),
-                    int(STRAIGHT * ahead)],
+            inputs=[self.grids, self.arrays["map_id"], self.passable.passable, self.paths.row_of_item,
+                    self.paths.search.distance, wp.from_torch(wanted), int(STRAIGHT * ahead)],
             outputs=[wp.from_torch(cell)],
         )  # fmt: skip
         return self.points(cell.clamp_min(0).long())

@@ -4,10 +4,13 @@ Cells are numbered ``cell = iy * width + ix``. A step to a straight neighbour we
 (chamfer weights: 8 % from Euclid at worst), and a diagonal step needs both straight cells beside it passable
 (no cutting of corners). Distances are integers, so every run and every device gives the same bits.
 
-The search is Dijkstra's, exact, with two plain queues in place of a heap: cells leave in order of distance,
-so what steps of weight 10 add to one queue is in order, and so is what steps of weight 14 add to the other.
-The nearer of the two heads is the next cell. A cell enters each queue at most once (a later step of the same
-weight is never shorter): queues as long as the grid never overflow.
+Cells may be `TIGHT`, too near to obstacles for comfort: steps into them weigh `TIGHT_FACTOR` times as much.
+
+The search is Dijkstra's, exact, with four plain queues in place of a heap: cells leave in order of distance, so
+what steps of one weight (straight or diagonal, into open or tight cells) add to a queue of their own is in
+order. The nearest of the four heads is the next cell. A cell enters each queue at most once (a later step of
+the same weight is never shorter), and those for open or for tight cells only: two arrays as long as the grid,
+filled from both ends, never overflow.
 """
 
 from collections.abc import Callable
@@ -23,6 +26,12 @@ UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them sti
 wp_straight = wp.constant(wp.int32(STRAIGHT))
 wp_diagonal = wp.constant(wp.int32(DIAGONAL))
 wp_unreached = wp.constant(wp.int32(UNREACHED))
+
+BLOCKED, OPEN, TIGHT = 0, 1, 2  # states of a cell
+TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken where the way around is long
+wp_blocked = wp.constant(wp.uint8(BLOCKED))
+wp_tight = wp.constant(wp.uint8(TIGHT))
+wp_tight_factor = wp.constant(wp.int32(TIGHT_FACTOR))
 
 SKIP = -2  # as the stop of a search: leave its distances as they are
 wp_skip = wp.constant(wp.int32(SKIP))
@@ -43,26 +52,50 @@ def _clear_distance(
 
 
 @wp.func
-def _relax_cell(
+def _enter_cell(
     cell: wp.int32,
     value: wp.int32,
-    tail: wp.int32,
+    tight: wp.int32,
+    tails: wp.vec2i,
+    passable: wp.array(dtype=wp.uint8),
     distance: wp.array(dtype=wp.int32),
     queue: wp.array(dtype=wp.int32),
 ):
-    """Lowers the label of `cell` to `value` where that is shorter and queues it; returns the new tail."""
-    new_tail = tail
-    if value < distance[cell]:
+    """Lowers a cell's label by a step of weight `value` from `distance`, queues it; returns the new tails.
+
+    A queue holds open cells from its front and tight ones from its back: a cell is one or the other.
+    """
+    result = tails
+    if passable[cell] == wp_tight:
+        if value + tight < distance[cell]:
+            distance[cell] = value + tight
+            queue[queue.shape[0] - 1 - tails[1]] = cell
+            result = wp.vec2i(tails[0], tails[1] + 1)
+    elif value < distance[cell]:
         distance[cell] = value
-        queue[tail] = cell
-        new_tail = tail + 1
-    return new_tail
+        queue[tails[0]] = cell
+        result = wp.vec2i(tails[0] + 1, tails[1])
+    return result
+
+
+@wp.func
+def _step_cell(
+    cell: wp.int32,
+    d: wp.int32,
+    weight: wp.int32,
+    tails: wp.vec2i,
+    passable: wp.array(dtype=wp.uint8),
+    distance: wp.array(dtype=wp.int32),
+    queue: wp.array(dtype=wp.int32),
+):
+    """Enters a cell by a step of `weight` from a cell at distance `d`, if it can be entered."""
+    return _enter_cell(cell, d + weight, weight * (wp_tight_factor - 1), tails, passable, distance, queue)
 
 
 @wp.kernel(enable_backward=False)
 def _flood_distance(
     # Grid:
-    passable: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    passable: wp.array2d(dtype=wp.uint8),  # [row, cell], 0 blocked, 1 open, 2 tight
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     width: wp.array(dtype=wp.int32),  # [grid]
@@ -81,80 +114,89 @@ def _flood_distance(
     if stop_cell == wp_skip:
         return
     row = row_of_item[item]
-    grid = grid_of_row[row]
-    w = width[grid]
-    h = height[grid]
+    w = width[grid_of_row[row]]
+    cells = w * height[grid_of_row[row]]
     ok = passable[row]
     dist = distance[item]
     near = straight_queue[item]
     far = diagonal_queue[item]
-
-    near_head = wp.int32(0)
-    near_tail = wp.int32(0)
-    far_head = wp.int32(0)
-    far_tail = wp.int32(0)
+    last = near.shape[0] - 1
+    near_head = wp.vec2i(0, 0)  # of open cells, of tight cells
+    near_tail = wp.vec2i(0, 0)
+    far_head = wp.vec2i(0, 0)
+    far_tail = wp.vec2i(0, 0)
     for i in range(sources.shape[1]):
         source = sources[item, i]
-        if source >= 0 and source < w * h:
-            if ok[source] != wp.uint8(0):
-                near_tail = _relax_cell(source, wp.int32(0), near_tail, dist, near)
+        if source >= 0 and source < cells:
+            if ok[source] != wp_blocked and dist[source] != 0:
+                dist[source] = 0
+                if ok[source] == wp_tight:
+                    near[last - near_tail[1]] = source
+                    near_tail = wp.vec2i(near_tail[0], near_tail[1] + 1)
+                else:
+                    near[near_tail[0]] = source
+                    near_tail = wp.vec2i(near_tail[0] + 1, near_tail[1])
 
     level = wp.int32(0)
-    while near_head < near_tail or far_head < far_tail:
-        # A label may have dropped since the cell was queued: then the other queue holds it too, and taking it
-        # here with its final label is as good.
+    busy = wp.bool(True)
+    while busy:
+        # The nearest of four heads. A label may have dropped since the cell was queued: then another queue
+        # holds it too, and taking it here with its final label is as good.
         d = wp_unreached
         cell = wp.int32(-1)
-        if near_head < near_tail:
-            cell = near[near_head]
+        which = wp.int32(-1)
+        if near_head[0] < near_tail[0]:
+            cell = near[near_head[0]]
             d = dist[cell]
-        use_far = wp.bool(False)
-        if far_head < far_tail:
-            if dist[far[far_head]] < d:
-                cell = far[far_head]
+            which = 0
+        if far_head[0] < far_tail[0]:
+            if dist[far[far_head[0]]] < d:
+                cell = far[far_head[0]]
                 d = dist[cell]
-                use_far = True
-        if use_far:
-            far_head += 1
+                which = 1
+        if near_head[1] < near_tail[1]:
+            if dist[near[last - near_head[1]]] < d:
+                cell = near[last - near_head[1]]
+                d = dist[cell]
+                which = 2
+        if far_head[1] < far_tail[1]:
+            if dist[far[last - far_head[1]]] < d:
+                cell = far[last - far_head[1]]
+                d = dist[cell]
+                which = 3
+        if which == 0:
+            near_head = wp.vec2i(near_head[0] + 1, near_head[1])
+        elif which == 1:
+            far_head = wp.vec2i(far_head[0] + 1, far_head[1])
+        elif which == 2:
+            near_head = wp.vec2i(near_head[0], near_head[1] + 1)
         else:
-            near_head += 1
-        if d >= level:  # lower: settled before, through the other queue
+            far_head = wp.vec2i(far_head[0], far_head[1] + 1)
+        busy = which >= 0 and cell != stop_cell
+        if busy and d >= level:  # lower: settled before, through another queue
             level = d
-            if cell == stop_cell:
-                break
             x = cell % w
             east = wp.bool(False)
             west = wp.bool(False)
-            north = wp.bool(False)
-            south = wp.bool(False)
             if x + 1 < w:
-                east = ok[cell + 1] != wp.uint8(0)
+                east = ok[cell + 1] != wp_blocked
             if x > 0:
-                west = ok[cell - 1] != wp.uint8(0)
-            if cell + w < w * h:
-                north = ok[cell + w] != wp.uint8(0)
-            if cell >= w:
-                south = ok[cell - w] != wp.uint8(0)
+                west = ok[cell - 1] != wp_blocked
             if east:
-                near_tail = _relax_cell(cell + 1, d + wp_straight, near_tail, dist, near)
+                near_tail = _step_cell(cell + 1, d, wp_straight, near_tail, ok, dist, near)
             if west:
-                near_tail = _relax_cell(cell - 1, d + wp_straight, near_tail, dist, near)
-            if north:
-                near_tail = _relax_cell(cell + w, d + wp_straight, near_tail, dist, near)
-                if east:
-                    if ok[cell + w + 1] != wp.uint8(0):
-                        far_tail = _relax_cell(cell + w + 1, d + wp_diagonal, far_tail, dist, far)
-                if west:
-                    if ok[cell + w - 1] != wp.uint8(0):
-                        far_tail = _relax_cell(cell + w - 1, d + wp_diagonal, far_tail, dist, far)
-            if south:
-                near_tail = _relax_cell(cell - w, d + wp_straight, near_tail, dist, near)
-                if east:
-                    if ok[cell - w + 1] != wp.uint8(0):
-                        far_tail = _relax_cell(cell - w + 1, d + wp_diagonal, far_tail, dist, far)
-                if west:
-                    if ok[cell - w - 1] != wp.uint8(0):
-                        far_tail = _relax_cell(cell - w - 1, d + wp_diagonal, far_tail, dist, far)
+                near_tail = _step_cell(cell - 1, d, wp_straight, near_tail, ok, dist, near)
+            for k in range(2):
+                beside = cell + w - 2 * w * k
+                if beside >= 0 and beside < cells:
+                    if ok[beside] != wp_blocked:
+                        near_tail = _step_cell(beside, d, wp_straight, near_tail, ok, dist, near)
+                        if east:
+                            if ok[beside + 1] != wp_blocked:
+                                far_tail = _step_cell(beside + 1, d, wp_diagonal, far_tail, ok, dist, far)
+                        if west:
+                            if ok[beside - 1] != wp_blocked:
+                                far_tail = _step_cell(beside - 1, d, wp_diagonal, far_tail, ok, dist, far)
 
 
 class DistanceSearch:
@@ -193,7 +235,7 @@ class DistanceSearch:
 
         Args:
             launch: ``launch(kernel, dim, inputs, outputs)`` launches or records.
-            passable: uint8 [rows, cells], 0 = blocked; cell = iy * width + ix with the grid's own width.
+            passable: uint8 [rows, cells], `BLOCKED`, `OPEN` or `TIGHT`; cell = iy * width + ix, own width.
             row_of_item: int32 [items], the row of `passable` that a search runs on.
             grid_of_row: int32 [rows], which grid (map) a row has now.
             width, height: int32 [grids], cells of each grid along x and y.

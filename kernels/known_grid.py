@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
 from maexp.kernels.planner import is_known
 from maexp.kernels.types import Maps
 
@@ -149,13 +150,17 @@ def _close_cells(
     # State in:
     known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    radius: wp.array(dtype=wp.float32),  # [mask row], distance to keep from known obstacle cells [m]
+    radius: wp.array(dtype=wp.float32),  # [mask row], distance from known obstacle cells [m]
     margin: float,  # the same, on top, in cells
+    value: wp.uint8,
     lanes: int,
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
-    """Closes what lies too near to known obstacles (threads that write the same cell write the same)."""
+    """Gives `value` to what is not blocked and lies nearer than the radius to known obstacles.
+
+    Threads that write the same cell write the same.
+    """
     row, lane = wp.tid()
     m = grid_of_row[row]
     w = grids.width[m]
@@ -170,7 +175,8 @@ def _close_cells(
             for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
                 for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
                     if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
-                        passable[row, v * w + u] = wp.uint8(0)
+                        if passable[row, v * w + u] != wp_blocked:
+                            passable[row, v * w + u] = value
 
 
 def lanes_on(device: wp.Device) -> int:
@@ -236,22 +242,31 @@ class PassableGrids:
         known: the grids to read.
         radius: float32 [E, K], distance to keep from known obstacles [m]; K masks per env. Where every robot
             has a known row of its own, K must be the number of robots.
-        margin: the same on top, in cells, for what the grid rounds away.
+        comfort: float32 [E, K], distance below which a cell is tight [m]; None: no cell is.
+        margin: the same on top of both, in cells, for what the grid rounds away.
         through_unknown: whether unknown cells count as passable.
 
     Attributes:
-        passable: uint8 [E * K, cells].
+        passable: uint8 [E * K, cells]: `BLOCKED`, `OPEN` or `TIGHT`.
         grid_of_row: int32 [E * K], the map of each row; set by `paint`.
     """
 
-    def __init__(self, known: KnownGrids, radius: np.ndarray, margin: float, through_unknown: bool):
+    def __init__(
+        self,
+        known: KnownGrids,
+        radius: np.ndarray,
+        comfort: np.ndarray | None,
+        margin: float,
+        through_unknown: bool,
+    ):
         envs, masks = radius.shape
         if known.rows_per_env not in (1, masks):
             raise ValueError(f"{known.rows_per_env} known rows per env need as many masks, got {masks}")
         device = known.known.device
         self.known, self.masks = known, masks
         self.margin, self.through_unknown = float(margin), int(through_unknown)
-        self.radius = wp.array(radius.reshape(-1), dtype=wp.float32, device=device)
+        rings = [(comfort, TIGHT), (radius, BLOCKED)] if comfort is not None else [(radius, BLOCKED)]
+        self.rings = [(wp.array(r.reshape(-1), dtype=wp.float32, device=device), value) for r, value in rings]
         rows = range(envs * masks)
         source = [row if known.rows_per_env == masks else row // masks for row in rows]
         self.known_of_row = wp.array(source, dtype=wp.int32, device=device)
@@ -265,4 +280,7 @@ class PassableGrids:
         dim = (self.passable.shape[0], lanes)
         inputs = [grids, self.grid_of_row, self.known.known, self.known_of_row]
         launch(_open_cells, dim, [*inputs, self.through_unknown, lanes], [self.passable])
-        launch(_close_cells, dim, [*inputs, self.radius, self.margin, lanes], [self.passable])
+        for radius, value in self.rings:
+            launch(
+                _close_cells, dim, [*inputs, radius, self.margin, wp.uint8(value), lanes], [self.passable]
+            )

@@ -10,7 +10,7 @@ from maexp.kernels.frontier import UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
 from maexp.kernels.known_grid import NavGrids, nav_cell
 from maexp.kernels.types import point_xy
-from maexp.kernels.wavefront import nearest_passable, step_back
+from maexp.kernels.ways import nearest_passable, step_back
 
 wp_unknown = wp.constant(wp.uint8(UNKNOWN))
 wp_unreached = wp.constant(wp.int32(UNREACHED))
@@ -150,6 +150,8 @@ def _first_cells(
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),
     # State in:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+    row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     target: wp.array3d(dtype=wp.int32),  # [env, robot, block], -1 = none
     reach: int,  # length of the way to look ahead, 10 a cell
@@ -165,5 +167,7 @@ def _first_cells(
         if distance[item, here] >= wp_unreached:
             here = -1
     while here >= 0 and distance[item, wp.max(here, 0)] > reach:
-        here = step_back(distance, item, here, grids.width[m], grids.height[m])
+        here = step_back(
+            passable, row_of_item[item], distance, item, here, grids.width[m], grids.height[m]
+        )
     cell[e, i, k] = here

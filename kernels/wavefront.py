@@ -2,9 +2,11 @@
 
 Every few local steps a robot's map is brought up to date and, where the path held so far is blocked or used
 up, the distance from the robot is searched over cells not known to be blocked (unknown ones count as
-passable) until the goal is reached. A goal inside an obstacle or out of reach is replaced by the reached cell
+passable; tight ones, near to obstacles, are
+avoided) until the goal is reached. A goal inside an obstacle or out of reach is replaced by the reached cell
 nearest to it. Every local step the waypoint becomes the farthest cell of the path that is in the robot's
-radar range and in sight, drawn nearer where the robot could not brake in time.
+radar range and in sight, drawn nearer where the robot could not brake in time (`COMFORT`, `CREEP` and `HEADROOM`
+are tuned: docs/planners.md).
 
 A path holds its first `PATH_CELLS` cells only; the search is repeated long before a robot gets there. What is
 held never outlives a macro step: a new goal always searches anew.
@@ -13,97 +15,26 @@ held never outlives a macro step: a new goal always searches anew.
 import numpy as np
 import warp as wp
 
-from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch, wp_diagonal, wp_straight
+from maexp.kernels.frontier import OBSTACLE
+from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids, nav_cell, nav_center
 from maexp.kernels.types import Robots, point_xy
+from maexp.kernels.ways import in_sight, is_passable, nearest_passable, step_back
 
 PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
-SNAP_CELLS = 4  # how far the search may start from a robot that stands on a blocked cell, in cells
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
-
 CREEP = 0.5  # least distance of a waypoint that is not the end, in clearances of the robot
+COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
+HEADROOM = 2.0  # speed is held to what brakes within so many times the gap to the nearest obstacle
+LOOK_CELLS = 5  # how far that obstacle is looked for, in cells
 
+wp_headroom = wp.constant(HEADROOM)
+wp_look_cells = wp.constant(LOOK_CELLS)
 wp_creep = wp.constant(CREEP)
+wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
 wp_path_cells = wp.constant(PATH_CELLS)
-wp_snap_cells = wp.constant(SNAP_CELLS)
 wp_unreached = wp.constant(wp.int32(UNREACHED))
 wp_skip = wp.constant(wp.int32(SKIP))
-
-
-@wp.func
-def is_passable(passable: wp.array2d(dtype=wp.uint8), row: int, cell: int) -> bool:
-    return passable[row, cell] != wp.uint8(0)
-
-
-@wp.func
-def nearest_passable(passable: wp.array2d(dtype=wp.uint8), row: int, cell: int, w: int, h: int) -> int:
-    """The passable cell nearest to `cell`, at most `SNAP_CELLS` away along x and y; -1 where none is."""
-    best = wp.int32(-1)
-    best_gap = wp.int32(1 << 30)
-    x = cell % w
-    y = cell / w
-    for v in range(wp.max(y - wp_snap_cells, 0), wp.min(y + wp_snap_cells, h - 1) + 1):
-        for u in range(wp.max(x - wp_snap_cells, 0), wp.min(x + wp_snap_cells, w - 1) + 1):
-            gap = (v - y) * (v - y) + (u - x) * (u - x)
-            if gap < best_gap and is_passable(passable, row, v * w + u):
-                best = v * w + u
-                best_gap = gap
-    return best
-
-
-@wp.func
-def in_sight(passable: wp.array2d(dtype=wp.uint8), row: int, start: int, end: int, w: int) -> bool:
-    """Whether every cell that the segment between two cell centres touches, `start` apart, is passable."""
-    x = start % w
-    y = start / w
-    dx = end % w - x
-    dy = end / w - y
-    nx = wp.abs(dx)
-    ny = wp.abs(dy)
-    sx = wp.sign(dx)
-    sy = wp.sign(dy)
-    i = wp.int32(0)
-    j = wp.int32(0)
-    clear = wp.bool(True)
-    while clear and (i < nx or j < ny):
-        side = (1 + 2 * i) * ny - (1 + 2 * j) * nx  # which edge the segment crosses first; 0 = the corner
-        if side == 0:
-            clear = is_passable(passable, row, y * w + x + sx)
-            clear = clear and is_passable(passable, row, (y + sy) * w + x)
-        if side <= 0:
-            x += sx
-            i += 1
-        if side >= 0:
-            y += sy
-            j += 1
-        clear = clear and is_passable(passable, row, y * w + x)
-    return clear
-
-
-@wp.func
-def step_back(distance: wp.array2d(dtype=wp.int32), item: int, cell: int, w: int, h: int) -> int:
-    """The neighbour before `cell` on a shortest path from the source, -1 at the source.
-
-    Of several the first counts: east, north, west, south, then north-east, north-west, south-west, south-east.
-    """
-    x = cell % w
-    y = cell / w
-    d = distance[item, cell]
-    found = wp.int32(-1)
-    for k in range(8):
-        ux = wp.where(k == 0 or k == 4 or k == 7, 1, wp.where(k == 2 or k == 5 or k == 6, -1, 0))
-        uy = wp.where(k == 1 or k == 4 or k == 5, 1, wp.where(k == 3 or k == 6 or k == 7, -1, 0))
-        u = x + ux
-        v = y + uy
-        if found < 0 and u >= 0 and u < w and v >= 0 and v < h:
-            weight = wp.where(k < 4, wp_straight, wp_diagonal)
-            if distance[item, v * w + u] == d - weight:
-                # A diagonal step cuts no corner: both cells beside it are reached (they touch reached cells).
-                if k < 4 or (
-                    distance[item, y * w + u] < wp_unreached and distance[item, v * w + x] < wp_unreached
-                ):
-                    found = v * w + u
-    return found
 
 
 @wp.func
@@ -169,6 +100,8 @@ def _trace_path(
     map_id: wp.array(dtype=wp.int32),
     # State in:
     goal: wp.array2d(dtype=wp.vec2),
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+    row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     stop: wp.array(dtype=wp.int32),  # [item]
     # State out:
@@ -206,7 +139,7 @@ def _trace_path(
     while cell >= 0:
         path[item, total % wp_path_cells] = cell
         total += 1
-        cell = step_back(distance, item, cell, w, h)
+        cell = step_back(passable, row_of_item[item], distance, item, cell, w, h)
     path_total[item] = total
     path_used[item] = 0
 
@@ -233,8 +166,29 @@ def clear_ahead(
     return wp.max(room, 0.0)
 
 
+@wp.func
+def nearest_obstacle(grids: NavGrids, m: int, known: wp.array2d(dtype=wp.uint8), row: int, at: wp.vec2) -> float:
+    """Distance to the nearest known obstacle cell [m], `LOOK_CELLS` cells at most."""
+    w = grids.width[m]
+    h = grids.height[m]
+    p = (at - grids.origin[m]) / grids.cell[m]
+    x = int(wp.floor(p[0]))
+    y = int(wp.floor(p[1]))
+    nearest = float(wp_look_cells)
+    for v in range(wp.max(y - wp_look_cells, 0), wp.min(y + wp_look_cells, h - 1) + 1):
+        for u in range(wp.max(x - wp_look_cells, 0), wp.min(x + wp_look_cells, w - 1) + 1):
+            if known[row, v * w + u] == wp_obstacle:
+                nearest = wp.min(nearest, wp.length(wp.vec2(float(u) + 0.5, float(v) + 0.5) - p))
+    return nearest * grids.cell[m]
+
+
 @wp.kernel(enable_backward=False)
 def _hold_back(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    rows_per_env: int,
     # Robots:
     robots: Robots,
     lead_time: float,
@@ -257,6 +211,10 @@ def _hold_back(
     way = target[e, i] - at
     keep = 2.0 * robots.clearance[e, i]
     room = clear_ahead(e, i, way, keep, collided, center)
+    m = map_id[e]
+    row = e * rows_per_env + i % rows_per_env
+    gap = nearest_obstacle(grids, m, known, row, at) - robots.threshold[e, i]
+    room = wp.clamp(room, 0.0, wp.max(wp_headroom * gap, 0.0))
     length = lead_time * wp.sqrt(2.0 * robots.max_accel[e, i] * room) + wp_creep * robots.clearance[e, i]
     full = wp.length(way)
     if full > length:
@@ -364,7 +322,8 @@ class PathSearch:
         known = self.passable.known
         launch(
             _trace_path, self.shape,
-            [known.grids, known.map_id, goal, self.search.distance, self.search.stop],
+            [known.grids, known.map_id, goal, self.passable.passable, self.row_of_item, self.search.distance,
+             self.search.stop],
             [self.path, self.path_total, self.path_used, self.path_ends],
         )  # fmt: skip
 
@@ -379,6 +338,19 @@ class PathSearch:
         )  # fmt: skip
 
 
+def distinct_masks(
+    radius: np.ndarray, comfort: np.ndarray, each: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The distances of robots that differ (of `each` robot if asked), [E, K] twice, and the mask of each robot."""
+    robots = radius.shape[1]
+    if each:
+        return radius, comfort, np.arange(robots)
+    _, first, mask_of_robot = np.unique(
+        np.concatenate([radius, comfort]), axis=1, return_index=True, return_inverse=True
+    )
+    return radius[:, first], comfort[:, first], mask_of_robot.reshape(-1)
+
+
 class Wavefront:
     """The planner over one shard of a simulation: recorded launches.
 
@@ -391,18 +363,15 @@ class Wavefront:
         limited = sim.settings.comm_limited
         self.lead_time = sim.settings.horizon * sim.settings.dt
         self.view, self.robots = shard.view, shard.robots
-        threshold = self.robots.threshold.numpy()
+        threshold, clearance = self.robots.threshold.numpy(), self.robots.clearance.numpy()
         robots = threshold.shape[1]
-        if limited:
-            radius, mask_of_robot = threshold, np.arange(robots)
-        else:
-            radius, mask_of_robot = np.unique(threshold, axis=1, return_inverse=True)
+        radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.known = KnownGrids(
             sim.maps, sim.nav_grids, self.view.map_id, shard.known("free"), shard.known("boundary"),
             robots if limited else 1, sim.nav_cells,
         )  # fmt: skip
-        self.passable = PassableGrids(self.known, radius, MARGIN_CELLS, through_unknown=True)
-        self.paths = PathSearch(self.passable, mask_of_robot.reshape(-1))
+        self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
+        self.paths = PathSearch(self.passable, mask_of_robot)
         self.field_launches = shard.record(self.find_paths)
         self.waypoint_launches = shard.record(self.pick_waypoints)
 
@@ -417,5 +386,6 @@ class Wavefront:
         self.paths.pick(launch, s.active, s.collided, s.center, s.goal, self.robots.radar_range, s.target)
         launch(
             _hold_back, self.paths.shape,
-            [self.robots, self.lead_time, s.active, s.collided, s.center], [s.target],
+            [self.known.grids, s.map_id, self.known.known, self.known.rows_per_env,
+             self.robots, self.lead_time, s.active, s.collided, s.center], [s.target],
         )  # fmt: skip

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from maexp.kernels.frontier import FREE, OBSTACLE, frontier_cells, mark_frontier
 from oracle import grid as oracle
 from scipy import ndimage
+
+from maexp.kernels.frontier import FREE, OBSTACLE, frontier_cells, mark_frontier
 
 pytestmark = pytest.mark.kernels
 

@@ -2,27 +2,28 @@
 
 from functools import partial
 
-import maexp.kernels.geodesic as geodesic
 import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
 import warp as wp
-from maexp.kernels.geodesic import UNREACHED, DistanceSearch, geodesic_distance
 from oracle import grid as oracle
 from scipy.sparse.csgraph import dijkstra
+
+import maexp.kernels.geodesic as geodesic
+from maexp.kernels.geodesic import UNREACHED, DistanceSearch, geodesic_distance
 
 pytestmark = pytest.mark.kernels
 
 
-def scipy_distance(passable: np.ndarray, sources: list[int]) -> np.ndarray:
+def scipy_distance(passable: np.ndarray, sources: list[int], factor=None) -> np.ndarray:
     height, width = passable.shape
     rows, cols, weights = [], [], []
     for y, x in zip(*np.nonzero(passable), strict=True):
         for v, u, weight in oracle.neighbours(passable, y, x):
             rows.append(y * width + x)
             cols.append(v * width + u)
-            weights.append(weight)
+            weights.append(weight if factor is None else weight * factor[v, u])
     cells = height * width
     graph = sp.csr_matrix((weights, (rows, cols)), shape=(cells, cells))
     found = dijkstra(graph, indices=[s for s in sources if s >= 0 and passable.flat[s]])
@@ -128,6 +129,23 @@ def test_mixed_grid_sizes_and_early_stop():
     search.search(*arguments)
     np.testing.assert_array_equal(search.distance.numpy()[[0, 2]], early[[0, 2]])
     np.testing.assert_array_equal(search.distance.numpy()[1], full[1])
+
+
+def test_tight_cells_weigh_more():
+    rng = np.random.default_rng(13)
+    height, width = 15, 22
+    states = rng.choice([geodesic.BLOCKED, geodesic.OPEN, geodesic.TIGHT], (6, height, width), p=[0.2, 0.4, 0.4])
+    sources = rng.integers(0, height * width, (6, 2)).astype(np.int32)
+    search = DistanceSearch(6, height * width, 2)
+    search.sources.assign(sources)
+    lists = (range(6), [0] * 6, [width], [height])
+    arrays = [wp.array(list(v), dtype=wp.int32, device="cpu") for v in lists]
+    passable = wp.array(states.reshape(6, -1).astype(np.uint8), dtype=wp.uint8, device="cpu")
+    search.search(partial(wp.launch, device="cpu"), passable, *arrays)
+    for item in range(6):
+        factor = np.where(states[item] == geodesic.TIGHT, geodesic.TIGHT_FACTOR, 1)
+        want = scipy_distance(states[item] != geodesic.BLOCKED, list(sources[item]), factor)
+        np.testing.assert_array_equal(search.distance.numpy()[item].reshape(height, width), want)
 
 
 def test_large_open_grid_takes_less_than_the_promised_time():

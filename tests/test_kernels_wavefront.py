@@ -13,7 +13,8 @@ from maexp.envs.nav_grid import build_nav_grid, stack_nav_grids
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids
 from maexp.kernels.types import Maps, Robots
-from maexp.kernels.wavefront import CREEP, PATH_CELLS, SNAP_CELLS, PathSearch, _hold_back, in_sight
+from maexp.kernels.wavefront import CREEP, HEADROOM, PATH_CELLS, PathSearch, _hold_back, distinct_masks
+from maexp.kernels.ways import SNAP_CELLS, in_sight
 
 pytestmark = pytest.mark.kernels
 
@@ -97,7 +98,7 @@ def test_known_grid_of_the_team_and_of_each_robot():
 def test_passable_cells_keep_their_distance(through_unknown):
     scene = Scene(2, 2, 1, share=0.3)
     radius = np.array([[0.6, 1.3], [0.0, 2.5], [2.1, 0.7]], np.float32)  # metres
-    masks = PassableGrids(scene.known, radius, 0.25, through_unknown)
+    masks = PassableGrids(scene.known, radius, None, 0.25, through_unknown)
     masks.paint(launch)
     for e in range(3):
         for k in range(2):
@@ -111,14 +112,14 @@ def test_passable_cells_keep_their_distance(through_unknown):
 
 def test_a_mask_per_robot_reads_the_robots_own_row():
     scene = Scene(3, 2, 2, share=0.4)
-    masks = PassableGrids(scene.known, np.zeros((3, 2), np.float32), 0.0, through_unknown=False)
+    masks = PassableGrids(scene.known, np.zeros((3, 2), np.float32), None, 0.0, through_unknown=False)
     masks.paint(launch)
     for e in range(3):
         for i in range(2):
             want = scene.expected(e, i) == FREE
             np.testing.assert_array_equal(masks.passable.numpy()[e * 2 + i][: want.size], want.ravel())
     with pytest.raises(ValueError, match="2 known rows"):
-        PassableGrids(scene.known, np.zeros((3, 1), np.float32), 0.0, through_unknown=False)
+        PassableGrids(scene.known, np.zeros((3, 1), np.float32), None, 0.0, through_unknown=False)
 
 
 def test_cells_between_the_points_of_a_cloud_take_the_nearest_state():
@@ -187,7 +188,7 @@ def run_planner(scene: Scene, robots_xy, goals, reach: float, paths: PathSearch 
     """One replanning and one waypoint for every robot; positions in cells. Returns targets and the search."""
     envs, robots = robots_xy.shape[:2]
     if paths is None:
-        masks = PassableGrids(scene.known, np.zeros((envs, 1), np.float32), 0.5, through_unknown=True)
+        masks = PassableGrids(scene.known, np.zeros((envs, 1), np.float32), None, 0.5, through_unknown=True)
         masks.paint(launch)
         paths = PathSearch(masks, np.zeros(robots, int))
     cell, origin = scene.grids.cell.numpy()[scene.map_id], scene.grids.origin.numpy()[scene.map_id]
@@ -305,7 +306,7 @@ def test_following_waypoints_arrives():
     """A robot that steps from cell to cell toward its waypoints gets around every wall."""
     scene = Scene(0, 2, 1, share=1.0, map_id=(0,))
     shape = scene.kinds[0].shape
-    masks = PassableGrids(scene.known, np.zeros((1, 1), np.float32), 0.5, through_unknown=True)
+    masks = PassableGrids(scene.known, np.zeros((1, 1), np.float32), None, 0.5, through_unknown=True)
     masks.paint(launch)
     passable = masks.passable.numpy()[0][: shape[0] * shape[1]].reshape(shape)
     start = int(np.flatnonzero(passable)[0])
@@ -324,24 +325,77 @@ def test_following_waypoints_arrives():
 
 def test_waypoints_leave_room_to_brake():
     """Drawn to lead_time * the speed that stops at the waypoint, or half-way to a robot ahead, plus a creep."""
+    scene = open_scene(7, 250)
     robots = Robots()
-    robots.max_accel = array([[2.0] * 5], wp.float32)
-    robots.clearance = array([[1.0] * 5], wp.float32)
-    # 0 and 1 drive at each other, 2 behind 1, 3 far off and almost there, 4 stands on its target.
-    x = np.array([0.0, 6.0, 30.0, 100.0, 200.0])
-    ahead = np.array([20.0, -6.0, 18.0, 0.4, 0.0])
-    center = np.stack([x, 0 * x, 0 * x], axis=-1)[None]
+    robots.max_accel = array([[2.0] * 6], wp.float32)
+    robots.clearance = array([[1.0] * 6], wp.float32)
+    robots.threshold = array([[0.7] * 6], wp.float32)
+    # 0 and 1 drive at each other, 2 behind 1, 3 far off and almost there, 4 stands on its target, 5 beside a wall.
+    x = np.array([2.0, 8.0, 32.0, 102.0, 202.0, 230.5])
+    ahead = np.array([20.0, -6.0, 18.0, 0.4, 0.0, 15.0])
+    known = scene.known.known.numpy()
+    known[0, 1 * 250 + 231] = OBSTACLE  # its centre 1 right of robot 5 and 2 below
+    known[0, 6 * 250 + 60] = OBSTACLE  # too far from anybody
+    center = np.stack([x, 0 * x + 3.0, 0 * x], axis=-1)[None]
     for stopped, room_0 in ((0, 0.5 * (6.0 - 2.0)), (1, 6.0 - 2.0)):
-        collided = array([[0, stopped, 0, 0, 0]], wp.int32)
-        target = array(np.stack([x + ahead, 0 * x], axis=-1)[None], wp.vec2)
+        collided = array([[0, stopped, 0, 0, 0, 0]], wp.int32)
+        target = array(np.stack([x + ahead, 0 * x + 3.0], axis=-1)[None], wp.vec2)
         launch(
-            _hold_back, (1, 5), [robots, 0.3, array([1], wp.int32), collided, array(center, wp.vec3)], [target]
-        )
+            _hold_back, (1, 6),
+            [scene.grids, array([0], wp.int32), array(known, wp.uint8), 1, robots, 0.3, array([1], wp.int32),
+             collided, array(center, wp.vec3)], [target],
+        )  # fmt: skip
         got = target.numpy()[0, :, 0] - x
-        want = [0.3 * np.sqrt(2 * 2.0 * room) + CREEP for room in (room_0, 2.0, 18.0)]
-        np.testing.assert_allclose(got[0], want[0], rtol=1e-5)
-        np.testing.assert_allclose(got[1], -6.0 if stopped else -want[1], rtol=1e-5)
-        np.testing.assert_allclose(got[2:], [want[2], 0.4, 0.0], rtol=1e-5, atol=1e-5)
+        most = HEADROOM * (5.0 - 0.7)  # nothing within five cells
+        beside = HEADROOM * (np.hypot(231.0 - x[5], 1.0 - 3.0) - 0.7)
+        want = [0.3 * np.sqrt(2 * 2.0 * min(room, most)) + CREEP for room in (room_0, 2.0, 18.0, beside)]
+        np.testing.assert_allclose(got[0], want[0], rtol=1e-4)
+        np.testing.assert_allclose(got[1], -6.0 if stopped else -want[1], rtol=1e-4)
+        np.testing.assert_allclose(got[2:], [want[2], 0.4, 0.0, want[3]], rtol=1e-3, atol=1e-4)
+
+
+def test_tight_cells_lie_between_the_two_radii_and_are_avoided():
+    scene = Scene(2, 2, 1, share=0.25)
+    radius, comfort = np.full((3, 1), 0.2, np.float32), np.full((3, 1), 1.1, np.float32)
+    masks = PassableGrids(scene.known, radius, comfort, 0.5, through_unknown=True)
+    masks.paint(launch)
+    for e in range(3):
+        known = scene.expected(e, None)
+        cell = scene.places[scene.map_id[e]].resolution
+        hard, soft = (oracle.passable_cells(known, r[0, 0] / cell + 0.5, True) for r in (radius, comfort))
+        want = np.where(soft, 1, np.where(hard, 2, 0))
+        np.testing.assert_array_equal(masks.passable.numpy()[e][: want.size], want.ravel())
+        assert (want == 2).any()
+    # Around a wall's end: the way through the gap is shorter, but tight.
+    scene = open_scene(9, 11)
+    at, goal = np.array([[[1.5, 4.5]]]), np.array([[[9.5, 4.5]]])
+    _, paths = run_planner(scene, at, goal, 20.0)
+    wall_off(paths, [5 + 11 * y for y in range(9) if y not in (4, 8)])
+    mask = paths.passable.passable.numpy()
+    assert steps_on(paths, scene, at, goal, 4 * 11 + 5)
+    mask[0, 4 * 11 + 5] = 2
+    paths.passable.passable.assign(mask)
+    # A detour of 80 - 14 * 4 more than straight on is longer than 3 * 10: the gap is still worth it ...
+    assert steps_on(paths, scene, at, goal, 4 * 11 + 5)
+    mask[0, [4 * 11 + 4, 4 * 11 + 6]] = 2
+    paths.passable.passable.assign(mask)
+    # ... and no longer when three cells of it are tight.
+    assert not steps_on(paths, scene, at, goal, 4 * 11 + 5)
+
+
+def steps_on(paths: PathSearch, scene: Scene, at, goal, cell: int) -> bool:
+    run_planner(scene, at, goal, 20.0, paths)
+    return cell in paths.path.numpy()[0, : paths.path_total.numpy()[0]]
+
+
+def test_robots_alike_share_a_mask():
+    radius = np.array([[0.5, 0.7, 0.5, 0.5]] * 2, np.float32)
+    comfort = np.array([[1.0, 1.0, 1.0, 2.0]] * 2, np.float32)
+    hard, soft, mask_of_robot = distinct_masks(radius, comfort, each=False)
+    assert hard.shape == soft.shape == (2, 3)
+    np.testing.assert_array_equal(hard[:, mask_of_robot], radius)
+    np.testing.assert_array_equal(soft[:, mask_of_robot], comfort)
+    assert distinct_masks(radius, comfort, each=True)[2].tolist() == [0, 1, 2, 3]
 
 
 def test_nav_grids_struct_has_every_field():
