@@ -206,8 +206,9 @@ def repair_map(
     """A map that passes the checker, as far as dropping and adding points can help; and what was done.
 
     Free points that are obstacles too go; so do, with `close_gaps`, free points behind gaps too narrow for a
-    robot that collides at `threshold` [m] (default: the scenario's). The largest connected piece stays, and
-    obstacle points close it where rays leave. Exact duplicates never enter a map.
+    robot that collides at `threshold` [m] (default: the scenario's). The largest connected piece stays, free points
+    that no robot can see go where they are more than 5 %, and obstacle points close the map where rays leave. Exact
+    duplicates never enter a map.
     """
     scenario = find_scenario(world.scenario)
     threshold = scenario.collision_threshold if threshold is None else threshold
@@ -226,6 +227,10 @@ def repair_map(
     if piece.any():
         world = _replace(world, free_kept=piece == 0)
         steps.append(f"kept the largest of {piece.max() + 1} pieces: dropped {(piece > 0).sum():,} free points")
+    unseen = _find_unseen(world, threshold, start_clearance)
+    if unseen.any():
+        world = _replace(world, free_kept=~unseen)
+        steps.append(f"dropped {unseen.sum():,} free points that no robot can see from where it can go")
     for _ in range(SEAL_ROUNDS):  # a winding leak may need a second look
         wall = find_seal(world)
         if not len(wall):
@@ -263,6 +268,15 @@ def _find_cut_off(world: PointCloudMap, threshold: float, start_clearance: float
     piece = reach.piece[index[:, 0], index[:, 1]]
     _, nearest = cKDTree(index * reach.raster.step + reach.raster.corner).query(world.free[:, :2])
     return piece[nearest] != reach.chosen
+
+
+def _find_unseen(world: PointCloudMap, threshold: float, start_clearance: float) -> np.ndarray:
+    """Free points that robots cannot see, where they are so many that no episode could end; bool [free_count]."""
+    reach = find_reach(world, threshold, find_starts(world, start_clearance))
+    if not len(reach.places):
+        return np.zeros(len(world.free), dtype=bool)
+    unseen = ~visible_free(world, reach.places, find_scenario(world.scenario).radar_range)
+    return unseen if unseen.mean() > 1 - VISIBLE_SHARE else np.zeros_like(unseen)
 
 
 def _replace(world: PointCloudMap, free_kept=None, wall=None) -> PointCloudMap:

@@ -24,7 +24,7 @@ CLOUDS = (".pcd", ".ply", ".xyz", ".las", ".laz", ".bt", *MESHES)
 LEAST_POINTS = 20
 FLAT = 1e-3  # a cloud this thin for its width is a floor plan already
 OUTDOOR_SIZE, OUTDOOR_DENSITY = 100.0, 10.0  # larger [m] and sparser [points / m^2] than this was scanned from the air
-FLOOR_SHARE = 0.6  # of what the walls enclose; where less of the floor was scanned, the rest is inferred
+FLOOR_SHARE = 0.7  # of what the walls enclose; where less of the floor was scanned, the rest is inferred
 
 
 def read_cloud(path: Path, options: ImportOptions, report: ImportReport) -> tuple[Source, Scenario]:

@@ -13,6 +13,7 @@ from .grid import EIGHT, FREE, MAX_CELLS, OBSTACLE, UNKNOWN, Grid, resample
 
 DIRECTIONS = 16
 WALLED_IN = 13  # of 16 directions must meet a wall for a place to lie inside
+HEAD_HEIGHT = 1.8  # [m]; free space is not inferred below what hangs lower
 SIGHT = 40.0  # [m]; walls farther than this enclose nothing
 
 
@@ -51,6 +52,7 @@ class FloorSource:
     def __init__(self, points, low: float, high: float, finest: float, *, open_space=None, infer=False, holes=2):
         height = points[:, 2]
         self.walls = points[(height > low) & (height <= high)]
+        self._tall = points[(height > low) & (height <= max(high, HEAD_HEIGHT)), :2]  # sparse walls have fewer gaps
         ground = [points[np.abs(height) <= low, :2]]
         if open_space is not None:
             ground.append(open_space[(open_space[:, 2] > 0) & (open_space[:, 2] <= high), :2])
@@ -58,7 +60,7 @@ class FloorSource:
         self.finest = finest
         self.infer = infer
         self.holes = holes
-        inside = np.concatenate([self.walls[:, :2], self.ground])
+        inside = np.concatenate([self._tall, self.ground])
         self._low, self._high = inside.min(axis=0), inside.max(axis=0)
 
     def at(self, cell: float) -> Grid:
@@ -66,7 +68,8 @@ class FloorSource:
         walls = count_points(self.walls[:, :2], self._low, cell, shape) > 0
         free = count_points(self.ground, self._low, cell, shape) > 0
         if self.infer:
-            free |= walled_in(walls, cell)
+            tall = count_points(self._tall, self._low, cell, shape) > 0
+            free |= walled_in(tall, cell) & ~tall
         free &= ~walls
         if self.holes:
             free |= fill_holes(free, self.holes) & ~walls
