@@ -133,7 +133,7 @@ def choose_by_force(scene: Scene) -> torch.Tensor:
     force = (pull.unsqueeze(-1) * ways).sum(2)
     apart = at.unsqueeze(2) - at.unsqueeze(1)
     gap = apart.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    push = REPULSION * (1.0 - gap / nav.radar_range).clamp_min(0.0) * scene.alive.view(*scene.alive.shape, 1, 1).mT
+    push = REPULSION * (1.0 - gap / nav.radar_range).clamp_min(0.0) * scene.alive[:, None, :, None]
     force = force + pull.sum(-1, keepdim=True) * (push * apart / gap).sum(2)
     along = (ways * force.unsqueeze(2)).sum(-1) / force.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     return torch.where(scene.travel.isfinite(), pull * (1.0 + along), -torch.inf).argmax(-1)

@@ -1,12 +1,11 @@
 """The `wavefront` planner: a waypoint in sight on the shortest way to the goal, for DWA to drive to.
 
 Every few local steps a robot's map is brought up to date and, where the path held so far is blocked or used
-up, the distance from the robot is searched over cells not known to be blocked (unknown ones count as
-passable; tight ones, near to obstacles, are
-avoided) until the goal is reached. A goal inside an obstacle or out of reach is replaced by the reached cell
-nearest to it. Every local step the waypoint becomes the farthest cell of the path that is in the robot's
-radar range and in sight, drawn nearer where the robot could not brake in time (`COMFORT`, `CREEP` and `HEADROOM`
-are tuned: docs/planners.md).
+up, the distance from the robot is searched over cells not known to be blocked until the goal is reached;
+unknown cells count as passable, tight ones (near obstacles) as a detour. A goal inside an obstacle or out of
+reach is replaced by the reached cell nearest to it. Every local step the waypoint becomes the farthest cell of
+the path that is in the robot's radar range and in sight, drawn nearer where the robot could not brake in time.
+`COMFORT`, `CREEP` and `HEADROOM` are tuned: docs/planners.md.
 
 A path holds its first `PATH_CELLS` cells only; the search is repeated long before a robot gets there. What is
 held never outlives a macro step: a new goal always searches anew.

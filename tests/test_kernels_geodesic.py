@@ -1,5 +1,6 @@
 """Geodesic distances against scipy's Dijkstra and the plain-loop oracle."""
 
+import time
 from functools import partial
 
 import numpy as np
@@ -149,9 +150,9 @@ def test_tight_cells_weigh_more():
 
 
 def test_large_open_grid_takes_less_than_the_promised_time():
-    """100 ns per reached cell is promised, about 25 measured; ten times that fails, whatever else runs."""
-    import time
-
+    """100 ns per reached cell is promised, about 35 measured; ten times the promise fails, whatever else runs."""
+    if wp.config.mode == "debug":
+        pytest.skip("bounds checks take their time")
     passable = torch.ones(4, 120, 130, dtype=torch.bool)
     sources = torch.full((4,), 60 * 130 + 60)
     geodesic_distance(passable, sources)

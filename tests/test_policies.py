@@ -1,0 +1,252 @@
+"""Classical planners: they finish, they are batched without a trace of the batch, and they choose as they say."""
+
+import numpy as np
+import pytest
+import torch
+from oracle.grid import frontier_cells, geodesic_distance
+
+from maexp.agents.policies import (
+    CHOICES,
+    POLICIES,
+    FrontierPlanner,
+    Scene,
+    choose_by_area,
+    choose_by_assignment,
+    choose_by_force,
+    choose_in_turn,
+    choose_nearest,
+    keyed_uniform,
+)
+from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RobotConfig, make_map
+from maexp.envs.navigation import Navigation
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.geodesic import UNREACHED
+
+MAPS = [make_map("maze_small", k) for k in (0, 3)]
+REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
+
+
+def make_env(num_envs=4, planner="wavefront", **settings) -> ExplorationEnv:
+    settings = {"maps": MAPS, "seed": 11, "macro_steps": 80} | settings
+    return ExplorationEnv(num_envs=num_envs, planner=PlannerConfig(name=planner), num_threads=1, **settings)
+
+
+def play(env, name: str, steps: int):
+    """Plays until all teams are done or `steps` decisions; returns the last coverage of each and the actions."""
+    policy = POLICIES[name](env)
+    td = env.reset()
+    coverage, running, actions = torch.zeros(env.num_envs), torch.ones(env.num_envs, dtype=torch.bool), []
+    for _ in range(steps):
+        td = policy(td)
+        actions.append((td[REGION].clone(), td[OFFSET].clone()))
+        td = env.step(td)["next"]
+        coverage = torch.where(running, td["info", "coverage"][:, 0], coverage)
+        running &= ~td["done"][:, 0]
+        if not running.any():
+            break
+    return coverage, actions
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_reaches_95_percent_on_small_mazes(name):
+    coverage, _ = play(make_env(8), name, 79)
+    assert (coverage >= 0.95).float().mean() >= 7 / 8  # a team may lose all its robots; none did in 128
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_env_by_env_the_same_in_any_batch_and_on_every_run(name):
+    _, small = play(make_env(2), name, 3)
+    _, large = play(make_env(5), name, 3)
+    _, again = play(make_env(2), name, 3)
+    for (region, offset), (region_l, offset_l), (region_a, offset_a) in zip(small, large, again, strict=True):
+        assert torch.equal(region, region_l[:2]) and torch.equal(offset, offset_l[:2])
+        assert torch.equal(region, region_a) and torch.equal(offset, offset_a)
+        assert region.dtype == torch.int64 and offset.dtype == torch.float32
+        assert region.min() >= 0 and region.max() < 64 and offset.abs().max() <= 1.0
+
+
+@pytest.mark.parametrize("name", ["random", "nearest_frontier"])
+def test_plain_dwa_and_limited_communication_and_one_robot(name):
+    for settings in (
+        {"planner": "dwa"},
+        {"comm": CommConfig(range=12.0)},
+        {"num_robots": 1},
+        {"num_robots": 2, "robot": [RobotConfig(), RobotConfig(kind="differential", collision_threshold=0.6)]},
+    ):
+        coverage, _ = play(make_env(2, **settings), name, 4)
+        assert (coverage > 0.1).all()
+
+
+def test_direct_controls_are_refused():
+    with pytest.raises(ValueError, match="planner=direct"):
+        POLICIES["voronoi"](make_env(1, planner="direct"))
+
+
+def test_random_draws_are_even_and_change_with_every_key():
+    env = make_env(64)
+    env.reset()
+    draw = keyed_uniform(env, 40)
+    assert draw.shape == (64, 3, 40) and draw.unique().numel() > 0.99 * draw.numel()
+    assert abs(draw.mean() - 0.5) < 0.01 and abs(draw.std() - 12**-0.5) < 0.01
+    for key in ("seed", "env_id", "episode", "macro_step"):
+        env.simulation.tensors[key] += 1
+        assert (keyed_uniform(env, 40) != draw).float().mean() > 0.95
+        env.simulation.tensors[key] -= 1
+    assert torch.equal(keyed_uniform(env, 40), draw)
+
+
+def test_navigation_shows_what_the_team_knows():
+    env = make_env(3)
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    for e in range(3):
+        shot = env.snapshot(e)
+        place = shot["map"]
+        side = int(round(place.extent[1][0] - place.extent[0][0])) + 1
+        known = np.zeros((side, side), np.uint8)
+        for points, seen, kind in (
+            (place.free, shot["seen_free"], FREE), (place.boundary, shot["seen_boundary"], OBSTACLE)
+        ):  # fmt: skip
+            cells = np.round(points[seen.any(axis=0)][:, :2] - np.array(place.extent[0])).astype(int)
+            known[cells[:, 1], cells[:, 0]] = kind
+        got = nav.known[e, 0].numpy()[: side * side].reshape(side, side)
+        np.testing.assert_array_equal(got, known)
+        want = frontier_cells(known == FREE, known == OBSTACLE)
+        np.testing.assert_array_equal(nav.frontier[e, 0].numpy()[: side * side].reshape(side, side) != 0, want)
+        assert nav.size[e, 0].sum() == want.sum() > 0
+        for cell in nav.target[e, 0][nav.target[e, 0] >= 0].tolist():
+            assert known.flat[cell] == FREE
+    assert (known == UNKNOWN).any()
+
+
+def test_travel_and_points_of_targets():
+    env = make_env(2, robot=RobotConfig(collision_threshold=0.1))  # nothing is tight: plain distances
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    travel = nav.travel()
+    for e in range(2):
+        w = int(nav.width[nav.state["map_id"][e]])
+        known = nav.known[e, 0].numpy()[: w * w].reshape(w, w)
+        for i in range(3):
+            x, y = np.floor(nav.centers()[e, i].numpy() + 0.5).astype(int)
+            want = geodesic_distance(known == FREE, [y * w + x]).ravel()
+            target = nav.target[e, 0]
+            for k in (target >= 0).nonzero().ravel().tolist():
+                far = want[target[k]]
+                assert travel[e, i, k] == (np.inf if far == UNREACHED else pytest.approx(far / 10))
+                point = nav.points(nav.target)[e, 0, k]
+                assert point.tolist() == [int(target[k]) % w, int(target[k]) // w]
+    assert travel.isfinite().any()
+
+
+def test_actions_mean_the_points_they_came_from():
+    env = make_env(3)
+    env.reset()
+    nav = Navigation(env)
+    points = keyed_uniform(env, 2) * 36.0
+    region, offset = nav.to_action(points)
+    td = env.reset()
+    td[REGION], td[OFFSET] = region, offset
+    env.step(td)
+    torch.testing.assert_close(env.simulation.tensors["goal"], points, atol=1e-4, rtol=0)
+    region, offset = nav.to_action(points + 1000.0)
+    assert (region == 63).all() and (offset == 1.0).all()
+
+
+def test_goals_under_dwa_are_in_sight_and_in_reach():
+    env = make_env(4, planner="dwa")
+    td = env.reset()
+    planner = FrontierPlanner(env, choose_nearest, ahead=4.0)
+    for _ in range(3):
+        td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
+        centers = planner.nav.centers().clone()
+        passable = planner.nav.passable.passable.numpy().copy()
+        td = env.step(td)["next"]
+        goal = env.simulation.tensors["goal"]
+        assert ((goal - centers).norm(dim=-1) <= 4.0 + 1e-3).float().mean() > 0.9
+        for e in range(4):
+            w = int(planner.nav.width[planner.nav.state["map_id"][e]])
+            for i in range(3):
+                a, b = centers[e, i].numpy(), goal[e, i].numpy()
+                line = a + np.linspace(0.2, 1.0, 20)[:, None] * (b - a)
+                cells = np.floor(line + 0.5).astype(int)
+                assert passable[e][cells[:, 1] * w + cells[:, 0]].mean() > 0.9
+
+
+class Places:
+    """Stands in for a `Navigation` where a choice needs only the robots' places."""
+
+    radar_range = 10.0
+
+    def __init__(self, at, ways=None):
+        self.at, self.ways = torch.tensor(at), ways
+
+    def centers(self):
+        return self.at
+
+    def cell_of_env(self):
+        return torch.ones(len(self.at))
+
+    def first_points(self, ahead: float):
+        return self.at.unsqueeze(2) + self.ways
+
+
+def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
+    travel = torch.tensor(travel)
+    points = torch.zeros(*travel.shape, 2) if points is None else torch.tensor(points)
+    size = torch.ones_like(travel) if size is None else torch.tensor(size)
+    alive = torch.ones(travel.shape[:2], dtype=torch.bool) if alive is None else torch.tensor(alive)
+    return Scene(travel, points, size, alive, nav or Places(np.zeros((*travel.shape[:2], 2), np.float32)))
+
+
+INF = float("inf")
+
+
+def test_voronoi_keeps_to_the_own_area_and_ignores_the_dead():
+    travel = [[[1.0, 5.0, 9.0], [2.0, 4.0, 3.0], [7.0, 8.0, 8.0]]]
+    assert choose_by_area(scene_of(travel)).tolist() == [[0, 2, 0]]
+    assert choose_by_area(scene_of(travel, alive=[[False, True, True]])).tolist()[0][1:] == [0, 0]
+
+
+def test_hungarian_takes_the_least_total_and_shares_none():
+    scene = scene_of([[[1.0, 2.0, INF], [1.5, 9.0, INF]], [[INF, 3.0, INF], [INF, 1.0, INF]]])
+    assert choose_by_assignment(scene).tolist() == [[1, 0], [1, 1]]
+
+
+def test_choices_in_turn_spread_the_team():
+    at = [[[0.0, 0.0], [2.0, 0.0], [30.0, 0.0]]]
+    points = [at[0], at[0]]
+    travel = [[[1.0, 1.0, 6.0], [1.0, 1.0, 6.0]]]
+    scene = scene_of(travel, points=[points])
+    gain = torch.tensor([[[1.0, 0.9, 0.8]] * 2])
+    assert choose_in_turn(scene, gain, scene.travel / 10.0).tolist() == [[0, 2]]  # 1 is in sight of 0
+
+
+def test_force_turns_toward_the_larger_pull_and_away_from_others():
+    ways = torch.tensor([[[[3.0, 0.0], [-3.0, 0.0]]] * 2])
+    travel, size = [[[5.0, 5.0], [5.0, 5.0]]], [[[4.0, 5.0], [4.0, 5.0]]]
+    alone = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [50.0, 0.0]]], ways))
+    assert choose_by_force(alone).tolist() == [[1, 1]]
+    close = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [-2.0, 0.0]]], ways))
+    assert choose_by_force(close).tolist() == [[0, 1]]
+    dead = scene_of(travel, size=size, alive=[[True, False]], nav=close.nav)
+    assert choose_by_force(dead).tolist()[0][0] == 1
+
+
+def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_left():
+    env = make_env(1, num_robots=1)
+    env.reset()
+    env.simulation.tensors["macro_step"].fill_(1)
+    planner = FrontierPlanner(env, choose_nearest)
+    planner.nav.update()
+    here = planner.nav.centers().unsqueeze(2)
+    travel = torch.full((1, 1, planner.nav.num_blocks), INF)
+    travel[..., :2] = torch.tensor([0.5, 20.0])
+    points = here.expand(-1, -1, planner.nav.num_blocks, -1).clone()
+    points[..., 1, :] += 20.0
+    kept = [planner._give_up(travel, points)[0, 0, :2].tolist() for _ in range(4)]
+    assert kept == [[0.5, 20.0], [0.5, 20.0], [INF, 20.0], [INF, 20.0]]
+    travel[..., 1] = INF
+    assert planner._give_up(travel, points)[0, 0, 0] == 0.5
