@@ -1,0 +1,102 @@
+"""What the documentation shows works: its Python blocks run, its diffs apply, its links lead somewhere."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict.nn import set_composite_lp_aggregate
+from tensordict.nn.probabilistic import composite_lp_aggregate
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.envs import SCENARIOS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md")) + [ROOT / "README.md"]
+SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
+"""The README shows sizes that people use; here they would take too long."""
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The fenced blocks of one language of a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+
+
+def run_block(code: str, page: str) -> dict:
+    """Run a block as a user would paste it; returns its names."""
+    names: dict = {"__name__": "docs"}
+    exec(compile(code, page, "exec"), names)
+    return names
+
+
+@pytest.fixture(autouse=True)
+def leave_no_trace():
+    """Blocks may add rows to tables, set TorchRL's global switch and draw numbers."""
+    kept = [(table, dict(table)) for table in (SCENARIOS, ALGORITHMS)]
+    with torch.random.fork_rng(devices=[]), set_composite_lp_aggregate(composite_lp_aggregate(nowarn=True)):
+        torch.manual_seed(0)
+        yield
+    for table, rows in kept:
+        table.clear()
+        table.update(rows)
+
+
+def test_readme():
+    (code,) = blocks("README.md", "python")
+    for large, small in SMALLER.items():
+        assert large in code
+        code = code.replace(large, small)
+    names = run_block(code, "README.md")
+    assert names["rollout"].shape == (2, 2)
+    assert names["rollout"]["agents", "action", "region"].shape == (2, 2, 3)
+
+
+def test_own_training_loop():
+    (code,) = blocks("docs/torchrl.md", "python")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+    names = run_block(code, "docs/torchrl.md")
+    assert names["batch"].shape == (4, 6) and names["log_prob"].numel() == 4 * 6
+    for value in names["log_prob"].values(True, True):
+        assert value.shape == (4, 6, 3)  # one per robot: not the joint action's
+    assert torch.isfinite(names["loss"])
+    moved = names["optimizer"].state
+    assert moved and all(state["step"] == 2 for state in moved.values())
+
+
+def test_own_scenario():
+    names = run_block(blocks("docs/extending.md", "python")[0], "docs/extending.md")
+    assert names["env"].maps[0].name == "ring_3"
+    assert torch.isfinite(names["env"].rollout(1)["next", "agents", "reward"]).all()
+
+
+def test_own_planner():
+    names = run_block(blocks("docs/extending.md", "python")[1], "docs/extending.md")
+    assert names["coverage"]["n"] == 2 and 0.1 < names["coverage"]["mean"] <= 1.0
+
+
+def test_own_algorithm():
+    names = run_block(blocks("docs/extending.md", "python")[2], "docs/extending.md")
+    assert not names["loss"].team_value and names["logged"]["gradient_norm"] > 0
+
+
+def test_every_block_of_extending_is_tested():
+    assert len(blocks("docs/extending.md", "python")) == 3
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is absent: diffs are not checked")
+@pytest.mark.parametrize("number", range(3))
+def test_diffs_apply(number):
+    patches = blocks("docs/extending.md", "diff")
+    assert len(patches) == 3
+    done = subprocess.run(
+        ["git", "apply", "--check", "-"], input=patches[number], text=True, capture_output=True, cwd=ROOT
+    )
+    assert done.returncode == 0, f"write this diff of docs/extending.md anew:\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
+        assert link.startswith("https://") or (page.parent / link).exists(), link
