@@ -250,3 +250,20 @@ def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_le
     assert kept == [[0.5, 20.0], [0.5, 20.0], [INF, 20.0], [INF, 20.0]]
     travel[..., 1] = INF
     assert planner._give_up(travel, points)[0, 0, 0] == 0.5
+
+
+def test_wavefront_holds_nothing_that_a_saved_state_lacks():
+    """Paths live in scratch: an env that takes up a saved state drives on bit for bit, as under plain DWA."""
+    env, other = make_env(3), make_env(3)
+    policy, resumed = POLICIES["random"](env), POLICIES["random"](other)
+    td = env.reset()
+    for _ in range(3):
+        td = env.step(policy(td))["next"]
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    td_other = td.clone()
+    for _ in range(3):
+        td, td_other = env.step(policy(td))["next"], other.step(resumed(td_other))["next"]
+        for name in ("pose", "target", "seen_free"):
+            assert torch.equal(env.simulation.tensors[name], other.simulation.tensors[name])
+    assert (env.simulation.tensors["pose"][..., 2] != 0).any()
