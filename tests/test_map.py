@@ -6,6 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
+
 from maexp.envs.map import MapError, PointCloudMap
 
 
