@@ -133,7 +133,10 @@ def test_units_axes_strays_and_invalid_points(tmp_path):
     assert_room(import_map(write_ply(tmp_path / "up.ply", y_up), up="y"))
     random = np.random.default_rng(1)
     strays = random.uniform(-40, 40, size=(30, 3))
-    assert_room(import_map(write_ply(tmp_path / "stray.ply", np.concatenate([points, strays]))))
+    world, report = import_map_with_report(write_ply(tmp_path / "stray.ply", np.concatenate([points, strays])))
+    assert_room(world)
+    step = next(step for step in report.steps if step.name == "outliers")
+    assert 28 <= step.before - step.after <= 60
     broken = points.copy()
     broken[:5] = np.nan
     broken[5] = np.inf
@@ -180,6 +183,15 @@ def test_a_flat_cloud_is_a_plan(tmp_path, degrees):
     assert [holds(world, place) for place in inside] == [True, True, False]
 
 
+def test_free_space_is_not_inferred_outside(tmp_path):
+    """A house door stands open, and a wall stands 5 m from the house: between them nothing encloses."""
+    points = floor_plan()
+    points = points[~((points[:, 0] > 9.5) & (np.abs(points[:, 1] - 3) < 0.7))]
+    fence = np.stack([np.full(61, 15.0), np.arange(61) / 10, np.full(61, 1.5)], axis=1)
+    world = import_map(write_pcd(tmp_path / "plan.pcd", np.concatenate([points, fence])))
+    assert world.free_area < 70 and not holds(world, (13.0, 0.5)) and not holds(world, (13.0, 5.5))
+
+
 def terrain(spacing=0.9):
     """A slope of 60 x 50 m, a house and a tree on it, far from the origin; one return 500 m up."""
     random = np.random.default_rng(3)
@@ -196,6 +208,8 @@ def test_an_airborne_scan(tmp_path):
     world, report = import_map_with_report(write_xyz(tmp_path / "x.xyz", terrain()))
     assert world.scenario == "outdoor" and check_map(world).ok
     assert 0.9 * 11_760 < world.free_area < 12_100
+    standing = next(step.after for step in report.steps if step.name == "terrain")
+    assert standing == pytest.approx(240 / 0.9**2, rel=0.15), "the house stands on the slope, and nothing else"
     low = world.free[:, :2].min(axis=0)
     assert not holds(world, low + (56, 50)) and holds(world, low + (20, 50)) and holds(world, low + (100, 50))
     assert np.abs(world.free).max() < 1000, "moved to the origin"
@@ -272,6 +286,12 @@ def test_broken_clouds_are_refused(tmp_path):
         "half.ply": write_ply(tmp_path / "a.ply", points).read_bytes()[:5000],
         "ascii.pcd": write_pcd(tmp_path / "b.pcd", points).read_bytes()[:5000],
         "empty.pcd": write_pcd(tmp_path / "c.pcd", points[:0]).read_bytes(),
+        "more.pcd": write_pcd(tmp_path / "d.pcd", points)
+        .read_bytes()
+        .replace(b"%d\n" % len(points), b"%d\n" % (len(points) + 50)),
+        "words.pcd": write_pcd(tmp_path / "e.pcd", points).read_bytes().replace(b"0.", b"x.", 40),
+        "more.ply": b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\n"
+        b"property float z\nend_header\n" + b"1.0 2.0 3.0\n" * 8,
         "few.xyz": b"1 2 3\n4 5 6\n",
         "words.xyz": b"one two three\n",
         "two.xyz": b"1 2\n3 4\n",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +62,15 @@ def read_pcd(path: Path) -> Cloud:
     elif kind not in ("ascii", "binary"):
         raise MapError(f"{path}: PCD data is {kind!r}; ascii, binary and binary_compressed are read")
     _check_promise(path, promised, 2 * sum(counts) if kind == "ascii" else stride, rest, kind == "binary_compressed")
+    if kind == "ascii":  # Open3D takes missing and unreadable numbers for zeros
+        starts = np.cumsum([0, *counts])
+        with path.open("rb") as file:
+            file.seek(start)
+            text = file.read().decode("ascii", errors="replace")
+        points = _parse_numbers(path, text, [int(starts[fields.index(axis)]) for axis in "xyz"])
+        if len(points) != promised:
+            raise MapError(f"{path} promises {promised} points and holds {len(points)}; save it again")
+        return Cloud(points)
     return Cloud(_read_with_open3d(path, promised))
 
 
@@ -107,14 +117,20 @@ def read_xyz(path: Path) -> Cloud:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise MapError(f"{path} is not text; save it as lines of x y z") from error
-    rows = text.replace(",", " ").replace(";", " ").splitlines()
-    try:
-        points = np.loadtxt(rows, usecols=(0, 1, 2), ndmin=2, dtype=np.float64)
-    except (ValueError, IndexError) as error:
-        raise MapError(f"{path}: {error}; every line must hold x y z") from error
+    points = _parse_numbers(path, text.replace(",", " ").replace(";", " "), [0, 1, 2])
     if len(points) == 0:
         raise MapError(f"{path} holds 0 points; give a cloud with at least a few hundred")
     return Cloud(points)
+
+
+def _parse_numbers(path: Path, text: str, columns: list[int]) -> np.ndarray:
+    """Three columns of a table of numbers, float64 [rows, 3]."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty table is the caller's to refuse
+            return np.loadtxt(text.splitlines(), usecols=columns, ndmin=2, dtype=np.float64)
+    except (ValueError, IndexError) as error:
+        raise MapError(f"{path}: {error}; every line must hold the numbers of one point") from error
 
 
 def _read_header(path: Path, last: bytes) -> tuple[list[str], int]:
