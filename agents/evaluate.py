@@ -57,7 +57,7 @@ def evaluate(
             count = min(env.num_envs, episodes - first)
             finals.append(play(policy, env, numbers.clamp(max=episodes - 1))[:count])
             advance(count)
-    metrics = episode_metrics(torch.cat(finals), env.local_steps * env.macro_steps)
+    metrics = episode_metrics(torch.cat(finals), env.local_steps * env.macro_steps, env.success_coverage)
     return EvaluationResult(name, env.num_robots, metrics, time.perf_counter() - begin)
 
 

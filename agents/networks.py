@@ -1,6 +1,6 @@
 """The Multi-Agent Target Generator: Spatial-TeamFormer and the two heads that choose a goal.
 
-After the paper's section III-D and the Spatial-TeamFormer of MAANS (Yu et al. 2022). One set of weights
+After the paper's section IV-D and the Spatial-TeamFormer of MAANS (Yu et al. 2022). One set of weights
 serves a team of any size, and permuting the robots permutes the output.
 """
 

@@ -35,6 +35,9 @@ from maexp.kernels.state import STATE
 from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
 
 DEFAULT_MACRO_STEPS_MIN = 10
+EVALUATION = 2**30
+"""Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
+
 SWEEPS = 2.0
 """A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -94,7 +97,8 @@ class ExplorationEnv(EnvBase):
         self.num_envs, self.num_robots = num_envs, num_robots
         self.scenario = scenario
         self.local_steps = _count("local_steps", scenario.local_steps if local_steps is None else local_steps)
-        macro_steps = macro_steps or scenario.macro_steps or default_macro_steps(maps, scenario)
+        if macro_steps is None:
+            macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario)
         self.macro_steps = _count("macro_steps", macro_steps)
         if collision not in ("centre", "footprint"):
             raise ValueError(f"collision={collision!r} is unknown: choose centre or footprint")
@@ -248,7 +252,7 @@ class ExplorationEnv(EnvBase):
     def set_episodes(self, ids: torch.Tensor) -> None:
         """Let env i play evaluation episode ``ids[i]`` at the next reset: map and starts from (seed, id) alone."""
         self.simulation.tensors["env_id"].copy_(ids)
-        self.simulation.tensors["episode"].fill_(-1)
+        self.simulation.tensors["episode"].fill_(EVALUATION - 1)
 
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""

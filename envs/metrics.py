@@ -7,13 +7,16 @@ from tensordict import TensorDictBase
 RESAMPLES = 5000
 
 
-def episode_metrics(final: TensorDictBase, limit: int | None = None) -> dict[str, np.ndarray]:
+def episode_metrics(
+    final: TensorDictBase, limit: int | None = None, success_coverage: float = 0.95
+) -> dict[str, np.ndarray]:
     """Metrics of episodes from ``info`` [episodes] at their last step.
 
     Args:
         final: entries of shape [episodes, 1] and [episodes, N] (`envs.specs`).
         limit: local steps after which an episode is truncated; adds ``*_censored``, which counts episodes
             that never reached a coverage with this number instead of leaving them out.
+        success_coverage: coverage that makes an episode a success.
 
     Returns:
         float64 [episodes] per metric; NaN where an episode has no value (a coverage it never reached).
@@ -25,7 +28,7 @@ def episode_metrics(final: TensorDictBase, limit: int | None = None) -> dict[str
         "exploration_ratio": info["coverage"][:, 0],
         "reward_variance": info["episode_reward_raw"].std(axis=1),
         "reward_variance_scaled": info["episode_reward"].std(axis=1),
-        "success_rate": (info["coverage_step_95"][:, 0] >= 0).astype(np.float64),
+        "success_rate": (info["coverage"][:, 0] >= np.float32(success_coverage)).astype(np.float64),
         "collisions": info["collided"].sum(axis=1),
         "path_length": info["path_length"].mean(axis=1),
     }

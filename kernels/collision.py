@@ -44,9 +44,10 @@ def _detect_collisions(
     footprint: int,
     # State in:
     active: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
     # State in and out:
+    pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
     collided: wp.array2d(dtype=wp.int32),
     # Out:
     crashed: wp.array2d(dtype=wp.int32),
@@ -75,3 +76,6 @@ def _detect_collisions(
     if hit:
         crashed[e, i] = 1
         collided[e, i] = 1
+        # It stops where it is. Other robots' tests read its place and heading, which stay.
+        pose[e, i] = wp.vec4(pose[e, i][0], pose[e, i][1], 0.0, theta)
+        slip[e, i] = 0.0

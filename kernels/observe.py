@@ -147,16 +147,17 @@ def _draw_robots(
     # State in:
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    comm: wp.array3d(dtype=wp.bool),
     local_step: wp.array(dtype=wp.int32),
     track: wp.array3d(dtype=wp.int32),
     # Out:
     picture: wp.array4d(dtype=wp.uint8),
 ):
-    """Draw bodies (own 255, others 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
+    """Draw bodies (own 255, others it hears 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
     e, i = wp.tid()
     m = map_id[e]
     for other in range(pose.shape[1]):
-        if other != i:
+        if other != i and comm[e, i, other]:
             draw_body(
                 maps, m, e, i, point_xy(center[e, other]), pose[e, other][3],
                 robots.length[e, other], robots.width[e, other], OTHER, picture,

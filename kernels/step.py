@@ -104,7 +104,8 @@ class Shard:
         )  # fmt: skip
         launch(
             collision._detect_collisions, self.shape,
-            [maps, s.map_id, self.robots, int(cfg.footprint), s.active, s.pose, s.center], [s.collided, s.crashed],
+            [maps, s.map_id, self.robots, int(cfg.footprint), s.active, s.center],
+            [s.pose, s.slip, s.collided, s.crashed],
         )  # fmt: skip
 
     def scan(self, launch: Callable, running: wp.array) -> None:
@@ -231,7 +232,7 @@ class Shard:
         )  # fmt: skip
         draw(
             observe._draw_robots, dim=self.shape,
-            inputs=[maps, s.map_id, self.robots, s.pose, s.center, s.local_step, s.track], outputs=[out[0]],
+            inputs=[maps, s.map_id, self.robots, s.pose, s.center, s.comm, s.local_step, s.track], outputs=[out[0]],
         )  # fmt: skip
         draw(
             observe._observe_pose, dim=self.shape,

@@ -138,6 +138,10 @@ def test_evaluation_episodes_depend_on_their_number_alone(maps):
     a, b = large.reset(), small.reset()
     assert equal(a[[1, 3]], b)
     assert torch.equal(large.simulation.tensors["map_id"][[1, 3]], small.simulation.tensors["map_id"])
+    large.set_episodes(torch.arange(4))
+    pose = ("agents", "observation", "pose")
+    training = ExplorationEnv(maps, num_envs=4, seed=5).reset()
+    assert not torch.equal(large.reset()[pose][0], training[pose][0]), "training must not meet the evaluation's starts"
 
 
 def test_state_continues_bit_for_bit(maps):
@@ -230,6 +234,7 @@ def test_collided_robots_stay_and_pay_once():
         td = step_mdp(out)
         td["agents", "action", "control"] = torch.tensor([1.0, 0.0]).expand(8, 2, 2).clone()
     assert hit.any()
+    assert (env.simulation.tensors["pose"][..., 2][hit] == 0).all()
     torch.testing.assert_close(paid, hit.float() * -200.0 * 60.0 / 7000.0)
 
 
@@ -262,6 +267,7 @@ def test_bad_actions(maps):
         (dict(comm=CommConfig(range=-1.0)), "comm.range=-1.0"),
         (dict(num_envs=10**7), "lower num_envs"),
         (dict(maps=[]), "maps=\\[\\]"),
+        (dict(macro_steps=0), "macro_steps=0"),
     ],
 )
 def test_bad_settings_are_named(maps, settings, words):
@@ -285,6 +291,8 @@ def test_limited_communication(maps):
     explored = b["agents", "observation", "map"][:, :, :, 0]
     assert torch.equal(explored[:, :, 0], explored[:, :, 2])
     assert torch.equal(explored[:, :, 0], b["team", "map"][:, :, 0])
+    assert not (a["agents", "observation", "map"][:, :, :, 2] == 128).any(), "an unheard robot must not be drawn"
+    assert (b["agents", "observation", "map"][:, :, :, 2] == 128).any()
     alone = a["agents", "observation", "map"][:, :, :, 0]
     assert not torch.equal(alone[:, :, 0], alone[:, :, 2])
 
