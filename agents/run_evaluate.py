@@ -16,7 +16,7 @@ from maexp.agents.overrides import find_override, without
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, write_results
-from maexp.agents.train import load_matching, write_config
+from maexp.agents.train import check_action, load_matching, write_config
 
 PICTURES = 4
 TRAINING_ONLY = (
@@ -76,8 +76,10 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
 
 def load_policy(cfg: Any, env: Any) -> Any:
     """The policy of a checkpoint; its weights fit any team size."""
+    saved = find_checkpoint(cfg.checkpoint)[1]
+    check_action(saved, cfg)
     policy = make_policy(env, model_settings(cfg))
-    load_matching(policy, find_checkpoint(cfg.checkpoint)[1]["policy"])
+    load_matching(policy, saved["policy"])
     return policy
 
 

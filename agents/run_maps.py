@@ -38,6 +38,10 @@ def check(cfg: Any) -> None:
         raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
     if cfg.out and cfg.action != "show" and Path(cfg.out).suffix != ".npz":
         raise UserError(f"out={cfg.out} must end in .npz.")
+    if cfg.out and cfg.action == "show" and Path(cfg.out).suffix != ".png":
+        raise UserError(f"out={cfg.out} must end in .png.")
+    if cfg.out and not Path(cfg.out).parent.is_dir():
+        raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
 
 
 def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:

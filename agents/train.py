@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from maexp.agents.build import Learner, MapSuite, load_maps, make_env, make_learner
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.collect import Stopwatch, TeamCollector, batch_statistics, make_collector
+from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
 from maexp.agents.logs import MetricsLog
@@ -122,6 +123,7 @@ class TrainingRun:
 
     def restore(self, saved: dict) -> None:
         """Go on where `save` was called."""
+        check_action(saved, self.cfg)
         load_matching(self.learner.policy, saved["policy"])
         self.collector.load_state_dict(saved["collector"])
         self.learner.updater.load_state_dict(saved["updater"])
@@ -166,6 +168,20 @@ class TrainingRun:
             | row
             | {f"time_{name}": round(seconds, 4) for name, seconds in times.items()}
             | {"frames_per_second": round(self.batch_frames / spent, 2), "seconds": round(self.seconds, 3)}
+        )
+
+
+def check_action(saved: dict, cfg: Any) -> None:
+    """Refuse weights trained for the other kind of action: goals and controls have tensors of the same shapes.
+
+    Raises:
+        UserError: one of the two planners is `direct`, the other not.
+    """
+    trained = compose_config("train", saved["overrides"]).planner.name
+    if (trained == "direct") != (cfg.planner.name == "direct"):
+        raise UserError(
+            f"The checkpoint was trained with planner={trained} and planner={cfg.planner.name} takes another action: "
+            f"leave planner={cfg.planner.name} out, or train a policy with it."
         )
 
 

@@ -92,6 +92,11 @@ class ExplorationEnv(EnvBase):
         if not maps:
             raise ValueError("maps=[] is empty: give at least one map")
         num_envs, num_robots = _count("num_envs", num_envs), _count("num_robots", num_robots)
+        for m in maps:
+            if not isinstance(m, PointCloudMap):
+                raise ValueError(f"maps holds {m!r}: give PointCloudMaps, from make_map or import_map")
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
+            raise ValueError(f"seed={seed!r} must be a whole number")
         scenario = find_scenario(maps[0].scenario)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.num_robots = num_envs, num_robots

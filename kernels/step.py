@@ -325,5 +325,7 @@ def maps_struct(tensors: dict[str, torch.Tensor]) -> Maps:
             kind = wp.int32
         else:
             kind = {1: wp.float32, 2: {2: wp.vec2, 3: wp.vec3}.get(tensor.shape[-1])}[tensor.dim()]
+        if not tensor.numel():  # a map without obstacles: empty arrays may come with strides that Warp refuses
+            tensor = tensor.new_zeros(tensor.shape)
         setattr(maps, name, wp.from_torch(tensor, dtype=kind))
     return maps

@@ -87,6 +87,8 @@ BAD = {
     "no action": (["maps"], "list, make"),
     "a scenario to make": (["maps", "make", "labyrinth"], "maze_small"),
     "a file to check": (["maps", "check", "gone.npz"], "gone.npz"),
+    "a folder for a map": (["maps", "make", "maze_small", "out=gone/m.npz"], "make gone first"),
+    "a picture's name": (["maps", "show", "maze_small", "out=m.txt"], ".png"),
     "a word too many": (["maps", "check", "a.npz", "b.npz"], "b.npz"),
 }
 

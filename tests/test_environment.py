@@ -267,6 +267,8 @@ def test_bad_actions(maps):
         (dict(comm=CommConfig(range=-1.0)), "comm.range=-1.0"),
         (dict(num_envs=10**7), "lower num_envs"),
         (dict(maps=[]), "maps=\\[\\]"),
+        (dict(maps=["maze"]), "maze"),
+        (dict(seed="x"), "seed='x'"),
         (dict(macro_steps=0), "macro_steps=0"),
     ],
 )
@@ -354,3 +356,14 @@ def test_step_hook_sees_every_local_step(maps):
     env.set_step_hook(None)
     env.rollout(1)
     assert len(seen) == 7
+
+
+def test_an_open_field_without_obstacles():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0), indexing="ij")
+    free = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1)
+    field = PointCloudMap(free, np.zeros((0, 3)), 1.0, name="field")
+    for planner in ("dwa", "wavefront"):
+        env = ExplorationEnv([field], num_envs=2, local_steps=5, planner=PlannerConfig(name=planner))
+        td = env.rollout(2)
+        assert bool((td["next", "info", "coverage"] > 0).all())
+        assert not bool(td["next", "agents", "observation", "map"][..., 1, :, :].any())

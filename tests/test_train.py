@@ -121,6 +121,10 @@ def test_a_checkpoint_of_another_network_is_refused(capsys):
     assert main(["evaluate", f"checkpoint={folder}", "model.channels=4", "episodes=1", "hydra.run.dir=e"]) == 2
     assert "another network" in capsys.readouterr().err
     assert not Path("e").exists()
+    for words in (["evaluate", f"checkpoint={folder}", "hydra.run.dir=e"], ["train", f"resume={folder}"]):
+        assert main([*words, "planner=direct", "episodes=1"]) == 2  # its tensors have the same shapes
+        assert "planner=direct" in capsys.readouterr().err
+    assert not Path("e").exists()
     assert main(["train", f"resume={folder}", "num_robots=3"]) == 2
     assert "num_robots" in capsys.readouterr().err
 
