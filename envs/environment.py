@@ -97,6 +97,12 @@ class ExplorationEnv(EnvBase):
                 raise ValueError(f"maps holds {m!r}: give PointCloudMaps, from make_map or import_map")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
             raise ValueError(f"seed={seed!r} must be a whole number")
+        fewest = min(maps, key=lambda m: len(m.free))
+        if num_robots > len(fewest.free):
+            raise MapError(
+                f"map {fewest.name} has {len(fewest.free)} free points and no room for num_robots={num_robots}: "
+                "use fewer robots or a larger map"
+            )
         scenario = find_scenario(maps[0].scenario)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.num_robots = num_envs, num_robots

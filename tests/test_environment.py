@@ -270,6 +270,7 @@ def test_bad_actions(maps):
         (dict(maps=["maze"]), "maze"),
         (dict(seed="x"), "seed='x'"),
         (dict(macro_steps=0), "macro_steps=0"),
+        (dict(num_robots=10**9), "num_robots=1000000000"),
     ],
 )
 def test_bad_settings_are_named(maps, settings, words):
