@@ -24,9 +24,11 @@ from maexp.kernels.assignment import FORBIDDEN, assign_targets
 
 DWELL = 3  # decisions beside a target that does not go away before it is given up
 REGION_COUNT = 64
-BETA = 1.0  # cost_utility: one radar range of travel is worth this share of a disc full of unknown cells
+BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
+LEAST_GAIN = 0.5  # targets with a smaller share of unknown cells around them wait until no others are left
 RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
+DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
 REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
 
 
@@ -38,6 +40,7 @@ class Scene:
         travel: float32 [E, N, K], way from robot to target [m].
         points: float32 [E, N, K, 2], where the targets are [m].
         size: float32 [E, N, K], frontier cells behind each.
+        gain: float32 [E, N, K], share of unknown cells within radar range of each, in [0, 1].
         alive: bool [E, N], robots that still move.
         nav: the env's grids.
     """
@@ -45,18 +48,13 @@ class Scene:
     travel: torch.Tensor
     points: torch.Tensor
     size: torch.Tensor
+    gain: torch.Tensor
     alive: torch.Tensor
     nav: Navigation
 
     def spread(self, per_row: torch.Tensor) -> torch.Tensor:
         """[E, R, K] of what is known -> [E, N, K] of the robots."""
         return per_row.expand(-1, self.travel.shape[1], -1)
-
-    def gain(self) -> torch.Tensor:
-        """Share of unknown cells in radar range of each target: float32 [E, N, K] in [0, 1]."""
-        nav = self.nav
-        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        return self.spread(nav.count_unknown(nav.radar_range)) / disc.view(-1, 1, 1)
 
 
 def choose_nearest(scene: Scene) -> torch.Tensor:
@@ -86,7 +84,7 @@ def choose_in_turn(scene: Scene, gain: torch.Tensor, cost: torch.Tensor) -> torc
 
 def choose_by_utility(scene: Scene) -> torch.Tensor:
     """Unknown area around the target against the way there."""
-    return choose_in_turn(scene, scene.gain(), BETA * scene.travel / scene.nav.radar_range)
+    return choose_in_turn(scene, scene.gain, BETA * scene.travel / scene.nav.radar_range)
 
 
 def choose_by_tree(scene: Scene) -> torch.Tensor:
@@ -95,7 +93,7 @@ def choose_by_tree(scene: Scene) -> torch.Tensor:
     found = scene.spread(nav.grow_trees(RRT_SAMPLES, 0.5 * nav.radar_range)) & scene.travel.isfinite()
     found = found | ~found.any(-1, keepdim=True)  # no tree of the team found any: all frontiers count
     near = (scene.points - nav.centers().unsqueeze(2)).norm(dim=-1) <= nav.radar_range
-    gain = scene.gain() * torch.where(near, RRT_HYSTERESIS, 1.0)
+    gain = scene.gain * torch.where(near, RRT_HYSTERESIS, 1.0)
     cost = torch.where(found, BETA * scene.travel / nav.radar_range, torch.inf)
     return choose_in_turn(scene, gain, cost)
 
@@ -121,15 +119,14 @@ def choose_by_assignment(scene: Scene) -> torch.Tensor:
 def choose_by_force(scene: Scene) -> torch.Tensor:
     """The target whose way starts off closest to the force: pulls along the ways, pushes between robots.
 
-    A target pulls with its frontier cells over its way squared, the gradient of the multi-target potential
-    -size / way of MMPF (Yu et al. 2021), which takes geodesic ways in place of straight lines.
+    As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
     """
     nav = scene.nav
     at = nav.centers()
     ways = nav.first_points(3.0) - at.unsqueeze(2)
     ways = ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     cell = nav.cell_of_env().view(-1, 1, 1)
-    pull = torch.where(scene.travel.isfinite(), scene.size / (scene.travel / cell).clamp_min(1.0) ** 2, 0.0)
+    pull = torch.where(scene.travel.isfinite(), scene.size / (scene.travel / cell).clamp_min(1.0) ** DECAY, 0.0)
     force = (pull.unsqueeze(-1) * ways).sum(2)
     apart = at.unsqueeze(2) - at.unsqueeze(1)
     gap = apart.norm(dim=-1, keepdim=True).clamp_min(1e-6)
@@ -170,10 +167,13 @@ class FrontierPlanner:
         cells = nav.target.expand(-1, self.env.num_robots, -1)
         points = nav.points(cells.clamp_min(0))
         travel = self._give_up(nav.travel(), points)
+        gain = self._gain()
+        travel = _prefer(travel, gain >= LEAST_GAIN)
         scene = Scene(
             travel=travel,
             points=points,
             size=nav.size.expand(-1, self.env.num_robots, -1).float(),
+            gain=gain,
             alive=nav.alive(),
             nav=nav,
         )
@@ -186,6 +186,13 @@ class FrontierPlanner:
         else:
             goal = nav.waypoints(goal_cell, elsewhere, self.reach)
         return nav.to_action(goal)
+
+    def _gain(self) -> torch.Tensor:
+        """Share of unknown cells in radar range of every target: float32 [E, N, K]."""
+        nav = self.nav
+        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
+        gain = nav.count_unknown(nav.radar_range) / disc.view(-1, 1, 1)
+        return gain.expand(-1, self.env.num_robots, -1)
 
     def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Drop targets that robots stood beside in vain: what is unknown there cannot be seen from there."""
@@ -224,6 +231,12 @@ def _mix(x: torch.Tensor) -> torch.Tensor:
     x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * (0xBF58476D1CE4E5B9 - (1 << 64))
     x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * (0x94D049BB133111EB - (1 << 64))
     return x ^ ((x >> 31) & ((1 << 33) - 1))
+
+
+def _prefer(travel: torch.Tensor, worth: torch.Tensor) -> torch.Tensor:
+    """`travel` without the targets that are not `worth` it, for robots that can get to one that is."""
+    kept = travel.masked_fill(~worth, torch.inf)
+    return torch.where(kept.isfinite().any(-1, keepdim=True), kept, travel)
 
 
 class RandomPolicy:

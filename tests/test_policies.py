@@ -10,6 +10,7 @@ from maexp.agents.policies import (
     POLICIES,
     FrontierPlanner,
     Scene,
+    _prefer,
     choose_by_area,
     choose_by_assignment,
     choose_by_force,
@@ -198,10 +199,17 @@ def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
     points = torch.zeros(*travel.shape, 2) if points is None else torch.tensor(points)
     size = torch.ones_like(travel) if size is None else torch.tensor(size)
     alive = torch.ones(travel.shape[:2], dtype=torch.bool) if alive is None else torch.tensor(alive)
-    return Scene(travel, points, size, alive, nav or Places(np.zeros((*travel.shape[:2], 2), np.float32)))
+    gain = torch.ones_like(travel)
+    return Scene(travel, points, size, gain, alive, nav or Places(np.zeros((*travel.shape[:2], 2), np.float32)))
 
 
 INF = float("inf")
+
+
+def test_targets_with_little_to_see_wait():
+    travel = torch.tensor([[[1.0, 2.0, INF], [1.0, INF, INF]]])
+    worth = torch.tensor([[[False, True, True]] * 2])
+    assert _prefer(travel, worth).tolist() == [[[INF, 2.0, INF], [1.0, INF, INF]]]
 
 
 def test_voronoi_keeps_to_the_own_area_and_ignores_the_dead():
