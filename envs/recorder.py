@@ -6,7 +6,7 @@ DT = 0.1  # seconds in a local step (design 1)
 
 
 class CoverageRecorder:
-    """Records the coverage of every team while the env is used in the ``with`` block.
+    """Records the coverage of every team while the env is used in the ``with`` block::
 
         with CoverageRecorder(env, every=5) as recorder:
             evaluate(policy, env, episodes)

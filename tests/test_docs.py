@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.envs import SCENARIOS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted((ROOT / "docs").glob("*.md")) + [ROOT / "README.md"]
+PAGES = sorted((ROOT / "docs").rglob("*.md")) + [ROOT / "README.md"]
 SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
 """The README shows sizes that people use; here they would take too long."""
 
@@ -100,3 +101,13 @@ def test_diffs_apply(number):
 def test_links_lead_somewhere(page):
     for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
         assert link.startswith("https://") or (page.parent / link).exists(), link
+
+
+def test_the_pages_build_without_a_warning(tmp_path):
+    """Sphinx, warnings as errors: broken references, pages nobody links to, docstrings that are no markup."""
+    pytest.importorskip("sphinx", reason="Sphinx is absent: pip install -e '.[docs]'")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "docs", str(tmp_path / "html")]
+    done = subprocess.run(command, text=True, capture_output=True, cwd=ROOT, timeout=300)
+    assert done.returncode == 0, done.stderr
+    reference = (tmp_path / "html" / "api" / "envs.html").read_text()
+    assert "maexp.envs.ExplorationEnv" in reference and "num_envs" in reference

@@ -1,0 +1,30 @@
+"""Sphinx: the pages of this folder and the reference from docstrings. Build: sphinx-build -W docs docs/_build."""
+
+from importlib import metadata
+
+project = "MAexp"
+release = metadata.version("maexp")
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"MAexp {release}"
+myst_heading_anchors = 3
+suppress_warnings = ["myst.header"]  # pages may start below a shared heading
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True}
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+napoleon_custom_sections = [(name, "params_style") for name in ("Robot and map", "Clouds and meshes", "Cleaning")]
+python_use_unqualified_type_names = True
+
+
+def escape(app, what, name, obj, options, lines):
+    """Shapes as [*, robots] and |free| mean themselves in our docstrings, not emphasis and substitution."""
+    lines[:] = [line.replace("[*,", r"[\*,").replace("|free|", r"\|free\|") for line in lines]
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", escape)
