@@ -7,12 +7,15 @@ from torchrl.modules import PopArtValueNorm
 from maexp.agents import losses
 from maexp.agents.critics import build_critic
 from maexp.agents.model import ModelConfig
+from maexp.agents.ranges import check_ranges, choice, flag, number, whole
 from maexp.agents.updaters import GradientUpdater, TrustRegionUpdater, Updater
 
 
 @dataclass(frozen=True)
 class Settings:
     """Settings that all algorithms share. A team step is one macro step of one team.
+
+    ValueError where one is out of its range (all subclasses).
 
     Attributes:
         gamma: discount per macro step
@@ -28,17 +31,20 @@ class Settings:
         max_grad_norm: bound on the gradient of the policy, and on the critic's
     """
 
-    gamma: float = 0.99
-    lmbda: float = 0.95
-    lr: float = 7e-4
-    critic_lr: float = 1e-3
-    final_lr_share: float = 1.0
-    entropy_coeff: float = 3e-3
-    critic_coeff: float = 1.0
-    value_norm: bool = True
-    normalize_advantage: bool = True
-    minibatch_size: int = 128
-    max_grad_norm: float = 1.0
+    gamma: float = number(0.99, high=1.0)
+    lmbda: float = number(0.95, high=1.0)
+    lr: float = number(7e-4, open_ends=True)
+    critic_lr: float = number(1e-3, open_ends=True)
+    final_lr_share: float = number(1.0, high=1.0)
+    entropy_coeff: float = number(3e-3)
+    critic_coeff: float = number(1.0)
+    value_norm: bool = flag(True)
+    normalize_advantage: bool = flag(True)
+    minibatch_size: int = whole(128)
+    max_grad_norm: float = number(1.0, open_ends=True)
+
+    def __post_init__(self):
+        check_ranges(self, "algorithm")
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings."""
@@ -58,11 +64,11 @@ class ClippedSettings(Settings):
         kl_target: divergence at which that weight stays
     """
 
-    epochs: int = 3
-    clip_epsilon: float = 0.2
-    clip_value: float = 0.0
-    kl_coeff: float = 0.0
-    kl_target: float = 0.01
+    epochs: int = whole(3)
+    clip_epsilon: float = number(0.2, high=1.0, open_ends=True)
+    clip_value: float = number(0.0)
+    kl_coeff: float = number(0.0)
+    kl_target: float = number(0.01, open_ends=True)
 
     def loss_arguments(self) -> dict:
         names = ("clip_epsilon", "kl_coeff", "kl_target")
@@ -74,7 +80,7 @@ class ClippedSettings(Settings):
 class MixedClippedSettings(ClippedSettings):
     """ClippedSettings and the `mixer` that makes the team's value: vdn or qmix."""
 
-    mixer: str = "qmix"
+    mixer: str = choice("qmix", "vdn")
 
 
 @dataclass(frozen=True)
@@ -93,15 +99,15 @@ class TrustRegionSettings(Settings):
         critic_epochs: passes of the critic over each batch
     """
 
-    max_kl: float = 0.03
-    accept_ratio: float = 0.1
-    damping: float = 0.1
-    cg_steps: int = 10
-    backtracks: int = 15
-    backtrack_factor: float = 0.8
-    policy_minibatch_size: int = 512
-    fisher_size: int = 128
-    critic_epochs: int = 3
+    max_kl: float = number(0.03, open_ends=True)
+    accept_ratio: float = number(0.1, high=1.0)
+    damping: float = number(0.1)
+    cg_steps: int = whole(10)
+    backtracks: int = whole(15)
+    backtrack_factor: float = number(0.8, high=1.0, open_ends=True)
+    policy_minibatch_size: int = whole(512)
+    fisher_size: int = whole(128)
+    critic_epochs: int = whole(3)
 
 
 @dataclass(frozen=True)
@@ -113,8 +119,8 @@ class ActorCriticSettings(Settings):
         mixer: how the robots' values make the team's, vdn or qmix
     """
 
-    epochs: int = 1
-    mixer: str = "qmix"
+    epochs: int = whole(1)
+    mixer: str = choice("qmix", "vdn")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from maexp.agents.ranges import check_ranges, choice, flag, whole
+
 
 @dataclass(frozen=True)
 class ModelConfig:
@@ -20,21 +22,17 @@ class ModelConfig:
         critic_hidden: width of the critic's hidden layers.
     """
 
-    stem: str = "pool"
-    channels: int = 16
-    grid_features: int = 16
-    depth: int = 1
-    heads: int = 1
-    feedforward: int = 2
-    merge_maps: bool = True
-    critic_hidden: int = 64
+    stem: str = choice("pool", "conv")
+    channels: int = whole(16, most=4096)
+    grid_features: int = whole(16, most=4096)
+    depth: int = whole(1, most=64)
+    heads: int = whole(1, most=64)
+    feedforward: int = whole(2, most=64)
+    merge_maps: bool = flag(True)
+    critic_hidden: int = whole(64, most=4096)
 
     def __post_init__(self):
-        if self.stem not in ("pool", "conv"):
-            raise ValueError(f"model.stem={self.stem!r} is unknown; choose pool or conv.")
-        for name in ("channels", "grid_features", "depth", "heads", "feedforward", "critic_hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"model.{name}={getattr(self, name)} must be at least 1.")
+        check_ranges(self, "model")
         if self.width % self.heads:
             raise ValueError(
                 f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; "

@@ -1,0 +1,75 @@
+"""Settings of algorithms and networks: each has a range, and what lies outside is named with it."""
+
+import math
+from dataclasses import fields
+
+import pytest
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.cli import main
+from maexp.agents.model import PRESETS, ModelConfig
+
+# What each setting may be and what it may not be, from what it means (not from the code).
+GOOD = {
+    "gamma": [0, 1.0], "lmbda": [0, 1], "final_lr_share": [0, 1], "accept_ratio": [0, 1],
+    "lr": [1e-9, 2], "critic_lr": [1e-9], "max_grad_norm": [1e-3], "kl_target": [1e-6], "max_kl": [1e-6],
+    "entropy_coeff": [0], "critic_coeff": [0], "clip_value": [0, 10], "kl_coeff": [0], "damping": [0],
+    "clip_epsilon": [0.01, 0.99], "backtrack_factor": [0.01, 0.99],
+    "value_norm": [True, False], "normalize_advantage": [True, False], "mixer": ["vdn", "qmix"],
+    **{name: [1, 7] for name in (
+        "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
+    )},
+}  # fmt: skip
+BAD = {
+    "gamma": [-0.1, 1.1, 2], "lmbda": [-1, 2], "final_lr_share": [-0.5, 1.5], "accept_ratio": [-0.1, 1.1],
+    "clip_epsilon": [-1, 0, 1], "backtrack_factor": [0, 1], "mixer": ["sum", ""],
+    **{name: [0, -1] for name in ("lr", "critic_lr", "max_grad_norm", "kl_target", "max_kl")},
+    **{name: [-1e-9] for name in ("entropy_coeff", "critic_coeff", "clip_value", "kl_coeff", "damping")},
+    **{name: [0, -3, 1.5, True] for name in (
+        "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
+    )},
+    **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage")},
+}  # fmt: skip
+EVERYWHERE = [math.nan, math.inf, -math.inf, "much", None]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_setting_of_an_algorithm_has_its_range(name):
+    row = ALGORITHMS[name]
+    for preset in ("default", "reference"):
+        row.configure(preset)
+    for one in (field.name for field in fields(row.settings)):
+        for value in GOOD[one]:
+            assert getattr(row.configure(**{one: value}), one) == value
+        for value in BAD[one] + EVERYWHERE:
+            with pytest.raises(ValueError, match=rf"algorithm\.{one}=") as caught:
+                row.configure(**{one: value})
+            assert repr(value) in str(caught.value) and "must be" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [one.name for one in fields(ModelConfig)])
+def test_every_size_of_a_network_has_its_range(name):
+    kind = type(getattr(PRESETS["small"], name))
+    bad = {str: ["fft"], bool: [1], int: [0, -1, 2.0, 10**6, True]}[kind]
+    for value in bad + EVERYWHERE:
+        with pytest.raises(ValueError, match=rf"model\.{name}=.*must be"):
+            ModelConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["algorithm.lr=nan"], "algorithm.lr=nan must be a finite number above 0."),
+        (["algorithm.gamma=2"], "algorithm.gamma=2.0 must be a number from 0 to 1."),
+        (["algorithm.clip_epsilon=-1"], "algorithm.clip_epsilon=-1.0 must be a number above 0 and below 1."),
+        (["algorithm.minibatch_size=0"], "algorithm.minibatch_size=0 must be a whole number, 1 or more."),
+        (["algorithm=vdppo", "algorithm.mixer=sum"], "algorithm.mixer='sum' must be one of qmix, vdn."),
+        (["model.channels=0"], "model.channels=0 must be a whole number from 1 to 4096."),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(words, sentence, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny = ["scenario.maps=[0]", "scenario.held_out=[70]", "num_envs=2", "total_frames=30", "episodes=0"]
+    assert main(["train", *tiny, *words]) == 2
+    assert capsys.readouterr().err == f"maexp: {sentence}\n"
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
