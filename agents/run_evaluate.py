@@ -12,10 +12,12 @@ from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import EvaluationResult, evaluate, play
+from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.overrides import find_override, without
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, write_results
+from maexp.agents.run_folder import short
 from maexp.agents.train import check_action, load_matching, write_config
 
 PICTURES = 4
@@ -51,6 +53,7 @@ def check(cfg: Any) -> None:
     for name in policy_names(cfg):
         if name not in POLICIES:
             raise UserError(f"policy={name} is unknown: choose one of {', '.join(POLICIES)}.")
+    check_render(cfg)
 
 
 def policy_names(cfg: Any) -> list[str]:
@@ -61,7 +64,7 @@ def policy_names(cfg: Any) -> list[str]:
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
-    """Evaluate, print the table, write results.json and a picture."""
+    """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with blame_input():
         maps = load_maps(cfg.scenario, train=False).held_out
         envs = [make_env(cfg, maps, size, min(cfg.num_envs, cfg.episodes)) for size in team_sizes(cfg.num_robots)]
@@ -70,7 +73,12 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
     report(cfg, results, maps, where / "results.json")
     draw_ends(cfg, maps, next(iter(policies.values())), where / "picture.png")
-    print(f"Written to {where}: results.json, picture.png, config.yaml")
+    written = ["results.json", "picture.png", "config.yaml"]
+    if cfg.render:
+        written += [film.name for env in envs for film in film_all(cfg, env, maps, policies, where)] + [f"{EPISODES}/"]
+    print(f"Written to {short(where)}: {', '.join(written)}")
+    if cfg.render:
+        print(f"Next: maexp view {short(where)} browser=true")
     return 0
 
 
@@ -98,6 +106,19 @@ def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[Evaluatio
                 evaluate(bound, env, cfg.episodes, name=name, seed=cfg.seed, advance=progress.advance)
             )
     return results
+
+
+def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Path) -> list[Path]:
+    """A film of each policy in the first `render_envs` of the episodes, and the episodes as files."""
+    films = []
+    env = make_env(cfg, maps, env.num_robots, cfg.render_envs)
+    for name, policy in policies.items():
+        name = name if len(team_sizes(cfg.num_robots)) == 1 else f"{name}_N{env.num_robots}"
+        with Progress(f"filming {name}", 1) as progress:
+            episodes = play_teams(env, bind(policy, env), name, seed=cfg.seed)
+            films.append(write_film(episodes, where, name, cfg.render_format)[0])
+            progress.advance(1)
+    return films
 
 
 def report(cfg: Any, results: list[EvaluationResult], maps: list, path: Path, **extra: float) -> None:

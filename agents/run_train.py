@@ -10,7 +10,7 @@ from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError
 from maexp.agents.overrides import find_override
 from maexp.agents.run_evaluate import evaluate_all, report
-from maexp.agents.run_folder import check_writable
+from maexp.agents.run_folder import check_writable, short
 from maexp.agents.train import TrainingRun, train, write_config
 
 STOPPED = 130
@@ -51,10 +51,10 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(cfg, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
-          f"{cfg.num_robots} robots; everything goes to {_short(where)}", flush=True)  # fmt: skip
+          f"{cfg.num_robots} robots; everything goes to {short(where)}", flush=True)  # fmt: skip
     train(training)
     if training.stopped:
-        print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={_short(where)}")
+        print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={short(where)}")
         return STOPPED
     finish(training)
     return 0
@@ -73,8 +73,8 @@ def finish(done: TrainingRun) -> None:
         written.append("summary.json")
     draw_rollout(cfg, done, where / "rollout.gif")
     written.append("rollout.gif")
-    print(f"Written to {_short(where)}: {', '.join(written)}")
-    print(f"Next: maexp evaluate checkpoint={_short(where)} num_robots=1,2,6,8")
+    print(f"Written to {short(where)}: {', '.join(written)}")
+    print(f"Next: maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8")
 
 
 def draw_curves(where: Path) -> None:
@@ -96,9 +96,3 @@ def draw_rollout(cfg: Any, done: TrainingRun, path: Path) -> None:
         torch.manual_seed(cfg.seed)
         env.set_episodes(torch.zeros(1, dtype=torch.int64, device=env.device))
         write_gif(record_episode(env, done.learner.policy, every=None), path)
-
-
-def _short(path: Path) -> str:
-    """The path as one would type it here."""
-    here = Path.cwd()
-    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

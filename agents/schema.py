@@ -152,6 +152,9 @@ class EvaluateSettings(LearnerSettings):
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
 
+    render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
+    render_envs: int = setting(1, "teams in a film, side by side, each in a held-out episode of its own")
+    render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")
 
 @dataclass
 class MapsSettings:

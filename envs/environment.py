@@ -333,11 +333,17 @@ class ExplorationEnv(EnvBase):
         side = int(PIXELS)
         return origin + size * np.stack([pixels // side, pixels % side], axis=-1)
 
-    def render(self, index: int = 0, size: int = 512) -> np.ndarray:
-        """A picture of env ``index``: uint8 [size or more, size, 3]."""
-        from maexp.envs.render import draw_frame
+    def render(self, index: int | Sequence[int] = 0, size: int = 512, mode: str = "rgb_array") -> np.ndarray:
+        """A picture of env ``index``, or of several side by side: uint8 [height, width, 3], ``size`` wide each.
 
-        return draw_frame(self.snapshot(index), size=size)
+        TorchRL's ``PixelRenderTransform`` and ``VideoRecorder`` work with it; ``mode`` is there because they may
+        name it, and has this one value.
+        """
+        from maexp.envs.render import check_teams, draw_teams
+
+        if mode != "rgb_array":
+            raise ValueError(f"mode={mode!r} is unknown: this env renders rgb_array")
+        return draw_teams([self.snapshot(team) for team in check_teams(self, index)], size)
 
 
 def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:

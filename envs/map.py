@@ -122,27 +122,24 @@ class PointCloudMap:
 
     def save(self, path: str | os.PathLike) -> Path:
         """Writes the map as .npz (no pickle); the file appears whole or not at all."""
-        path = Path(path)
+        return write_npz(path, self.to_arrays())
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of a map file, to write them beside others."""
         arrays = {name: getattr(self, name) for name in _CLOUDS + _PER_POINT}
         arrays = {name: array for name, array in arrays.items() if array is not None}
         texts = {"format": _FORMAT, "name": self.name, "scenario": self.scenario}
         arrays |= {name: np.array(text, dtype=np.str_) for name, text in texts.items()}
-        arrays["resolution"] = np.float64(self.resolution)
-        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
-            os.chmod(part, 0o666 & ~_umask())
-            os.replace(part, path)
-        except BaseException:
-            os.unlink(part)
-            raise
-        return path
+        return arrays | {"resolution": np.float64(self.resolution)}
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> PointCloudMap:
         """Reads what `save` wrote; raises MapError on any other or damaged file."""
-        arrays = read_npz(path)
+        return cls.from_arrays(read_npz(path), path)
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], path: str | os.PathLike) -> PointCloudMap:
+        """The map among the arrays that `path` held; raises MapError as `load` does."""
         missing = {"format", "name", "scenario", "resolution", *_CLOUDS} - arrays.keys()
         if missing:
             raise MapError(
@@ -173,6 +170,21 @@ def find_boundary(free: np.ndarray, obstacles: np.ndarray, spacing: np.ndarray) 
     reach = BOUNDARY_REACH * np.asarray(spacing, dtype=np.float64) * (1 + 1e-6)  # float32 may round up
     distance, _ = cKDTree(free).query(obstacles, distance_upper_bound=float(reach.max()) * (1 + 1e-9))
     return distance <= reach
+
+
+def write_npz(path: str | os.PathLike, arrays: dict[str, np.ndarray]) -> Path:
+    """Writes arrays as .npz (no pickle); the file appears whole or not at all."""
+    path = Path(path)
+    handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        os.chmod(part, 0o666 & ~_umask())
+        os.replace(part, path)
+    except BaseException:
+        os.unlink(part)
+        raise
+    return path
 
 
 def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:

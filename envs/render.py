@@ -16,7 +16,7 @@ from torchrl.envs.utils import step_mdp
 from maexp.envs.film import write_gif, write_mp4
 from maexp.envs.raster import MapRaster, map_raster
 
-__all__ = ["draw_frame", "draw_grid", "record_episode", "write_gif", "write_mp4"]
+__all__ = ["draw_frame", "draw_grid", "draw_teams", "record_episode", "watch_episode", "write_gif", "write_mp4"]
 
 DT = 0.1  # seconds in a local step (design 1)
 
@@ -63,7 +63,7 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
     """Picture of one team, uint8 (height, width, 3).
 
     Args:
-        snapshot: what ``ExplorationEnv.snapshot(i)`` returns.
+        snapshot: what ``ExplorationEnv.snapshot(i)`` or ``Episode.snapshot(k)`` returns.
         size: width in pixels, at least 64; the map keeps its proportions within size x size, and a caption
             strip with coverage, time, scale and legend comes below.
 
@@ -100,41 +100,70 @@ def draw_grid(frames, columns: int | None = None, gap: int = 6) -> np.ndarray:
     return grid
 
 
-def record_episode(env, policy, env_index: int = 0, every: int | None = 2, size: int = 512) -> list:
+def record_episode(env, policy, env_index=0, every: int | None = 2, size: int = 512) -> list:
     """Plays one episode from ``env.reset()`` and draws team ``env_index``: a list of uint8 pictures.
 
     Args:
         env: an :class:`ExplorationEnv`; call ``env.set_episodes`` before to choose an evaluation episode.
         policy: a TensorDictModule that writes the action.
+        env_index: number of the team, or several numbers: these teams side by side.
         every: local steps from one picture to the next (a tenth of a second each); None: as many as make
             about 150 pictures of a full episode.
-        size: width of the pictures in pixels.
+        size: width of a team's picture in pixels.
 
     The other teams of the batch play along, undrawn. The first picture is the start, the last one the end.
     """
-    if every is None:
-        every = max(1, env.local_steps * env.macro_steps // 150)
-    frames, drawn = [], []
+    frames = []
+    watch_episode(env, policy, lambda moment: frames.append(draw_teams(moment, size)), env_index, every)
+    return frames
 
-    def draw(env) -> None:
-        snapshot = env.snapshot(env_index)
-        if snapshot["local_step"] not in drawn[-1:]:  # a team that is done stands still
-            frames.append(draw_frame(snapshot, size))
-            drawn.append(snapshot["local_step"])
 
-    env.set_step_hook(draw, every=every)
+def draw_teams(snapshots: list[dict], size: int = 512) -> np.ndarray:
+    """One team's picture, or those of several side by side, ``size`` pixels wide each."""
+    frames = [draw_frame(snapshot, size) for snapshot in snapshots]
+    return frames[0] if len(frames) == 1 else draw_grid(frames)
+
+
+def watch_episode(env, policy, watch, teams=0, every: int | None = 2) -> None:
+    """Plays one episode from ``env.reset()`` and calls ``watch(snapshots)``, one per team in ``teams``.
+
+    That happens at the start, after every ``every``-th local step in which one of these teams moved, and at the
+    end; a team that is done keeps its last snapshot. Arguments as in :func:`record_episode`.
+
+    Raises:
+        ValueError: a team's number is not one of the env's.
+    """
+    teams = check_teams(env, teams)
+    every = every or max(1, env.local_steps * env.macro_steps // 150)
+    latest: dict[int, dict] = {}
+
+    def look(env) -> None:
+        steps = env.simulation.tensors["local_step"].tolist()
+        moved = [team for team in teams if team not in latest or latest[team]["local_step"] != steps[team]]
+        latest.update({team: env.snapshot(team) for team in moved})
+        if moved:
+            watch([latest[team] for team in teams])
+
+    env.set_step_hook(look, every=every)
     try:
         with torch.no_grad():
             state = env.reset()
-            done = False
-            while not done:
+            done = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+            while not bool(done[teams].all()):
                 state = env.step(policy(state))
-                done = bool(state["next", "done"][env_index].any())
+                done = done | state["next", "done"].reshape(-1)
                 state = step_mdp(state)
-        draw(env)
     finally:
         env.set_step_hook(None)
-    return frames
+
+
+def check_teams(env, teams) -> list[int]:
+    """The numbers of one team or of several as a list."""
+    numbers = np.atleast_1d(np.asarray(teams))
+    whole = numbers.size and numbers.dtype.kind in "iu" and numbers.ndim == 1
+    if not whole or numbers.min() < 0 or numbers.max() >= env.num_envs:
+        raise ValueError(f"team {teams} is none of this env's: give numbers from 0 to {env.num_envs - 1}")
+    return numbers.tolist()
 
 
 # Colours of the points
@@ -266,7 +295,8 @@ def _draw_strip(snapshot: dict, raster: MapRaster, width: int) -> Image.Image:
     robots, collided = len(snapshot["pose"]), int(np.count_nonzero(snapshot["collided"]))
     team = f"{robots} robot{'s' * (robots != 1)}" + (f", {collided} collided" if collided else "")
     clock = f"{seconds:.1f} s, step {int(snapshot['local_step'])}"
-    title = _fit(f"{snapshot['map'].name} · {team}", _font(text), 0.66 * width)
+    names = [name for name in (snapshot["map"].name, snapshot.get("policy"), team) if name]
+    title = _fit(" · ".join(names), _font(text), 0.66 * width)
     draw.text((pad, pad + row // 2), title, INK, _font(text), "lm")
     draw.text((right, pad + row // 2), clock, INK, _font(text), "rm")
     bar = (pad, pad + row, right, pad + 2 * row - pad // 2)

@@ -1,0 +1,75 @@
+"""Films of held-out episodes, and the episodes themselves as files that replay without simulation."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from maexp.agents.errors import UserError
+from maexp.envs.film import write_gif, write_mp4
+from maexp.envs.render import draw_frame, draw_grid, watch_episode
+from maexp.envs.viewing.episode import Episode, EpisodeRecorder
+
+WRITERS = {"gif": write_gif, "mp4": write_mp4}
+EPISODES = "episodes"  # folder of the episode files
+WIDTHS = ((1, 512), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
+
+
+def check_render(cfg: Any) -> None:
+    """Raise UserError where no film could be written at the end."""
+    if cfg.render_format not in WRITERS:
+        raise UserError(f"render_format={cfg.render_format} is unknown: choose one of {', '.join(WRITERS)}.")
+    if type(cfg.render_envs) is not int or not 1 <= cfg.render_envs <= 64:
+        raise UserError(f"render_envs={cfg.render_envs} must be a whole number from 1 to 64.")
+    if cfg.render and cfg.render_format == "mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError as error:
+            advice = 'pip install "maexp[video]", or give render_format=gif'
+            raise UserError(f"render_format=mp4 needs imageio-ffmpeg: {advice}.") from error
+
+
+def play_teams(
+    env: Any, policy: Any, name: str, *, first: int = 0, seed: int = 0, every: int | None = None
+) -> list[Episode]:
+    """Evaluation episodes `first`, `first` + 1, ... of all teams of `env`, recorded.
+
+    Args:
+        policy: a TensorDictModule that writes the action; `name` is what the files call it
+        seed: of the policy's random numbers; the global ones go on as if nothing had happened
+        every: local steps from one record to the next; None: about 150 records in a full episode
+    """
+    recorders = [EpisodeRecorder(name) for _ in range(env.num_envs)]
+
+    def look(snapshots: list[dict]) -> None:
+        for recorder, snapshot in zip(recorders, snapshots, strict=True):
+            recorder.add(snapshot)
+
+    devices = [env.device] if env.device.type == "cuda" else []
+    with torch.random.fork_rng(devices):
+        torch.manual_seed(seed)
+        env.set_episodes(torch.arange(first, first + env.num_envs, device=env.device))
+        watch_episode(env, policy, look, range(env.num_envs), every)
+    return [recorder.episode() for recorder in recorders]
+
+
+def draw_film(episodes: list[Episode]) -> list[np.ndarray]:
+    """The pictures of a film, uint8 (height, width, 3): the teams side by side, at the same time each."""
+    width = next(pixels for most, pixels in WIDTHS if len(episodes) <= most)
+    frames, latest = [], {}
+    for step in np.unique(np.concatenate([one.step for one in episodes])):
+        for k, episode in enumerate(episodes):
+            record = int(np.searchsorted(episode.step, step, side="right")) - 1
+            if latest.get(k, (-1,))[0] != record:  # a team that is done stands still
+                latest[k] = record, draw_frame(episode.snapshot(record), width)
+        pictures = [latest[k][1] for k in range(len(episodes))]
+        frames.append(pictures[0] if len(pictures) == 1 else draw_grid(pictures))
+    return frames
+
+
+def write_film(episodes: list[Episode], folder: Path, name: str, kind: str) -> list[Path]:
+    """Write `film_NAME.KIND` and `episodes/NAME_K.npz`, K counted from 0; returns what was written."""
+    path = WRITERS[kind](draw_film(episodes), folder / f"film_{name}.{kind}")
+    (folder / EPISODES).mkdir(exist_ok=True)
+    return [path] + [one.save(folder / EPISODES / f"{name}_{k}.npz") for k, one in enumerate(episodes)]
