@@ -1,0 +1,110 @@
+"""Every command the documentation shows is run as it stands there, made small, in a folder with the files it names."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import open3d
+import pytest
+from worlds import room
+
+from maexp.agents.cli import VERBS, main
+from maexp.envs.importing.export import export_ros_map
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
+PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=2", "device=cpu")
+OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
+SMALLER = {  # verb -> what makes it small, last and so stronger
+    "train": (*PLACES, "total_frames=8", "collector.steps=2", "episodes=2", "model.channels=4"),
+    "evaluate": (*PLACES, "episodes=2"),
+    "bench": ("scenario.local_steps=3", "num_envs=2", "num_robots=2", "device=cpu", "seconds=0.05"),
+}
+MEANT = {  # placeholder -> what stands for it here
+    "outputs/DATE/RUN": "outputs/run",
+    "RUN_OR_CHECKPOINT": "outputs/run",
+    "policy=NAME": "policy=voronoi",
+    "maexp VERB": "maexp train",
+    "RUN": "outputs/run",
+    "FILE": "floor.yaml",
+}
+NOT_OURS = ("pip ", "python3 -m venv", "sphinx-build ")
+"""Lines that begin so are other programs, which .ci/run or a test of its own calls."""
+
+
+def shown() -> dict[str, list[str]]:
+    """Command -> pages that show it: lines of shell blocks, and `maexp ...` with settings or flags in a sentence."""
+    found: dict[str, list[str]] = {}
+    for page in PAGES:
+        text = page.read_text()
+        lines = [
+            line
+            for block in re.findall(r"^```(?:sh|bash)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+            for line in block.replace("\\\n", " ").splitlines()
+        ]
+        spoken = [line for line in re.findall(r"`(maexp [^`\n]+)`", text) if "..." not in line and "[" not in line]
+        lines += [line for line in spoken if "=" in line or "--" in line]
+        for line in lines:
+            line = re.sub(r"\s+#.*", "", line).strip()
+            line = line[line.index("maexp ") :] if line.startswith("pip ") and "maexp " in line else line
+            if line and not line.startswith("#"):
+                found.setdefault(line, []).append(page.name)
+    return found
+
+
+COMMANDS = [line for line in shown() if line.startswith("maexp")]
+
+
+def small(line: str) -> list[str]:
+    """The words of a command, with what it stands for, and small."""
+    for name, meaning in MEANT.items():
+        line = re.sub(rf"(?<![A-Za-z_]){re.escape(name)}(?![A-Za-z_])", meaning, line)
+    words = shlex.split(line)[1:]
+    if not words or {"--help", "--cfg"} & set(words):
+        return words
+    more = SMALLER.get(words[0], ())
+    if words[0] in SMALLER and not any(w.startswith(("scenario=pointcloud", "checkpoint=", "resume=")) for w in words):
+        more = (*more, *OWN_MAPS)
+    if any(word.startswith("resume=") for word in words):
+        more = ()
+    return [*words, *more]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where a reader would be: maps of their own under the names that the pages use, and a run."""
+    place = tmp_path_factory.mktemp("reader")
+    for name in {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply)", line)}:
+        if (place / name).suffix == ".pcd":
+            cloud = room(30, 21, spacing=0.2)
+            flat = np.concatenate([cloud.free, *(cloud.obstacles + [0, 0, h] for h in np.arange(0.2, 1.4, 0.2))])
+            points = open3d.utility.Vector3dVector(1000 * flat[:, [0, 2, 1]].astype(float))  # mm, y up
+            open3d.io.write_point_cloud(str(place / name), open3d.geometry.PointCloud(points))
+        elif (place / name).suffix == ".yaml":
+            export_ros_map(room(30, 21, spacing=0.2), place / name)
+        elif (place / name).suffix == ".npz":
+            room(30, 21, spacing=0.2).save(place / name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        assert main(["train", *SMALLER["train"], *OWN_MAPS, "hydra.run.dir=outputs/run"]) == 0
+    return place
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_command(line, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    status = main(small(line))
+    output = capsys.readouterr()
+    assert status == 0, f"{' '.join(small(line))}\n{output.err}"
+    assert "Traceback" not in output.err
+
+
+def test_every_line_is_one_of_ours_or_listed():
+    others = [line for line in shown() if not line.startswith("maexp")]
+    assert [line for line in others if not line.startswith(NOT_OURS)] == []
+    assert len(COMMANDS) > 15
+
+
+def test_every_verb_is_shown():
+    assert set(VERBS) <= {line.split()[1] for line in COMMANDS if len(line.split()) > 1}
