@@ -25,7 +25,7 @@ class RewardWeights:
     success: float
     collision: float
     points: float  # w = points / total weight scales explore and overlap
-    events: float  # v = events scales time, success, collision; 0 takes w there too (the paper's way)
+    events: float  # v = events scales time, success, collision; 0: points / |free| (the paper's way)
     time_sign: float  # 0: -(1 - coverage) as in the code, 1: -coverage as the paper prints
     goal_coverage: float
 
@@ -68,11 +68,12 @@ def _reward_robots(
     e, i = wp.tid()
     if active[e] == 0:
         return
-    total = float(maps.total_weight[map_id[e]])
+    m = map_id[e]
+    total = float(maps.total_weight[m])
     w = weights.points / total
     v = weights.events
-    if v <= 0.0:
-        v = w
+    if v <= 0.0:  # events are no points: where density varies, the weights' unit must not scale them
+        v = weights.points / float(maps.free_begin[m + 1] - maps.free_begin[m])
     before = float(covered_before[e]) / total
     after = float(covered[e]) / total
     lapse = -(1.0 - before)

@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 import warp as wp
+from hypothesis import settings
 
 torch.set_num_threads(1)
 wp.config.quiet = True
 if os.environ.get("MAEXP_WARP_MODE"):  # `.ci/run` repeats the kernel tests with "debug" (bounds checks)
     wp.config.mode = os.environ["MAEXP_WARP_MODE"]
+settings.register_profile("long")  # `--hypothesis-profile=long`: hours of fuzzing by hand (docs/reliability.md)
 
 
 @pytest.fixture(scope="session")
