@@ -47,7 +47,7 @@ VERBS = {
     ),
     "bench": Verb(
         "measures throughput, as a table and JSON",
-        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels num_envs=256"),
+        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE"),
         "run_bench",
         ("action",),
         ("env", "kernels"),

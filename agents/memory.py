@@ -14,9 +14,12 @@ def check_batch_memory(env, steps: int) -> None:
     Raises:
         UserError: names the settings to lower.
     """
+    from maexp.envs.simulation import bytes_per_env  # here, for the command line starts without torch
+
     specs = [env.observation_spec, env.full_action_spec]
     one_step = sum(leaf.zero().nbytes for spec in specs for leaf in spec.values(True, True))
-    need = COPIES * 2 * one_step * steps  # each step is stored as it was and as it became
+    simulation = bytes_per_env(env) * env.num_envs
+    need = simulation + COPIES * 2 * one_step * steps  # each step is stored as it was and as it became
     if env.device.type == "cuda":
         import torch
 
@@ -25,8 +28,9 @@ def check_batch_memory(env, steps: int) -> None:
         have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if need > have:
         raise UserError(
-            f"One batch of num_envs={env.num_envs} x collector.steps={steps} needs about {need / 2**30:.1f} GiB, "
-            f"more than the {have / 2**30:.1f} GiB of {env.device}: lower num_envs or collector.steps."
+            f"One batch of num_envs={env.num_envs} x collector.steps={steps} needs about {need / 2**30:.1f} GiB "
+            f"({simulation / 2**30:.1f} GiB of it for the simulation), more than the {have / 2**30:.1f} GiB of "
+            f"{env.device}: lower num_envs or collector.steps."
         )
 
 

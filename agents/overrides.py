@@ -9,7 +9,7 @@ from hydra.errors import HydraException, OverrideParseException
 from maexp.agents.errors import UserError
 from maexp.agents.schema import schema
 
-PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "hydra.run.dir", "hydra.sweep.dir")
+PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir")
 LISTS = {"evaluate": ("num_robots", "policy"), "bench": ("num_robots",)}
 
 
@@ -96,3 +96,25 @@ def without(overrides: list[str], *names: str) -> list[str]:
     keys = [one.key_or_group for one in parsed]
     rows = zip(overrides, roots, keys, strict=True)
     return [word for word, root, key in rows if root not in names and key not in names]
+
+
+def move_sweeps(overrides: list[str], single: tuple[str, ...] = ()) -> list[str]:
+    """`overrides` with the first of several values each (num_envs=8,64), and `sweep=[...]`, which holds them all.
+
+    Raises:
+        UserError: a setting in `single` was given several values.
+    """
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    several = [word for word, one in zip(overrides, parsed, strict=True) if one.is_sweep_override()]
+    for name in split_sweeps(several)[0]:
+        if name.split(".")[0] in single:
+            raise UserError(f"{name} takes one value here, not several.")
+    firsts = [split_sweeps([word])[1][0][0] if word in several else word for word in overrides]
+    return [*firsts, f"sweep=[{','.join(quote(word) for word in several)}]"] if several else firsts
+
+
+def split_sweeps(words: list[str]) -> tuple[list[str], list[list[str]]]:
+    """The names of settings given several values, and for each its overrides, one per value."""
+    parsed = OverridesParser.create().parse_overrides(list(words))
+    names = [one.key_or_group for one in parsed]
+    return names, [[f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()] for one in parsed]

@@ -1,15 +1,21 @@
 """`maexp bench`: throughput, as a table and JSON."""
 
+import importlib
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.checks import check_counts, team_sizes
-from maexp.agents.errors import blame_input
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.overrides import move_sweeps
+
+ONE_VALUE = ("action", "seconds", "baseline", "axes", "largest", "device", "hydra")
 
 
 def prepare(overrides: list[str]) -> list[str]:
-    return overrides
+    """Settings given several values go to `sweep`; their first value stands in their place."""
+    return move_sweeps(overrides, ONE_VALUE)
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
@@ -18,16 +24,23 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 
 def check(cfg: Any) -> None:
-    """Raise UserError for counts out of range."""
+    """Raise UserError for counts out of range, and for settings that another measurement has."""
     check_counts(cfg, "num_envs")
+    check_counts(cfg.collector, "steps", prefix="collector.")
+    if not (cfg.seconds > 0 and math.isfinite(cfg.seconds)):
+        raise UserError(f"seconds={cfg.seconds} must be a time to measure for, above 0 [s].")
     if cfg.num_robots is not None:
         team_sizes(cfg.num_robots)
+    if cfg.largest is not None:
+        check_counts(cfg, "largest")
+    for name, action in (("baseline", "kernels"), ("axes", "scale"), ("largest", "scale")):
+        if cfg[name] is not None and cfg.action != action:
+            raise UserError(f"{name}={cfg[name]} belongs to maexp bench {action}, not to maexp bench {cfg.action}.")
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
-    """Measure what `action` names; the measuring is in `bench`."""
-    from maexp.agents import bench
-
+    """Measure what `action` names; each has a module of its own."""
+    home = importlib.import_module(f"maexp.agents.bench_{cfg.action}")
     with blame_input():
-        getattr(bench, f"bench_{cfg.action}")(cfg, where)
+        getattr(home, f"bench_{cfg.action}")(cfg, where, overrides)
     return 0

@@ -43,12 +43,18 @@ class NavGrid:
         )
 
 
+def grid_shape(map: PointCloudMap) -> tuple[int, int]:
+    """Cells of a map's navigation grid along x and y."""
+    (xmin, ymin), (xmax, ymax) = map.extent
+    width, height = (int(np.floor(side / map.resolution + 0.5)) + 1 for side in (xmax - xmin, ymax - ymin))
+    return width, height
+
+
 def build_nav_grid(map: PointCloudMap) -> NavGrid:
     """The navigation grid of a map: cells as large as its resolution, the extent's corner at a cell centre."""
     cell = float(map.resolution)
-    (xmin, ymin), (xmax, ymax) = map.extent
-    origin = np.array([xmin, ymin]) - 0.5 * cell
-    width, height = (int(np.floor(side / cell + 0.5)) + 1 for side in (xmax - xmin, ymax - ymin))
+    origin = np.array(map.extent[0]) - 0.5 * cell
+    width, height = grid_shape(map)
 
     def cell_of(points: np.ndarray) -> np.ndarray:
         index = np.floor((points[:, :2].astype(np.float64) - origin) / cell).astype(np.int64)

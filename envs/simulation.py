@@ -5,9 +5,9 @@ import os
 
 import torch
 
-from maexp.envs.nav_grid import bank_nav_grids
+from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.kernels.reward import RewardWeights
-from maexp.kernels.state import axis_sizes, memory_per_env
+from maexp.kernels.state import axis_sizes, grid_memory_per_env, memory_per_env
 from maexp.kernels.step import Settings, Simulation
 from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL
 
@@ -114,9 +114,25 @@ def sizes(env) -> dict[str, int]:
     )
 
 
+def bytes_per_env(env) -> int:
+    """What one env of the simulation takes on its device: state, scratch, and the grids of the `wavefront` planner."""
+    total = sum(memory_per_env(sizes(env)).values())
+    if env.planner_config.name == "wavefront":
+        limited, robots = env.comm_config.limited, env.num_robots
+        cells = max(width * height for width, height in map(grid_shape, env.maps))
+        masks = robots if limited else len({one.collision_threshold for one in env.robot_configs})
+        total += grid_memory_per_env(cells, robots, robots if limited else 1, masks)
+    return total
+
+
 def check_memory(env) -> None:
-    """Refuse a batch that the device cannot hold, before anything is allocated."""
-    per_env = sum(memory_per_env(sizes(env)).values()) + 2 * env.num_robots * 4 * 125 * 125
+    """Refuse a batch that the device cannot hold, before anything is allocated.
+
+    Raises:
+        ValueError: says how much is needed and free, and what to lower.
+    """
+    pictures = 2 * env.num_robots * 4 * 125 * 125  # one observation and the next
+    per_env = bytes_per_env(env) + pictures
     if env.device.type == "cuda":
         free = torch.cuda.mem_get_info(env.device)[0]
     else:
@@ -127,8 +143,9 @@ def check_memory(env) -> None:
                     if line.startswith("MemAvailable:"):
                         free = int(line.split()[1]) * 1024
     if per_env * env.num_envs > free:
+        most = int(free / per_env)
+        lower = f"lower num_envs to {most}" if most else "lower num_robots or use a smaller map"
         raise ValueError(
             f"num_envs={env.num_envs} needs {per_env * env.num_envs / 2**30:.1f} GiB "
-            f"({per_env / 2**20:.1f} MiB per env) and {env.device} has {free / 2**30:.1f} GiB free: "
-            f"lower num_envs below {int(free / per_env)}"
+            f"({per_env / 2**20:.1f} MiB per env) and {env.device} has {free / 2**30:.1f} GiB free: {lower}"
         )

@@ -116,6 +116,22 @@ def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
     return result
 
 
+def grid_memory_per_env(cells: int, robots: int, known_rows: int, masks: int) -> int:
+    """Bytes of the `wavefront` planner's grids and paths for one env (`kernels.wavefront`, `known_grid`, `geodesic`).
+
+    Args:
+        cells: of the largest navigation grid.
+        robots: N.
+        known_rows: grids of what is known, 1 for the team or one per robot.
+        masks: grids of where robots fit.
+    """
+    known = known_rows * (cells + 4)  # uint8 per cell; the map of each row
+    passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
+    search = robots * (3 * 4 * cells + 2 * 4)  # distances and two queues, int32; source and stop
+    paths = robots * (4 * 64 + 4 * 4)  # PATH_CELLS cells; length, place, end, mask of each
+    return known + passable + search + paths
+
+
 def warp_views(tensors: dict[str, torch.Tensor], first: int, last: int) -> SimpleNamespace:
     """Warp arrays over envs ``first`` to ``last`` of all state and scratch tensors."""
     fields = STATE | SCRATCH

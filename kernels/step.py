@@ -213,6 +213,10 @@ class Shard:
 
     def observe(self, picture, team, pose, grid) -> None:
         """Draw into fresh tensors of all envs (design 6.1: what leaves the env is never reused)."""
+        self.draw(partial(wp.launch, device=self.device), picture, team, pose, grid)
+
+    def draw(self, launch: Callable, picture, team, pose, grid) -> None:
+        """Pictures, poses and region offsets of this shard's envs, into tensors of all envs."""
         s, maps = self.view, self.sim.maps
         part = slice(self.first, self.last)
         out = [
@@ -223,18 +227,17 @@ class Shard:
         if self.sim.settings.draw_known and self.sim.settings.comm_limited:
             free, boundary = s.known_free, s.known_boundary
         lanes = 1 if self.device.is_cpu else 1024
-        draw = partial(wp.launch, device=self.device)
-        draw(
+        launch(
             observe._draw_points, dim=(self.shape[0], lanes),
             inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, lanes,
                     free, boundary, s.seen_free, s.seen_boundary],
             outputs=out,
         )  # fmt: skip
-        draw(
+        launch(
             observe._draw_robots, dim=self.shape,
             inputs=[maps, s.map_id, self.robots, s.pose, s.center, s.comm, s.local_step, s.track], outputs=[out[0]],
         )  # fmt: skip
-        draw(
+        launch(
             observe._observe_pose, dim=self.shape,
             inputs=[maps, s.map_id, self.robots, s.pose, s.slip, s.center, s.goal],
             outputs=[wp.from_torch(pose[part], dtype=wp.vec4), wp.from_torch(grid[part].flatten(3))],

@@ -1,0 +1,133 @@
+"""`maexp bench env`: throughput of the whole env, and of one env as in the paper's table."""
+
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from maexp.agents.bench import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.progress import Progress
+from maexp.envs import ExplorationEnv
+from maexp.envs.simulation import bytes_per_env
+
+TEAM_SIZES = [2, 4, 6, 8]
+PAPER_SECONDS_PER_STEP = {
+    "MAANS (paper)": {2: 0.4497, 4: 0.9319, 6: 1.3675, 8: 1.9354},
+    "Explore-Bench (paper)": {2: 3.8586, 4: 6.6381, 6: 8.6575, 8: 10.9880},
+    "MAexp 2024, GPU (paper)": {2: 0.0144, 4: 0.0254, 6: 0.0373, 8: 0.0477},
+}
+COLUMNS = ["scenario", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"]
+
+
+def bench_env(cfg: Any, where: Path, overrides: list[str]) -> None:
+    """Robot-local-steps and macro steps per second at every point; ``where/bench_env.json`` and tables.
+
+    A robot-local-step holds planner, motion, collision, radar, merging and reward; the observation is drawn once
+    a macro step, and envs that end are reset, all within the measured time. Steps of frozen envs do not count.
+    """
+    points = sweep_points(cfg, overrides, TEAM_SIZES)
+    rows = []
+    with Progress("measuring", len(points), 0) as progress:
+        for point in points:
+            maps = load_maps(point.scenario).train
+            rows.append(measure_batch(point, make_env(point, maps, point.num_robots)))
+            rows[-1]["seconds_per_step_one_env"] = measure_latency(point, maps)
+            progress.show(len(rows), f"{point.num_envs} envs of {point.num_robots} robots")
+    print_rows(f"throughput of the simulation, {rows[0]['threads']} CPU threads", rows)
+    if len({(row["scenario"], row["radar_range"]) for row in rows}) == 1:
+        print_latency(rows)
+    write_report(where / "bench_env.json", "bench_env", cfg.device, {"rows": rows})
+
+
+def print_rows(title: str, rows: list[dict]) -> None:
+    """One line a point."""
+    cells = [
+        [
+            row["scenario"],
+            f"{row['radar_range']:g}",
+            str(row["num_envs"]),
+            str(row["num_robots"]),
+            f"{row['robot_local_steps_per_second']:,.0f}",
+            f"{row['robot_local_steps_per_second_and_thread']:,.0f}",
+            f"{row['macro_steps_per_second']:,.1f}",
+            f"{row['memory_per_env'] / 1e6:.2f}",
+            f"{row['first_step_seconds']:.1f}",
+        ]
+        for row in rows
+    ]
+    print_table(title, COLUMNS, cells)
+
+
+def print_latency(rows: list[dict]) -> None:
+    """The paper's table III beside ours: seconds per local step of one env, by team size."""
+    ours = {row["num_robots"]: row["seconds_per_step_one_env"] for row in rows}
+    cells = [
+        [name, *("-" if size not in published else f"{published[size]:.4f}" for size in ours)]
+        for name, published in PAPER_SECONDS_PER_STEP.items()
+    ]
+    cells.append(["this machine", *(f"{seconds:.6f}" for seconds in ours.values())])
+    title = "seconds per local step of one env, beside the paper's table"
+    print_table(title, ["platform", *(f"N = {size}" for size in ours)], cells)
+
+
+def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
+    """Throughput of a batch over at least ``cfg.seconds``, compile time apart."""
+    begin = time.perf_counter()
+    torch.manual_seed(cfg.seed)
+    state = env.reset()
+    actions = [env.rand_action(state.clone())["agents", "action"] for _ in range(8)]
+    state = advance(env, state, actions[0])
+    first = time.perf_counter() - begin
+    done, seconds, rates = 0, 0.0, []
+    while seconds < cfg.seconds or len(rates) < LEAST_LAPS:
+        begin = time.perf_counter()
+        steps, state = advance_counted(env, state, actions[len(rates) % 8])
+        lap = time.perf_counter() - begin
+        done, seconds = done + steps, seconds + lap
+        rates.append(steps * env.num_robots / lap)
+    threads = len(env.simulation.shards)
+    rate = done * env.num_robots / seconds
+    return describe_point(env, cfg) | {
+        "threads": threads,
+        "robot_local_steps_per_second": rate,
+        "robot_local_steps_per_second_and_thread": rate / threads,
+        "median_of_laps": statistics.median(rates),
+        "macro_steps_per_second": env.num_envs * len(rates) / seconds,
+        "laps": len(rates),
+        "seconds": seconds,
+        "first_step_seconds": first,
+        "memory_per_env": bytes_per_env(env),
+        "collided_at_end": env.simulation.tensors["collided"].float().mean().item(),
+    }
+
+
+def measure_latency(cfg: Any, maps: list, macro_steps: int = 10) -> float:
+    """Seconds per local step of a single env: the paper's measure."""
+    env = make_env(cfg, maps[:1], cfg.num_robots, num_envs=1)
+    state = env.reset()
+    action = env.rand_action(state.clone())["agents", "action"]
+    state = advance(env, state, action)
+    laps = []
+    for _ in range(macro_steps):
+        begin = time.perf_counter()
+        steps, state = advance_counted(env, state, action)
+        laps.append((time.perf_counter() - begin) / max(steps, 1))
+    return statistics.median(laps)
+
+
+def advance(env: ExplorationEnv, state, action):
+    """One macro step; envs that end are reset."""
+    return env.step_and_maybe_reset(state.set(("agents", "action"), action))[1]
+
+
+def advance_counted(env: ExplorationEnv, state, action) -> tuple[int, Any]:
+    """One macro step with resets; also the local steps that envs ran in it (frozen ones run none)."""
+    before = env.simulation.tensors["local_step"].clone()
+    stepped, state = env.step_and_maybe_reset(state.set(("agents", "action"), action))
+    steps = int((stepped["next", "info", "local_steps"].squeeze(-1) - before).sum())
+    if env.device.type == "cuda":
+        torch.cuda.synchronize(env.device)
+    return steps, state

@@ -1,0 +1,169 @@
+"""`maexp bench`: what it measures and counts, what it compares, how it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from maexp.agents import bench_kernels
+from maexp.agents.bench import spread, sweep_points
+from maexp.agents.bench_census import count_moment
+from maexp.agents.bench_counts import FORMULAS, kernel_cost
+from maexp.agents.cli import main
+from maexp.agents.compose import compose_config
+from maexp.agents.overrides import make_overrides, move_sweeps
+from maexp.envs import ExplorationEnv, make_map
+
+TINY = ["scenario=maze_small", "scenario.maps=[0]", "num_envs=2", "seconds=0.02"]
+
+
+@pytest.fixture(autouse=True)
+def somewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(bench_kernels, "COPY_BYTES", 2**20)
+    monkeypatch.setattr(bench_kernels, "MATRIX", 64)
+
+
+def report(folder: str, name: str) -> dict:
+    return json.loads(Path(folder, name).read_text())
+
+
+def test_settings_with_several_values_become_every_combination():
+    words = make_overrides("bench", ["env", "num_envs=2,4", "scenario=maze,maze_small", "num_robots=3,5"], ("action",))
+    prepared = move_sweeps(words)
+    cfg = compose_config("bench", prepared)
+    points = sweep_points(cfg, prepared, [2])
+    found = [(one.num_envs, one.scenario.name, one.num_robots) for one in points]
+    assert found == [(e, s, n) for e in (2, 4) for s in ("maze", "maze_small") for n in (3, 5)]
+
+
+def test_spread_is_median_and_tenths():
+    assert spread([float(k) for k in range(11)]) == {"median": 5.0, "p10": 1.0, "p90": 9.0}
+    assert spread([3.0]) == {"median": 3.0, "p10": 3.0, "p90": 3.0}
+
+
+def test_env_measures_every_point(capsys):
+    assert main(["bench", "env", *TINY, "num_robots=1,2", "radar.range=4,8", "hydra.run.dir=out"]) == 0
+    rows = report("out", "bench_env.json")["rows"]
+    assert [(row["radar_range"], row["num_robots"]) for row in rows] == [(4, 1), (4, 2), (8, 1), (8, 2)]
+    assert all(row["robot_local_steps_per_second"] > 0 and row["memory_per_env"] > 0 for row in rows)
+    text = capsys.readouterr().out
+    assert "robot-local-steps/s" in text and "bench_env.json" in text
+
+
+def test_kernels_are_timed_counted_and_compared(capsys):
+    words = ["bench", "kernels", *TINY, "num_robots=2"]
+    assert main([*words, "hydra.run.dir=first"]) == 0
+    first = report("first", "bench_kernels.json")
+    names = {row["kernel"] for row in first["rows"] if row["stage"] == "local step"}
+    assert {"plan_dwa", "scan_free", "merge_scan", "close_step"} <= names
+    assert {row["stage"] for row in first["rows"]} == {"goal", "local step", "observe", "reset"}
+    for row in first["rows"]:
+        assert 0 < row["in_place_us"]["p10"] <= row["in_place_us"]["median"] <= row["in_place_us"]["p90"]
+        assert row["alone_us"]["median"] > 0 and row["bytes"] > 0
+        assert row["share_of_copy"] == pytest.approx(
+            row["bytes"] / (1e-6 * row["in_place_us"]["median"]) / first["ceilings"]["copy_bytes_per_second"]
+        )
+    # an earlier run in which one kernel was ten times as fast, all beyond doubt
+    for row in first["rows"]:
+        factor = 0.1 if row["kernel"] == "scan_free" else 1.0
+        row["in_place_us"] = {name: factor * value for name, value in row["in_place_us"].items()}
+    Path("old run.json").write_text(json.dumps(first))
+    capsys.readouterr()
+    assert main([*words, "baseline=old run.json", "hydra.run.dir=second"]) == 0
+    rows = [row for row in report("second", "bench_kernels.json")["rows"] if row["kernel"] == "scan_free"]
+    assert all(row["changed"] and row["ratio"] > 2 for row in rows)
+    assert "!" in capsys.readouterr().out
+
+
+def test_a_change_is_beyond_the_noise_and_the_spread():
+    key = dict.fromkeys(bench_kernels.KEY, 0)
+
+    def compared(median, low, high):
+        row = key | {"in_place_us": {"median": median, "p10": low, "p90": high}}
+        bench_kernels.compare([row], {"by_key": {tuple(key.values()): {"median": 1.0, "p10": 0.9, "p90": 1.1}}})
+        return row["changed"]
+
+    assert compared(2.0, 1.9, 2.1) and compared(0.5, 0.4, 0.6)
+    assert not compared(1.2, 1.15, 1.3)  # apart, but less than the noise
+    assert not compared(2.0, 1.0, 3.0)  # far, but the spreads overlap
+
+
+BAD = {
+    "no file": (["baseline=no such.json"], "no such.json"),
+    "another file": (["baseline=other.json"], "other.json"),
+    "a moment": (["seconds=0"], "seconds=0"),
+    "two times": (["seconds=1,2"], "seconds"),
+    "no envs": (["num_envs=4,0"], "num_envs=0"),
+    "no robots": (["num_robots=2,0"], "num_robots"),
+    "an axis elsewhere": (["axes=envs"], "bench scale"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gives_a_sentence(case, capsys):
+    words, expected = BAD[case]
+    Path("other.json").write_text('{"rows": [1]}')
+    assert main(["bench", "kernels", *TINY, *words, "hydra.run.dir=out"]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("maexp: ") and err.count("\n") == 1 and expected in err, err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("settings", ["planner=dwa", "planner=direct"])
+def test_every_kernel_of_the_plain_step_has_a_formula(settings):
+    cfg = compose_config("bench", ["action=kernels", *TINY, "num_robots=2", settings])
+    env = bench_kernels.make_env(cfg, [make_map("maze_small", 0)], 2)
+    steps = bench_kernels.record_steps(env, env.simulation.shards[0])
+    assert {step.kernel for step in steps} <= set(FORMULAS)
+
+
+def test_counts_agree_with_the_definitions():
+    """Points in range and seen, by brute force over the whole map."""
+    env = ExplorationEnv(make_map("maze_small", 0), num_envs=3, num_robots=2, seed=4, num_threads=1)
+    env.rollout(2)
+    counts = count_moment(env, env.simulation.shards[0])
+    rows = []
+    for e in range(3):
+        shot = env.snapshot(e)
+        others = shot["center"][::-1]
+        for i, at in enumerate(shot["center"]):
+            free, boundary = (np.linalg.norm(p[:, :2] - at, axis=1) for p in (shot["map"].free, shot["map"].boundary))
+            outline = np.linalg.norm(others[i] - at) <= 10 + 2.5
+            least, most = (boundary <= 10).sum(), (boundary <= 10).sum() + 10 * outline
+            rows.append(((free <= 10).sum(), shot["visible"][i].sum(), least, most))
+    free_in, visible, least, most = np.mean(rows, axis=0)
+    assert counts["free_in"] == pytest.approx(free_in, abs=0.5) and counts["visible"] == pytest.approx(visible)
+    assert least - 0.5 <= counts["occluders"] <= most + 0.5
+    assert counts["free_in"] <= counts["free_near"] and counts["undecided"] <= counts["free_in"]
+    assert counts["undecided"] > 0 and counts["pair_tests"] >= counts["undecided"]
+    assert counts["team_points"] * 2 * 3 == sum(
+        int((env.simulation.tensors[f"seen_{k}"] != 0).sum()) for k in ("free", "boundary")
+    )
+
+
+def test_cost_grows_with_what_is_met():
+    env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=2, num_threads=1)
+    env.rollout(2)
+    counts = count_moment(env, env.simulation.shards[0])
+    more = counts | {"free_near": 2 * counts["free_near"], "pair_tests": 2 * counts["pair_tests"]}
+    assert kernel_cost("_scan_free", more).operations > kernel_cost("_scan_free", counts).operations
+    assert kernel_cost("_scan_free", more).bytes > kernel_cost("_scan_free", counts).bytes
+    assert kernel_cost("_unknown", counts) is None
+
+
+def test_counting_and_timing_change_nothing():
+    """What is timed is put back: the same moment for every lap, in place and alone."""
+    env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=3, num_threads=1)
+    env.rollout(1)
+    before = {name: value.clone() for name, value in env.simulation.tensors.items()}
+    shard = env.simulation.shards[0]
+    steps = bench_kernels.record_steps(env, shard)
+    run = bench_kernels.Runner(env.device, None)
+    run.in_place(steps, 0.01, lambda: count_moment(env, shard))
+    run.alone(steps, 0.01)
+    scratch = ("mask", "nearby")  # `record_steps` marks all envs; the planner's list is written before it is read
+    for name, value in env.simulation.tensors.items():
+        assert name in scratch or torch.equal(value, before[name]), name
