@@ -116,6 +116,7 @@ def make_env(cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int
         macro_steps=scenario.macro_steps,
         collision=scenario.collision,
         success_coverage=scenario.success_coverage,
+        num_threads=cfg.num_threads,
     )
 
 

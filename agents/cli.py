@@ -37,6 +37,12 @@ VERBS = {
         ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate policy=nearest_frontier scenario=maze"),
         "run_evaluate",
     ),
+    "benchmark": Verb(
+        "compares algorithms and classical policies over scenarios and seeds, in one table; resumable",
+        ("maexp benchmark preset=smoke", "maexp benchmark scenarios=maze,indoor_small algorithms=mappo policies=random",
+         "maexp benchmark resume=outputs/DATE/RUN"),
+        "run_benchmark",
+    ),
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",

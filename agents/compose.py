@@ -19,7 +19,13 @@ def group_choices(group: str) -> dict[str, str]:
     """The choices of a group of `conf/` with the comment on their first line: {"maze": "125 m mazes ..."}."""
     folder = resources.files("maexp.conf").joinpath(group)
     files = sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name)
-    return {one.name[:-5]: one.read_text().splitlines()[0].removeprefix("#").strip() for one in files}
+    return {one.name[:-5]: _first_comment(one.read_text()) for one in files}
+
+
+def _first_comment(text: str) -> str:
+    """The first line without its #; Hydra wants "# @package" before it where there is one."""
+    line = next(line for line in text.splitlines() if not line.startswith("# @"))
+    return line.removeprefix("#").strip()
 
 
 def groups() -> list[str]:

@@ -10,7 +10,13 @@ from maexp.agents.errors import UserError
 from maexp.agents.schema import schema
 
 PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir")
-LISTS = {"evaluate": ("num_robots", "policy"), "bench": ("num_robots",)}
+LISTS = {
+    "evaluate": ("num_robots", "policy"),
+    "bench": ("num_robots",),
+    "benchmark": (
+        "scenarios", "algorithms", "policies", "seeds", "maps", "scenario", "algorithm", "policy", "seed",
+    ),
+}  # fmt: skip
 
 
 def split_flags(words: list[str]) -> tuple[list[str], list[str]]:

@@ -4,9 +4,10 @@ import json
 import math
 import os
 import subprocess
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from omegaconf import OmegaConf
 from rich import box
@@ -67,8 +68,27 @@ def write_results(path: Path, results: list[EvaluationResult], run: dict) -> Non
     """{policy: {metric: {mean, std, ci95, n}}} and `run`: what was run."""
     named = {name: one.summary() for name, one in zip(result_names(results), results, strict=True)}
     named["run"] = run | {"num_robots": sorted({one.num_robots for one in results})}
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(_without_nan(named), indent=2) + "\n")
+    write_json(path, named)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """A JSON file, null where a number is NaN."""
+    write_text(path, json.dumps(_without_nan(content), indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all: a kill at any moment leaves the old one or the new one."""
+    write_file(path, lambda file: file.write(text.encode()))
+
+
+def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
+    """The same for a file that `fill` writes into."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".tmp")
+    with open(aside, "wb") as file:
+        fill(file)
+        file.flush()
+        os.fsync(file.fileno())
     os.replace(aside, path)
 
 

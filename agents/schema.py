@@ -118,6 +118,7 @@ class EnvSettings:
     num_envs: int = setting(32, "teams simulated at once")
     seed: int = setting(0, "of everything random: maps' starts, networks, policy")
     device: str = setting("auto", "cpu, cuda, cuda:1, ...; auto: cuda where there is one")
+    num_threads: int | None = setting(None, "CPU threads of the simulation; default: as many as help")
 
 
 @dataclass
@@ -184,7 +185,41 @@ class BenchSettings(LearnerSettings):
     sweep: Any = None  # settings that were given several values; filled by the command line
 
 
-SCHEMAS = {"train": TrainSettings, "evaluate": EvaluateSettings, "maps": MapsSettings, "bench": BenchSettings}
+@dataclass
+class BenchmarkSettings(LearnerSettings):
+    """`maexp benchmark`."""
+
+    seed: int = 0  # each cell has its own, from `seeds`
+    preset: str = MISSING
+    scenarios: Any = setting(None, "where: scenarios=maze,indoor_small; default: what the preset says")
+    algorithms: Any = setting(None, "trained and then evaluated; default: all six")
+    policies: Any = setting(None, "classical ones, only evaluated; default: all")
+    seeds: Any = setting(None, "of training, starts and maps; default: what the preset says")
+    episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)")
+    num_robots: int = setting(3, "robots in a team")
+    total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for")
+    iterations: int | None = setting(None, "instead: iterations of one episode of each of the num_envs teams")
+    maps: Any = setting("held_out", "evaluated on held_out or trained maps, or both as maps=held_out,trained")
+    train_maps: int | None = setting(None, "train on the first so many maps; default: all but the last fifth")
+    test_maps: int | None = setting(None, "evaluate on the first so many held-out maps; default: all of them")
+    policy_per_map: Any = setting(None, "a policy for each of so many maps, as {maze: 4}; default: one for all")
+    workers: int | None = setting(None, "cells at once; default: the cores, or the GPUs where there are some")
+    resume: str | None = setting(None, "folder of a benchmark to go on with (its settings are kept)")
+    report: bool = setting(False, "run nothing, only write the tables and pictures of the cells that are done")
+    confirm: bool = setting(False, "run it although it would take more than a day")
+    estimate: bool = setting(True, "measure a few steps first and say how long it will take")
+    checkpoint_every: int = setting(10, "iterations between two checkpoints of a training")
+    checkpoint_keep: int = setting(2, "newest checkpoints kept, besides the best")
+    collector: CollectorSettings = field(default_factory=CollectorSettings)
+
+
+SCHEMAS = {
+    "train": TrainSettings,
+    "evaluate": EvaluateSettings,
+    "maps": MapsSettings,
+    "bench": BenchSettings,
+    "benchmark": BenchmarkSettings,
+}
 
 
 def schema(verb: str) -> type:

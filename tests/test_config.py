@@ -8,7 +8,7 @@ from maexp.agents.compose import compose_config, group_choices, groups
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
 from maexp.agents.overrides import find_override, make_overrides, quote, without
-from maexp.agents.schema import SCHEMAS
+from maexp.agents.schema import SCHEMAS, schema
 from maexp.envs.scenarios import SCENARIOS
 
 
@@ -24,7 +24,8 @@ def refusal(verb: str, *words: str) -> str:
 def test_every_choice_composes_and_is_described(group):
     for choice, text in group_choices(group).items():
         assert text, f"conf/{group}/{choice}.yaml has no description on its first line"
-        assert compose_config("train", [f"{group}={choice}"])[group] is not None
+        verb = "train" if group in schema("train").__dataclass_fields__ else "benchmark"
+        assert compose_config(verb, [f"{group}={choice}"])[group] is not None
 
 
 def test_choices_match_the_tables_of_the_code():

@@ -19,6 +19,11 @@ OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger
     "train": (*PLACES, "total_frames=8", "collector.steps=2", "episodes=2", "model.channels=4"),
     "evaluate": (*PLACES, "episodes=2"),
+    "benchmark": (
+        *PLACES, "scenarios=maze_small", "algorithms=mappo", "policies=random", "seeds=0", "iterations=null",
+        "total_frames=4", "collector.steps=2", "episodes=2", "model.channels=4", "train_maps=1",
+        "test_maps=1", "policy_per_map=null", "estimate=false", "workers=1",
+    ),
     "bench": ("scenario.local_steps=3", "num_envs=2", "num_robots=2", "device=cpu", "seconds=0.05"),
 }
 MEANT = {  # placeholder -> what stands for it here

@@ -1,0 +1,272 @@
+"""What a benchmark is made of: cells, the settings of each, the folder they live in and what may change there."""
+
+import fcntl
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.compose import compose_config
+from maexp.agents.errors import UserError
+from maexp.agents.overrides import quote
+from maexp.agents.policies import POLICIES
+from maexp.agents.results import plain, write_json
+from maexp.envs.scenarios import SCENARIOS, find_scenario, split
+
+PLAN = "benchmark.json"
+SUITES = ("held_out", "trained")
+SECTIONS = (
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
+    "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
+)  # fmt: skip
+"""Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
+OWN = ("scenario.name", "algorithm.name")  # each cell has its own
+FREE = (
+    "preset", "scenarios", "algorithms", "policies", "seeds", "seed", "maps", "workers", "device", "confirm", "report",
+    "estimate", "resume", "checkpoint_every", "checkpoint_keep", "num_threads", *OWN,
+)  # fmt: skip
+"""Settings that may change when a benchmark goes on: finished cells stay comparable."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One policy on one scenario with one seed; the unit that is run, skipped and reported.
+
+    Attributes:
+        map: the one map the policy is trained on; None: all training maps of the scenario
+    """
+
+    scenario: str
+    policy: str
+    seed: int
+    map: int | None = None
+
+    @property
+    def name(self) -> str:
+        """As on the screen, and below `cells/`."""
+        place = "" if self.map is None else f"map_{self.map}_"
+        return f"{self.scenario}/{self.policy}/{place}seed_{self.seed}"
+
+    @property
+    def trains(self) -> bool:
+        """Whether the policy has to be trained."""
+        return self.policy in ALGORITHMS
+
+
+def list_cells(cfg: Any) -> list[Cell]:
+    """All cells in the order they are run: seed by seed, scenario by scenario, classical policies first."""
+    names = policy_names(cfg)
+    ordered = [one for one in names if one in POLICIES] + [one for one in names if one in ALGORITHMS]
+    return [
+        Cell(scenario, policy, seed, index)
+        for seed in as_list(cfg.seeds)
+        for scenario in as_list(cfg.scenarios)
+        for index in own_maps(cfg, scenario)
+        for policy in ordered
+    ]
+
+
+def own_maps(cfg: Any, scenario: str) -> list[int | None]:
+    """The maps that have a policy each, or one None where a policy is trained on all."""
+    if cfg.policy_per_map is None:
+        return [None]
+    return list(range(cfg.policy_per_map[scenario]))
+
+
+def as_list(value: Any) -> list:
+    """A setting of one value or several as a list."""
+    if value is None:
+        return []
+    return list(value) if OmegaConf.is_list(value) or isinstance(value, list | tuple) else [value]
+
+
+def policy_names(cfg: Any) -> list[str]:
+    """Algorithms and classical policies, each once."""
+    return list(dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies)))
+
+
+def check_lists(cfg: Any) -> None:
+    """Raise UserError unless scenarios, policies, seeds and maps are lists of what there is."""
+    known = {
+        "scenarios": list(SCENARIOS), "algorithms": list(ALGORITHMS), "policies": list(POLICIES), "maps": list(SUITES)
+    }  # fmt: skip
+    for name, choices in known.items():
+        for value in as_list(cfg[name]):
+            both = [*ALGORITHMS, *POLICIES] if name in ("algorithms", "policies") else choices
+            if value not in both:
+                raise UserError(f"{name}={value} is unknown: choose of {', '.join(choices)}.")
+    for name in ("scenarios", "maps", "seeds"):
+        if not as_list(cfg[name]):
+            raise UserError(f"{name}=[] leaves nothing to do: give at least one.")
+    if not policy_names(cfg):
+        raise UserError("algorithms=[] and policies=[] leave nothing to compare: give at least one of either.")
+    for name in ("seeds", "scenarios"):
+        values = as_list(cfg[name])
+        if len(set(values)) < len(values):
+            raise UserError(f"{name}={values} names one twice: give each once.")
+    for seed in as_list(cfg.seeds):
+        if type(seed) is not int or seed < 0:
+            raise UserError(f"seeds={seed} must be whole numbers, 0 or more, as seeds=0,1,2.")
+    _check_policy_per_map(cfg)
+
+
+def _check_policy_per_map(cfg: Any) -> None:
+    if cfg.policy_per_map is None:
+        return
+    counts = plain(cfg.policy_per_map) if OmegaConf.is_dict(cfg.policy_per_map) else cfg.policy_per_map
+    good = isinstance(counts, dict) and all(type(one) is int and one >= 1 for one in counts.values())
+    if not good:
+        raise UserError(f"policy_per_map={counts} must say how many maps of each scenario, as {{maze: 4}}.")
+    for scenario in as_list(cfg.scenarios):
+        if scenario not in counts:
+            raise UserError(f"policy_per_map has no {scenario}: add policy_per_map.{scenario}=1, or leave it out.")
+
+
+# Settings of a cell
+
+
+def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
+    """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
+    words = [f"scenario={cell.scenario}", f"seed={cell.seed}"]
+    words += [f"algorithm={cell.policy}"] if cell.trains else []
+    usual, ours = (
+        _flatten({name: node[name] for name in SECTIONS}) for node in (plain(compose_settings("train", [])), plain(cfg))
+    )
+    changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
+    changed |= _maps_of(cfg, cell) | _length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
+    if not cell.trains:
+        changed = {name: value for name, value in changed.items() if not name.startswith("algorithm.")}
+    return words + [f"{name}={render(value)}" for name, value in changed.items()]
+
+
+def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
+    """Which maps the cell trains on and which are held out, where not all of them."""
+    if find_scenario(cell.scenario).build is None:
+        return {}
+    chosen: dict[str, Any] = {}
+    train, held_out = split(cell.scenario)
+    if cell.map is not None:
+        chosen["scenario.maps"] = [cell.map]
+    elif cfg.train_maps is not None and cfg.scenario.maps is None:
+        chosen["scenario.maps"] = list(train[: cfg.train_maps])
+    if cfg.test_maps is not None and cfg.scenario.held_out is None:
+        chosen["scenario.held_out"] = list(held_out[: cfg.test_maps])
+    return chosen
+
+
+def _length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
+    """For `iterations`: each collects one whole episode of every team."""
+    if cfg.iterations is None:
+        return {}
+    steps = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or cfg.collector.steps
+    return {"collector.steps": steps, "total_frames": cfg.iterations * cfg.num_envs * steps}
+
+
+def cell_config(cfg: Any, cell: Cell) -> tuple[Any, list[str]]:
+    """(settings of maexp train, overrides) of a cell."""
+    words = cell_overrides(cfg, cell)
+    return compose_settings("train", words), words
+
+
+def compose_settings(verb: str, overrides: list[str]) -> Any:
+    """The settings of a verb without Hydra's own."""
+    composed = compose_config(verb, overrides)
+    return OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+
+
+def render(value: Any) -> str:
+    """A value as Hydra reads it on the command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{name}:{render(one)}" for name, one in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(render(one) for one in value) + "]"
+    return quote(str(value))
+
+
+def _flatten(node: dict, prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for name, value in node.items():
+        if isinstance(value, dict) and value:
+            flat |= _flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+# The folder
+
+
+def cell_folder(where: Path, cell: Cell) -> Path:
+    return where / "cells" / cell.name
+
+
+def write_plan(where: Path, cfg: Any, overrides: list[str]) -> None:
+    """benchmark.json: the words of the command line, and the settings that all cells share."""
+    write_json(where / PLAN, {"overrides": overrides, "settings": shared_settings(cfg)})
+
+
+def read_plan(place: str | Path) -> dict:
+    """The content of a benchmark's benchmark.json.
+
+    Raises:
+        UserError: the folder holds no benchmark.
+    """
+    path = Path(place) / PLAN
+    if not path.is_file():
+        found = "does not exist" if not Path(place).exists() else f"holds no {PLAN}"
+        raise UserError(f"{place} {found}: give the folder of a maexp benchmark that was started before.")
+    try:
+        content = json.loads(path.read_text())
+        return {"overrides": list(content["overrides"]), "settings": dict(content["settings"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged: start the benchmark anew in another folder.") from error
+
+
+def shared_settings(cfg: Any) -> dict[str, Any]:
+    """What must stay as it is for cells to be comparable."""
+    return {name: value for name, value in _flatten(plain(cfg)).items() if not _is_free(name)}
+
+
+def _is_free(name: str) -> bool:
+    return any(name == one or name.startswith(f"{one}.") for one in FREE)
+
+
+def check_unchanged(where: Path, cfg: Any) -> None:
+    """Raise UserError if a setting differs from that of the cells already there."""
+    if not (where / PLAN).is_file() or not any((where / "cells").glob("*/*/*")):
+        return
+    before, now = read_plan(where)["settings"], json.loads(json.dumps(shared_settings(cfg)))
+    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if names:
+        listed = ", ".join(f"{name} (was {before.get(name)}, now {now.get(name)})" for name in names[:4])
+        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        raise UserError(
+            f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were, "
+            "or start a benchmark of its own."
+        )
+
+
+@contextmanager
+def lock(where: Path) -> Iterator[None]:
+    """Hold the folder; the lock ends with this process, however it ends.
+
+    Raises:
+        UserError: another process is at it.
+    """
+    with open(where / "benchmark.lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UserError(f"Another maexp benchmark is running in {where}: wait for it or stop it.") from error
+        yield

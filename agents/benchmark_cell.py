@@ -1,0 +1,123 @@
+"""One cell of a benchmark: train where there is something to train, play the episodes, keep all their numbers."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.benchmark import Cell, cell_config, cell_folder
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
+from maexp.agents.errors import blame_input
+from maexp.agents.evaluate import evaluate
+from maexp.agents.policies import POLICIES
+from maexp.agents.progress import Progress
+from maexp.agents.results import describe_run, write_file, write_json
+from maexp.agents.train import TrainingRun, train, write_config
+from maexp.envs.recorder import CoverageRecorder
+
+RECORD_EVERY = 10  # local steps between two points of a coverage curve
+CURVE = ("curve_seconds", "curve_coverage")
+
+
+@dataclass
+class CellResult:
+    """What a finished cell left for one set of maps.
+
+    Attributes:
+        episodes: each metric's value in each episode, NaN where an episode has none
+        seconds: times of the coverage curve [s], shape [records]
+        coverage: [episodes, records] in [0, 1]
+        run: what was run
+    """
+
+    episodes: dict[str, np.ndarray]
+    seconds: np.ndarray
+    coverage: np.ndarray
+    run: dict
+
+
+class EnvShelf:
+    """The last env for each set of maps: building one takes longer than many an evaluation."""
+
+    def __init__(self):
+        self.kept: dict[str, tuple[str, Any]] = {}
+
+    def find(self, suite: str, key: str, build: Callable[[], Any]) -> Any:
+        """The env kept for `key`, or a new one in place of the one kept."""
+        if self.kept.get(suite, ("", None))[0] != key:
+            self.kept.pop(suite, None)
+            self.kept[suite] = (key, build())
+        return self.kept[suite][1]
+
+
+def finished(where: Path, cell: Cell, suite: str) -> bool:
+    """Whether a cell has its result; it is written last."""
+    return (cell_folder(where, cell) / f"{suite}.json").is_file()
+
+
+def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[str]) -> bool:
+    """Bring a cell to its end, from wherever it was left; False if it was told to stop.
+
+    Raises:
+        UserError: settings or maps that cannot be used.
+    """
+    folder = cell_folder(where, cell)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings, words = cell_config(cfg, cell)
+    policy, trained = None, {}
+    if cell.trains:
+        saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
+        run = TrainingRun.build(settings, folder, words, saved)
+        write_config(settings, folder, "train", words)
+        train(run)
+        if run.stopped:
+            return False
+        policy, trained = run.learner.policy, {"training_seconds": round(run.seconds, 2)}
+    for suite in suites:
+        if not finished(where, cell, suite):
+            play_suite(cfg, settings, cell, suite, policy, folder, shelf, trained)
+    return True
+
+
+def play_suite(
+    cfg: Any, settings: Any, cell: Cell, suite: str, policy: Any, folder: Path, shelf: EnvShelf, trained: dict
+) -> None:
+    """Play the episodes of one set of maps; writes the arrays, then the summary that marks the end."""
+    with blame_input():
+        maps = getattr(load_maps(settings.scenario, train=suite == "trained"), _ATTRIBUTE[suite])
+        key = f"{cell.scenario} {cell.seed} {cell.map} {suite}"
+        size = min(cfg.num_envs, cfg.episodes)
+        env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
+        bound = POLICIES[cell.policy](env) if policy is None else policy
+    begin = time.perf_counter()
+    with Progress(f"evaluating on {suite}", cfg.episodes) as progress:
+        with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
+            result = evaluate(
+                bound, env, cfg.episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
+            )
+    seconds, coverage = recorder.curves(cfg.episodes)
+    arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
+    write_file(folder / f"{suite}.npz", lambda file: np.savez_compressed(file, **arrays))
+    described = describe_run(settings, maps, time.perf_counter() - begin) | trained
+    described |= {"algorithm": cell.policy if cell.trains else None, "episodes": cfg.episodes, "maps_are": suite}
+    described |= {"num_robots": env.num_robots, "device": str(env.device)}
+    described |= {"limit": env.local_steps * env.macro_steps}
+    write_json(folder / f"{suite}.json", {cell.policy: result.summary(), "run": described})
+
+
+_ATTRIBUTE = {"held_out": "held_out", "trained": "train"}
+
+
+def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
+    """The result of a finished cell."""
+    folder = cell_folder(where, cell)
+    run = json.loads((folder / f"{suite}.json").read_text())["run"]
+    with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    seconds, coverage = (arrays.pop(name) for name in CURVE)
+    return CellResult(arrays, seconds, coverage, run)

@@ -1,0 +1,128 @@
+"""What a benchmark leaves: tables, summaries and pictures, of all cells that are done so far."""
+
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.benchmark import Cell
+from maexp.agents.benchmark_cell import CellResult, finished, read_result
+from maexp.agents.benchmark_table import (
+    Column,
+    pool_column,
+    print_tables,
+    table_csv,
+    table_latex,
+    table_markdown,
+)
+from maexp.agents.results import PACKAGES, find_commit, write_json, write_text
+
+
+class Report:
+    """Reads finished cells, each once, and writes what comes of them.
+
+    Args:
+        cfg: settings of maexp benchmark
+        where: the folder
+        cells: all cells, in their order
+        suites: the sets of maps
+    """
+
+    def __init__(self, cfg: Any, where: Path, cells: list[Cell], suites: list[str]):
+        self.cfg, self.where, self.cells, self.suites = cfg, where, cells, suites
+        self._results: dict[tuple[Cell, str], CellResult] = {}
+        self._columns: dict[tuple, Column] = {}
+        self._written: set[tuple[int, str]] = set()
+
+    def update(self, done: list[Cell], running: list[Cell]) -> None:
+        """Write the tables when a scenario has been through all its policies with a seed."""
+        blocks = {(one.seed, one.scenario) for one in done}
+        blocks = {one for one in blocks - self._written if self._is_whole(one)}
+        if blocks:
+            self._written |= blocks
+            self.write_tables()
+
+    def _is_whole(self, block: tuple[int, str]) -> bool:
+        cells = [one for one in self.cells if (one.seed, one.scenario) == block]
+        return all(finished(self.where, one, suite) for one in cells for suite in self.suites)
+
+    def finish(self) -> None:
+        """Everything, and the table on the terminal."""
+        tables = self.write_tables()
+        if not tables:
+            print("No cell is done yet, so there is no table.")
+            return
+        written = ["table.csv", "table.md", "table.tex", "summary.json", *self.draw(tables)]
+        print_tables(tables)
+        print(f"Written to {self.where}: {', '.join(written)}")
+
+    def results(self, scenario: str, policy: str, suite: str) -> list[tuple[Cell, CellResult]]:
+        """The finished cells of a policy in a scenario."""
+        found = []
+        for cell in self.cells:
+            if (cell.scenario, cell.policy) == (scenario, policy) and finished(self.where, cell, suite):
+                if (cell, suite) not in self._results:
+                    self._results[cell, suite] = read_result(self.where, cell, suite)
+                found.append((cell, self._results[cell, suite]))
+        return found
+
+    def tables(self) -> dict[str, list[Column]]:
+        """Per scenario the columns of all policies that have finished cells."""
+        tables: dict[str, list[Column]] = {}
+        policies = list(dict.fromkeys(one.policy for one in self.cells))
+        for scenario in dict.fromkeys(one.scenario for one in self.cells):
+            columns = [self._column(scenario, policy, suite) for suite in self.suites for policy in policies]
+            columns = [one for one in columns if one is not None]
+            if columns:
+                tables[scenario] = columns
+        return tables
+
+    def _column(self, scenario: str, policy: str, suite: str) -> Column | None:
+        found = self.results(scenario, policy, suite)
+        if not found:
+            return None
+        key = (scenario, policy, suite, *(cell for cell, _ in found))
+        if key not in self._columns:
+            pairs = [(cell.seed, result.episodes) for cell, result in found]
+            self._columns[key] = pool_column(policy, suite, pairs)
+        return self._columns[key]
+
+    def write_tables(self) -> dict[str, list[Column]]:
+        """table.csv, table.md, table.tex and summary.json; returns the columns of each scenario."""
+        tables = self.tables()
+        if tables:
+            write_text(self.where / "table.csv", table_csv(tables))
+            write_text(self.where / "table.md", table_markdown(tables))
+            write_text(self.where / "table.tex", table_latex(tables))
+            for scenario, columns in tables.items():
+                named = {one.name: one.summary for one in columns}
+                write_json(self.where / "summaries" / f"{scenario}.json", named | {"run": self.describe([scenario])})
+            content = {scenario: {one.name: one.summary for one in columns} for scenario, columns in tables.items()}
+            write_json(self.where / "summary.json", content | {"run": self.describe(list(tables))})
+        return tables
+
+    def describe(self, scenarios: list[str]) -> dict:
+        """What was run, of the cells that are done."""
+        known = {cell: one.run for (cell, _), one in self._results.items() if cell.scenario in scenarios}
+        runs = [one.run for (cell, _), one in self._results.items() if cell.scenario in scenarios]
+        return {
+            "preset": self.cfg.preset,
+            "scenario": scenarios[0] if len(scenarios) == 1 else scenarios,
+            "maps": sorted({name for one in runs for name in one["maps"]}),
+            "maps_are": self.suites,
+            "seeds": sorted({cell.seed for cell in known}),
+            "episodes": self.cfg.episodes,
+            "num_robots": self.cfg.num_robots,
+            "planner": self.cfg.planner.name,
+            "cells": {"done": len(known), "all": sum(one.scenario in scenarios for one in self.cells)},
+            "commit": find_commit(),
+            "commits_of_cells": sorted({str(one["commit"]) for one in runs}),
+            "versions": {name: metadata.version(name) for name in PACKAGES},
+            "seconds": round(sum(one["seconds"] for one in runs), 2),
+            "training_seconds": round(sum(one.get("training_seconds", 0.0) for one in known.values()), 2),
+        }
+
+    # Pictures
+
+    def draw(self, tables: dict[str, list[Column]]) -> list[str]:
+        """All pictures; returns their names."""
+        return []

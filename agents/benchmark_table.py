@@ -1,0 +1,266 @@
+"""The table of a benchmark, in the layout of the paper's: pooled over seeds, bold computed, four ways of writing it."""
+
+import csv
+import io
+from dataclasses import dataclass, field
+
+import numpy as np
+from rich import box
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from maexp.agents.paper_results import paper_value
+from maexp.envs.metrics import summarise
+
+
+@dataclass(frozen=True)
+class Row:
+    """A metric of the table: its name, which way is better (1: up, -1: down), and how it is printed."""
+
+    metric: str
+    label: str
+    unit: str
+    better: int
+    scale: float
+    digits: int
+
+    @property
+    def title(self) -> str:
+        arrow = "↑" if self.better > 0 else "↓"
+        return f"{self.label}{f' {self.unit}' if self.unit else ''} {arrow}"
+
+    def number(self, value: float) -> str:
+        return f"{self.scale * value:.{self.digits}f}"
+
+
+ROWS = (
+    Row("exploration_ratio", "ER", "%", 1, 100, 1),
+    Row("coverage_step_85", "CS85", "steps", -1, 1, 0),
+    Row("coverage_step_95", "CS95", "steps", -1, 1, 0),
+    Row("mutual_overlap_85", "MO85", "%", -1, 100, 1),
+    Row("mutual_overlap_95", "MO95", "%", -1, 100, 1),
+    Row("reward_variance", "RV", "", -1, 1, 0),
+)
+SHORT = {"held_out": "", "trained": " (training maps)"}
+NOTES = (
+    "ER: exploration ratio, more is better. CS85, CS95: local steps until 85, 95 % coverage; MO85, MO95: share of the "
+    "seen points that two or more robots saw, at that moment; RV: spread of the reward over robots; less is better.",
+    "Mean ± standard deviation over episodes, [bootstrap 95 % interval of the mean]. CS and MO: over the episodes that "
+    "got there, (how many/of all); a policy that seldom gets there shows its luckiest episodes.",
+    "Bold: the best mean of a row as printed; several where they tie. paper: Table II, trained and tested on the same "
+    "map; its indoor and outdoor maps are scans, ours are generated.",
+)
+
+
+@dataclass
+class Column:
+    """A policy on one set of maps in one scenario, pooled over its cells.
+
+    Attributes:
+        summary: {metric: {mean, std, ci95, n}}
+        total: episodes
+        seeds: {seed: mean of each metric}, to see how far trainings differ
+    """
+
+    policy: str
+    suite: str
+    summary: dict[str, dict]
+    total: int
+    seeds: dict[int, dict[str, float]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.policy + SHORT[self.suite]
+
+
+def pool_column(policy: str, suite: str, cells: list[tuple[int, dict[str, np.ndarray]]]) -> Column:
+    """The column of a policy from the (seed, episodes) of its cells."""
+    metrics = list(cells[0][1])
+    pooled = {name: np.concatenate([episodes[name] for _, episodes in cells]) for name in metrics}
+    seeds: dict[int, dict[str, float]] = {}
+    for seed in dict.fromkeys(seed for seed, _ in cells):
+        same = [episodes for one, episodes in cells if one == seed]
+        seeds[seed] = {name: _mean(np.concatenate([one[name] for one in same])) for name in metrics}
+    summary = {name: summarise(values) for name, values in pooled.items()}
+    return Column(policy, suite, summary, len(pooled["exploration_ratio"]), seeds)
+
+
+def _mean(values: np.ndarray) -> float:
+    kept = values[~np.isnan(values)]
+    return float(kept.mean()) if len(kept) else float("nan")
+
+
+def best(means: dict[str, float | None], row: Row) -> set[str]:
+    """Names with the best mean as printed: several where they tie, none where there is no value or only one name."""
+    printed = {name: float(row.number(one)) for name, one in means.items() if one is not None and one == one}
+    if len(means) < 2 or not printed:
+        return set()
+    top = max(row.better * one for one in printed.values())
+    return {name for name, one in printed.items() if row.better * one == top}
+
+
+def best_columns(columns: list[Column], row: Row) -> set[str]:
+    """Names of the columns that are bold in a row; each set of maps is compared by itself."""
+    found: set[str] = set()
+    for suite in dict.fromkeys(one.suite for one in columns):
+        found |= best({one.name: one.summary[row.metric]["mean"] for one in columns if one.suite == suite}, row)
+    return found
+
+
+# Parts of a cell
+
+
+def value_text(column: Column, row: Row) -> str:
+    """68.8 ± 5.7, or - where no episode got there."""
+    one = column.summary[row.metric]
+    return f"{row.number(one['mean'])} ± {row.number(one['std'])}" if one["n"] else "-"
+
+
+def interval_text(column: Column, row: Row) -> str:
+    """[67.2, 70.1], and of how many episodes where it can be fewer than all."""
+    one = column.summary[row.metric]
+    count = f"({one['n']}/{column.total})"
+    if not one["n"]:
+        return count
+    low, high = (row.number(end) for end in one["ci95"])
+    return f"[{low}, {high}]" + (f" {count}" if row.label.startswith(("CS", "MO")) else "")
+
+
+def paper_text(scenario: str, column: Column, row: Row) -> str | None:
+    """The paper's value of the same scenario and algorithm."""
+    value = paper_value(scenario, column.policy, row.metric)
+    digits = 2 if row.digits else 0
+    return None if value is None else f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+
+
+# Terminal
+
+
+def print_tables(tables: dict[str, list[Column]], console: Console | None = None) -> None:
+    """A table per scenario, policies as rows; fits 100 columns."""
+    console = console or Console()
+    console = Console(file=console.file, width=max(100, console.width), force_terminal=console.is_terminal)
+    for scenario, columns in tables.items():
+        console.print(draw_table(scenario, columns))
+    console.print(Group(*(Text(one, style="dim") for one in NOTES)))
+
+
+def draw_table(scenario: str, columns: list[Column]) -> Table:
+    """The table of one scenario."""
+    table = Table(title=f"{scenario}: {columns[0].total} episodes a policy", title_justify="left", box=box.SIMPLE_HEAD,
+                  pad_edge=False, collapse_padding=True, padding=(0, 1))  # fmt: skip
+    table.add_column("policy", no_wrap=True)
+    for row in ROWS:
+        table.add_column(row.title, justify="right", no_wrap=True)
+    bold = {row.metric: best_columns(columns, row) for row in ROWS}
+    for column in columns:
+        cells = []
+        for row in ROWS:
+            cell = Text(value_text(column, row), style="bold" if column.name in bold[row.metric] else "")
+            cells.append(cell.append(f"\n{_narrow(column, row)}", style="not bold dim"))
+        table.add_row(column.name.replace(" (", "\n("), *cells)
+        published = [paper_text(scenario, column, row) for row in ROWS]
+        if any(published):
+            table.add_row(Text("  paper", style="dim"), *(Text(one or "-", style="dim") for one in published))
+    return table
+
+
+def _narrow(column: Column, row: Row) -> str:
+    """The interval; for CS and MO, where there is no room for both, for CS how many and for MO the interval."""
+    one = column.summary[row.metric]
+    if row.label.startswith("CS") or not one["n"]:
+        return f"({one['n']}/{column.total})"
+    low, high = (row.number(end) for end in one["ci95"])
+    return f"[{low}, {high}]"
+
+
+# Files
+
+
+def table_csv(tables: dict[str, list[Column]]) -> str:
+    """A line per scenario, policy, set of maps and metric, all metrics; empty where there is no value."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["scenario", "policy", "maps", "metric", "mean", "std", "ci95_low", "ci95_high", "reached",
+                     "episodes", "best", "paper_mean", "paper_std", "seed_means"])  # fmt: skip
+    rows = {row.metric: row for row in ROWS}
+    for scenario, columns in tables.items():
+        bold = {row.metric: best_columns(columns, row) for row in ROWS}
+        for column in columns:
+            for metric, one in column.summary.items():
+                row = rows.get(metric)
+                published = paper_value(scenario, column.policy, metric) or ("", "")
+                scale = row.scale if row else 1.0
+                published = [value / scale if value != "" else "" for value in published]
+                numbers = [one["mean"], one["std"], *one["ci95"]] if one["n"] else [""] * 4
+                seeds = " ".join(f"{seed}:{means[metric]:.6g}" for seed, means in column.seeds.items())
+                is_best = int(column.name in bold[metric]) if row else ""
+                writer.writerow([scenario, column.policy, column.suite, metric, *map(_csv_number, numbers), one["n"],
+                                 column.total, is_best, *map(_csv_number, published), seeds])  # fmt: skip
+    return text.getvalue()
+
+
+def _csv_number(value) -> str:
+    return value if value == "" else f"{value:.6g}"
+
+
+def table_markdown(tables: dict[str, list[Column]]) -> str:
+    """A table per scenario as in the paper: metrics as rows, policies as columns."""
+    parts = []
+    for scenario, columns in tables.items():
+        lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
+        lines += ["| | " + " | ".join(one.name for one in columns) + " |", "| --- |" + " --- |" * len(columns)]
+        for row in ROWS:
+            bold = best_columns(columns, row)
+            cells = [_markdown_cell(scenario, one, row, bold) for one in columns]
+            lines.append(f"| {row.title} | {' | '.join(cells)} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join([*parts, *NOTES]) + "\n"
+
+
+def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> str:
+    text = value_text(column, row)
+    text = f"**{text}**" if column.name in bold else text
+    published = paper_text(scenario, column, row)
+    return "<br>".join([text, interval_text(column, row), *([f"paper {published}"] if published else [])])
+
+
+def table_latex(tables: dict[str, list[Column]]) -> str:
+    """One tabular for \\input: scenarios and metrics as rows, policies as columns; needs booktabs and multirow."""
+    names = list(dict.fromkeys(one.name for columns in tables.values() for one in columns))
+    lines = [r"% \usepackage{booktabs,multirow}", rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
+    lines += [" & & " + " & ".join(_escape(one) for one in names) + r" \\"]
+    for scenario, columns in tables.items():
+        lines.append(r"\midrule")
+        have = {one.name: one for one in columns}
+        published = any(paper_text(scenario, one, ROWS[0]) for one in columns)
+        height = len(ROWS) * (3 if published else 2)
+        for k, row in enumerate(ROWS):
+            head = rf"\multirow{{{height}}}{{*}}{{{_escape(scenario)}}}" if k == 0 else ""
+            bold = best_columns(columns, row)
+            label = _escape(row.title).replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")
+            cells = [_latex_cell(have.get(name), row, bold) for name in names]
+            lines.append(f"{head} & {label} & {' & '.join(cells)} " + r"\\")
+            small = [rf"{{\scriptsize {interval_text(have[n], row)}}}" if n in have else "" for n in names]
+            lines.append(" & & " + " & ".join(small) + r" \\")
+            if published:
+                texts = [paper_text(scenario, have[n], row) if n in have else None for n in names]
+                small = [rf"{{\scriptsize ${t.replace('±', chr(92) + 'pm')}$}}" if t else "" for t in texts]
+                lines.append(r" & {\scriptsize paper} & " + " & ".join(small) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *("% " + one for one in NOTES)]) + "\n"
+
+
+def _latex_cell(column: Column | None, row: Row, bold: set[str]) -> str:
+    if column is None:
+        return ""
+    one = column.summary[row.metric]
+    if not one["n"]:
+        return "-"
+    mean, std = row.number(one["mean"]), row.number(one["std"])
+    mean = rf"\mathbf{{{mean}}}" if column.name in bold else mean
+    return rf"${mean} \pm {std}$"
+
+
+def _escape(text: str) -> str:
+    return text.replace("_", r"\_").replace("%", r"\%")

@@ -1,0 +1,200 @@
+"""`maexp benchmark`: policies x scenarios x seeds, cell by cell, to one table."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.benchmark import (
+    PLAN,
+    Cell,
+    as_list,
+    cell_folder,
+    check_lists,
+    check_unchanged,
+    list_cells,
+    lock,
+    read_plan,
+    write_plan,
+)
+from maexp.agents.benchmark_cell import finished
+from maexp.agents.benchmark_estimate import Estimate, estimate_cells
+from maexp.agents.benchmark_pool import Outcome, WorkerPool, last_lines
+from maexp.agents.benchmark_report import Report
+from maexp.agents.build import pick_device
+from maexp.agents.checks import check_counts
+from maexp.agents.errors import UserError
+from maexp.agents.overrides import find_override, without
+from maexp.agents.progress import Progress, duration
+from maexp.agents.run_folder import check_writable
+from maexp.agents.train import stop_on_signals, write_config
+
+FAILED, STOPPED = 1, 130
+LONG = 24.0  # hours that need confirm=true
+ALSO = {"scenario": "scenarios", "algorithm": "algorithms", "policy": "policies", "seed": "seeds"}
+"""Names that the other verbs have for one value."""
+
+
+def prepare(overrides: list[str]) -> list[str]:
+    """For resume=FOLDER: that benchmark's overrides, then the new ones."""
+    overrides = [_rename(word) for word in overrides]
+    place = find_override(overrides, "resume")
+    if place is None:
+        return overrides
+    if find_override(overrides, "hydra.run.dir") is not None:
+        raise UserError("resume and hydra.run.dir together are ambiguous: a benchmark goes on in its own folder.")
+    return read_plan(place)["overrides"] + overrides
+
+
+def _rename(word: str) -> str:
+    name, sign, value = word.partition("=")
+    return f"{ALSO.get(name, name)}{sign}{value}"
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
+    """The folder that is resumed, or a new one."""
+    overrides = [_rename(word) for word in overrides]
+    place = find_override(overrides, "resume")
+    if place is not None:
+        check_writable(Path(place).absolute())
+        return Path(place).absolute()
+    try:
+        return claim()
+    except UserError as error:
+        chosen = find_override(overrides, "hydra.run.dir")
+        if chosen and (Path(chosen) / PLAN).is_file():
+            raise UserError(f"{chosen} holds a benchmark already: go on with it by resume={chosen}.") from error
+        raise
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for counts out of range and unknown names."""
+    check_counts(cfg, "num_envs", "num_robots", "total_frames", "checkpoint_every", "checkpoint_keep", "episodes")
+    check_counts(cfg.collector, "steps", prefix="collector.")
+    for name in ("workers", "iterations", "train_maps", "test_maps"):
+        if cfg[name] is not None:
+            check_counts(cfg, name)
+    check_lists(cfg)
+
+
+def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """Run the cells that are not done, then write the tables and pictures."""
+    with lock(where):
+        return run_locked(cfg, where, overrides)
+
+
+def run_locked(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """The same, while no one else is at the folder."""
+    suites = [one for one in as_list(cfg.maps)]
+    cells = list_cells(cfg)
+    todo = [one for one in cells if not all(finished(where, one, suite) for suite in suites)]
+    report = Report(cfg, where, cells, suites)
+    if cfg.report or not todo:
+        return conclude(report, Outcome(done=[]), where, len(todo))
+    gpus = count_gpus(cfg.device)
+    workers = min(cfg.workers or gpus or len(os.sched_getaffinity(0)), len(todo))
+    expected = estimate_cells(cfg, todo, len(suites), workers)
+    announce(cfg, where, cells, todo, workers, expected)
+    check_unchanged(where, cfg)
+    kept = without(overrides, "workers", "confirm", "report", "estimate")
+    write_plan(where, cfg, kept)
+    write_config(cfg, where, "benchmark", overrides)
+    pool = WorkerPool(where, kept, suites, workers, gpus)
+    with stop_on_signals() as stop, BenchmarkProgress(where, cells, todo, expected) as progress:
+        outcome = pool.run(todo, stop, lambda pool: watch(pool, progress, report))
+    return conclude(report, outcome, where, len(todo) - len(outcome.done))
+
+
+def count_gpus(device: str) -> int:
+    """GPUs to go round; 0 where the cells run on the CPU or on one named GPU."""
+    import torch
+
+    if pick_device(device).type == "cpu" or ":" in device:
+        return 0
+    return torch.cuda.device_count()
+
+
+def announce(cfg: Any, where: Path, cells: list[Cell], todo: list[Cell], workers: int, expected: Estimate) -> None:
+    """Say what is about to happen and how long it may take; refuse what nobody may have meant."""
+    done = len(cells) - len(todo)
+    print(f"preset {cfg.preset}: {len(cells)} cells ({len(set(c.policy for c in cells))} policies, "
+          f"{len(as_list(cfg.scenarios))} scenarios, seeds {', '.join(map(str, as_list(cfg.seeds)))}, {cfg.episodes} "
+          f"episodes each){f', {done} of them done before' if done else ''}; {workers} at once")  # fmt: skip
+    if cfg.preset == "smoke":
+        print("smoke shows that everything runs; policies are hardly trained, so its figures are no result")
+    print(expected.text, flush=True)
+    if expected.hours > LONG and not cfg.confirm:
+        raise UserError(
+            f"This would take about {expected.describe()}: add confirm=true to run it all the same (it can be stopped "
+            "and resumed at any time), or lower total_frames, seeds, scenarios or algorithms."
+        )
+    print(f"Everything goes to {short(where)}", flush=True)
+
+
+def watch(pool: WorkerPool, progress: "BenchmarkProgress", report: Report) -> None:
+    """Show how far it is; write the tables whenever a scenario has been through all policies."""
+    progress.look(pool)
+    report.update(pool.outcome.done, pool.running())
+
+
+def conclude(report: Report, outcome: Outcome, where: Path, left: int) -> int:
+    """Tables, pictures, what failed, how to go on."""
+    report.finish()
+    for cell, reason in outcome.failed.items():
+        print(f"{cell.name} failed: {reason}\n  its output: {short(cell_folder(where, cell) / 'log.txt')}")
+    if left:
+        print(f"{left} cells are not done. Go on with: maexp benchmark resume={short(where)}")
+    if outcome.interrupted:
+        return STOPPED
+    return FAILED if outcome.failed else 0
+
+
+class BenchmarkProgress(Progress):
+    """One line: cells done, time left, what the running ones are at.
+
+    Args:
+        where: the benchmark's folder
+        cells, todo: all cells, and those not done yet
+        expected: weights of the cells
+    """
+
+    def __init__(self, where: Path, cells: list[Cell], todo: list[Cell], expected: Estimate):
+        super().__init__("benchmark", len(cells), len(cells) - len(todo))
+        self.where, self.todo, self.expected = where, todo, expected
+        self.spent_weight = 0.0
+
+    def look(self, pool: WorkerPool) -> None:
+        """Read how far the running cells are from the last lines of their logs."""
+        ended = [*pool.outcome.done, *pool.outcome.failed]
+        shares = {cell: read_share(cell_folder(self.where, cell) / "log.txt") for cell in pool.running()}
+        weight = self.expected.weight
+        self.spent_weight = sum(weight(one) for one in ended)
+        self.spent_weight += sum(weight(cell) * share for cell, (share, _) in shares.items())
+        note = ", ".join(f"{cell.name} {text}" for cell, (_, text) in shares.items())
+        self.show(self.first + len(ended), note)
+
+    def describe(self, note: str = "") -> str:
+        """Cells done, time left, the running ones."""
+        spent = time.monotonic() - self.begin
+        whole = sum(self.expected.weight(one) for one in self.todo)
+        left = spent * (whole - self.spent_weight) / self.spent_weight if self.spent_weight > 0 else float("inf")
+        return "  ".join(part for part in (f"{self.done}/{self.total} cells", f"{duration(left)} left", note) if part)
+
+
+def read_share(log: Path) -> tuple[float, str]:
+    """(share done in [0, 1], "training 40 %") from the last line of a log that a Progress wrote."""
+    for line in reversed(last_lines(log, 3)):
+        title, _, rest = line.partition(": ")
+        done, _, total = rest.split("  ")[0].replace(",", "").partition("/")
+        if done.isdigit() and total.isdigit() and int(total):
+            part = int(done) / int(total)
+            training = title == "training"
+            return (0.9 * part if training else 0.9 + 0.1 * part), f"{title.split()[0]} {part:.0%}"
+    return 0.0, "starting"
+
+
+def short(path: Path) -> str:
+    """The path as one would type it here."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
