@@ -75,6 +75,8 @@ def small(line: str) -> list[str]:
         more = ()
     return [*words, *more]
 
+ANSWERS = re.findall(r"^\$ (maexp .*)\n(maexp: .*)$", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
@@ -90,6 +92,10 @@ def folder(tmp_path_factory) -> Path:
             export_ros_map(room(30, 21, spacing=0.2), place / name)
         elif (place / name).suffix == ".npz":
             room(30, 21, spacing=0.2).save(place / name)
+    export_ros_map(room(8, 6, spacing=0.1), place / "cupboard.yaml")
+    (place / "scan.xyz").write_text("1 2 nan\n" + "\n".join(f"{i % 9} {i // 9} 0" for i in range(90)))
+    header = ("FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", "WIDTH 100", "HEIGHT 1", "POINTS 100", "DATA ascii")
+    (place / "truncated.pcd").write_text("\n".join(["VERSION 0.7", *header, "1 2 3", ""]))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         assert main(["train", *SMALLER["train"], *OWN_MAPS, "hydra.run.dir=outputs/run"]) == 0
@@ -105,10 +111,17 @@ def test_command(line, folder, monkeypatch, capsys):
     assert "Traceback" not in output.err
 
 
+@pytest.mark.parametrize(("line", "answer"), ANSWERS, ids=[line for line, _ in ANSWERS])
+def test_errors_are_as_shown(line, answer, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(shlex.split(line)[1:]) == 2
+    assert capsys.readouterr().err.replace(f"{folder}/", "").strip().startswith(answer)
+
+
 def test_every_line_is_one_of_ours_or_listed():
     others = [line for line in shown() if not line.startswith("maexp")]
     assert [line for line in others if not line.startswith(NOT_OURS)] == []
-    assert len(COMMANDS) > 15
+    assert len(COMMANDS) > 15 and len(ANSWERS) > 10
 
 
 def test_every_verb_is_shown():
