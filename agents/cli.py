@@ -53,10 +53,11 @@ VERBS = {
     ),
     "bench": Verb(
         "measures throughput, as a table and JSON",
-        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE"),
+        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",
+         "maexp bench train model=small,paper"),
         "run_bench",
         ("action",),
-        ("env", "kernels"),
+        ("env", "kernels", "train"),
     ),
 }  # fmt: skip
 

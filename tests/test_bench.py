@@ -78,6 +78,22 @@ def test_kernels_are_timed_counted_and_compared(capsys):
     assert "!" in capsys.readouterr().out
 
 
+def test_training_is_split_into_its_parts_for_every_network(capsys):
+    words = [*TINY, "collector.steps=2", "model=small,paper", "num_robots=2"]
+    assert main(["bench", "train", *words, "hydra.run.dir=out"]) == 0
+    small, paper = report("out", "bench_train.json")["rows"]
+    assert (small["model"], paper["model"]) == ("small", "paper") and small["parameters"] < paper["parameters"]
+    for row in (small, paper):
+        median = {name: seconds["median"] for name, seconds in row["seconds"].items()}
+        whole = median.pop("iteration")
+        assert set(median) == {"simulate", "policy", "advantage", "update"} and min(median.values()) > 0
+        assert sum(median.values()) == pytest.approx(whole, rel=0.3)
+        assert row["macro_steps"] == 4 and row["iterations"] >= 3
+        assert row["robot_macro_steps_per_second"] == pytest.approx(4 * 2 / whole)
+    assert paper["times_the_slowest"] == 1.0 and small["times_the_slowest"] > 1.0
+    assert "robot-steps/s" in capsys.readouterr().out
+
+
 def test_a_change_is_beyond_the_noise_and_the_spread():
     key = dict.fromkeys(bench_kernels.KEY, 0)
 
