@@ -94,8 +94,8 @@ def folder(tmp_path_factory) -> Path:
             room(30, 21, spacing=0.2).save(place / name)
     export_ros_map(room(8, 6, spacing=0.1), place / "cupboard.yaml")
     (place / "scan.xyz").write_text("1 2 nan\n" + "\n".join(f"{i % 9} {i // 9} 0" for i in range(90)))
-    header = ("FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1", "WIDTH 100", "HEIGHT 1", "POINTS 100", "DATA ascii")
-    (place / "truncated.pcd").write_text("\n".join(["VERSION 0.7", *header, "1 2 3", ""]))
+    header = "VERSION 0.7|FIELDS x y z|SIZE 4 4 4|TYPE F F F|COUNT 1 1 1|WIDTH 100|HEIGHT 1|POINTS 100|DATA ascii"
+    (place / "truncated.pcd").write_text("\n".join([*header.split("|"), "1 2 3", ""]))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         assert main(["train", *SMALLER["train"], *OWN_MAPS, "hydra.run.dir=outputs/run"]) == 0
