@@ -134,8 +134,10 @@ def _hear_robots(
         if heard and line_of_sight != 0 and other != i:
             # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
             width = 0.70710678 * maps.resolution[m]
+            a = center[e, wp.min(i, other)]  # one direction for both, lest rounding let only one hear the other
+            b = center[e, wp.max(i, other)]
             for j in range(maps.boundary_begin[m], maps.boundary_begin[m + 1]):
-                if segment_distance(maps.boundary[j], center[e, i], center[e, other]) < width:
+                if segment_distance(maps.boundary[j], a, b) < width:
                     heard = False
                     break
         if other == i:

@@ -1,8 +1,8 @@
 """What must hold in every env at every moment, asserted from outside with counts of its own.
 
 A `Watch` follows an `ExplorationEnv` through its step hook: after every local step it looks at what each robot sees,
-where it is and what it hit, and keeps its own flags, sums and rewards. `check_step` and `check_reset` compare these
-with what the env hands out.
+where it is and what it hit, and keeps its own flags, sums and rewards. `check_step` and `reset` compare these with what
+the env hands out.
 """
 
 import math
@@ -64,8 +64,18 @@ class Watch:
         self.env = env
         self.places = [_place(m) for m in env.maps]
         self.lives: list[Life | None] = [None] * env.num_envs
+        self.resetting = False
         self.local_steps = self.crashes = self.successes = self.episodes = 0
         env.set_step_hook(self.look)
+
+    def reset(self, td=None):
+        """`env.reset`, watched: running envs stay as they are."""
+        self.resetting = True
+        td = self.env.reset(td)
+        self.resetting = False
+        for e in range(self.env.num_envs):
+            self._check_observation(e, td[e])
+        return td
 
     # Every local step
 
@@ -80,9 +90,9 @@ class Watch:
             )}  # fmt: skip
             if life is None or life.number != state["episode"][e]:
                 self._begin(e, now, state)
-            elif life.over or life.finished:
+            elif life.over or life.finished or self.resetting:
                 for name in ("pose", "collided", "local_step", "covered", "path_length"):
-                    assert np.array_equal(now[name], life.old[name]), f"{name} of a finished env changed"
+                    assert np.array_equal(now[name], life.old[name]), f"{name} of an env at rest changed"
             else:
                 self._follow(e, now, self._visible(e, state))
                 self.local_steps += 1
@@ -225,12 +235,7 @@ class Watch:
         share = life.covered / life.place.weight.sum()
         assert math.isclose(life.coverage, share, rel_tol=1e-6 if life.place.exact else 0.04)
 
-    # Every macro step and reset
-
-    def check_reset(self, td) -> None:
-        """Compare what a reset handed out with what was counted."""
-        for e in range(self.env.num_envs):
-            self._check_observation(e, td[e])
+    # Every macro step
 
     def check_step(self, td) -> None:
         """Compare what `env.step` handed out (`td["next"]`) with what was counted."""
