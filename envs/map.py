@@ -213,11 +213,14 @@ def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 def check_file(path: Path) -> None:
     """Raises MapError unless `path` is a readable, non-empty regular file of a sane size."""
-    if not path.exists():
-        raise MapError(f"{path} does not exist; check the path")
-    if not path.is_file():
-        raise MapError(f"{path} is not a file; give the path of a map file")
-    size = path.stat().st_size
+    try:
+        if not path.exists():
+            raise MapError(f"{path} does not exist; check the path")
+        if not path.is_file():
+            raise MapError(f"{path} is not a file; give the path of a map file")
+        size = path.stat().st_size
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise MapError(f"{str(path)[:200]} cannot be looked up ({error.strerror}); check the path") from error
     if not 0 < size <= MAX_FILE_BYTES:
         raise MapError(f"{path} has {size} bytes; a map file has between 1 and {MAX_FILE_BYTES}")
     if not os.access(path, os.R_OK):

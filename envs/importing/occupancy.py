@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr as brief  # aliases of yaml nest values that would fill the memory when written out
 
 import numpy as np
 import yaml
@@ -18,6 +18,7 @@ from .options import ImportOptions
 from .report import ImportReport
 
 MAX_YAML_BYTES = 64 * 1024
+MAX_ORIGIN = 1e8  # [m]
 FORMATS = ("PPM", "PNG", "BMP", "TIFF", "JPEG")
 
 
@@ -70,8 +71,8 @@ def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Shee
         raise MapError(f"{path} has {path.stat().st_size} bytes; a map_server yaml has at most {MAX_YAML_BYTES}")
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise MapError(f"{path} is not yaml ({str(error).splitlines()[0]}); repair the file") from error
+    except Exception as error:  # PyYAML's constructors raise whatever odd values make them raise
+        raise MapError(f"{path} is not yaml ({' '.join(str(error).split())[:200]}); repair the file") from error
     if not isinstance(content, dict) or not {"image", "resolution"} <= content.keys():
         raise MapError(f"{path} is not a map_server yaml: it needs the keys image and resolution")
     origin = content.get("origin")
@@ -83,20 +84,24 @@ def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Shee
 def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
     image = content["image"]
     if not isinstance(image, str):
-        raise MapError(f"{path}: image={image!r} must be the path of a pgm or png file")
+        raise MapError(f"{path}: image={brief(image)} must be the path of a pgm or png file")
     origin = content.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
-        raise MapError(f"{path}: origin={origin!r} must be a list of x, y [m] and yaw [rad]")
+        raise MapError(f"{path}: origin={brief(origin)} must be a list of x, y [m] and yaw [rad]")
     origin = [_number(path, "origin", value) for value in [*origin, 0.0][:3]]
+    if max(map(abs, origin)) > MAX_ORIGIN:
+        raise MapError(f"{path}: origin={origin} lies farther than {MAX_ORIGIN:g} m away; correct it")
     mode = content.get("mode", "trinary")
     if mode not in ("trinary", "scale", "raw"):
-        raise MapError(f"{path}: mode={mode!r} must be trinary, scale or raw")
+        raise MapError(f"{path}: mode={brief(mode)} must be trinary, scale or raw")
     given = {
         "resolution": options.pixel_size or content.get("resolution"),
         "occupied_thresh": _first(options.occupied_threshold, content.get("occupied_thresh"), 0.65),
         "free_thresh": _first(options.free_threshold, content.get("free_thresh"), 0.196),
         "negate": content.get("negate", 0),
     }
+    if isinstance(given["negate"], bool):
+        given["negate"] = int(given["negate"])
     numbers = {name: _number(path, name, value) for name, value in given.items()}
     if not 1e-4 <= numbers["resolution"] <= 100:
         raise MapError(f"{path}: resolution={numbers['resolution']:g} must be between 0.0001 and 100 m a pixel")
@@ -121,8 +126,9 @@ def _first(*values):
 
 
 def _number(path: Path, name: str, value) -> float:
-    if not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise MapError(f"{path}: {name}={value!r} must be a number")
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not abs(value) < 1e300:  # an integer of yaml may be too long for a float
+        raise MapError(f"{path}: {name}={brief(value)} must be a number")
     return float(value)
 
 
