@@ -117,7 +117,7 @@ def _measure_learner(cfg: Any, cell: Cell) -> tuple[float, float]:
     settings.collector.steps = min(settings.collector.steps, STEPS)
     run = TrainingRun.build(settings, Path(), words)
     frames = run.batch_frames
-    batch = run.collector.next()
+    (batch,) = run.experience.next()
     run.learner.updater.update(batch, progress=0.0)
     update = _time(lambda: run.learner.updater.update(batch, progress=0.0)) / frames
     think = _time(lambda: run.learner.policy(batch[:, 0].clone())) / settings.num_envs

@@ -35,8 +35,8 @@ class MapSuite:
     held_out: list[PointCloudMap]
 
 
-def pick_device(name: str) -> torch.device:
-    """The torch device of the setting `device`.
+def pick_device(name: str, setting: str = "device") -> torch.device:
+    """The torch device of the setting `device`, or of another setting of that kind.
 
     Raises:
         UserError: not a device, or not one of this machine.
@@ -47,8 +47,15 @@ def pick_device(name: str) -> torch.device:
         device = torch.device(name)
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise UserError(f"device={name} cannot be used here ({str(error).splitlines()[0]}): try device=cpu.") from error
+        why = str(error).splitlines()[0]
+        raise UserError(f"{setting}={name} cannot be used here ({why}): try {setting}=cpu.") from error
     return device
+
+
+def choose_device(cfg: Any, name: str) -> torch.device:
+    """The device of `collector.sample_device` or `collector.train_device`: what is set there, else `device`."""
+    own = cfg.collector[name]
+    return pick_device(cfg.device) if own is None else pick_device(own, f"collector.{name}")
 
 
 def load_maps(scenario: Any, train: bool = True) -> MapSuite:
@@ -92,19 +99,21 @@ def _indices(name: str, value: Any, default: range) -> list[int]:
     return indices
 
 
-def make_env(cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None) -> ExplorationEnv:
-    """The environment that the settings describe, on `maps`.
+def make_env(
+    cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None, **others: Any
+) -> ExplorationEnv:
+    """The environment that the settings describe, on `maps`; `others` are arguments of `ExplorationEnv`.
 
     Raises:
         ValueError: a setting out of range; MapError: no room for the team.
     """
     scenario = cfg.scenario
     robot, radar = team_configs(cfg, num_robots)
+    settings = {"device": pick_device(cfg.device), "num_threads": cfg.num_threads} | others
     return ExplorationEnv(
         maps,
         num_envs=num_envs or cfg.num_envs,
         num_robots=num_robots,
-        device=pick_device(cfg.device),
         seed=cfg.seed,
         robot=robot,
         radar=radar,
@@ -116,7 +125,7 @@ def make_env(cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int
         macro_steps=scenario.macro_steps,
         collision=scenario.collision,
         success_coverage=scenario.success_coverage,
-        num_threads=cfg.num_threads,
+        **settings,
     )
 
 

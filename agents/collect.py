@@ -1,22 +1,42 @@
-"""Experience: TorchRL's collector, made to continue where a checkpoint left it."""
+"""Experience: TorchRL's collector, made to continue where a checkpoint left it, one for each team size."""
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
+from maexp.agents.errors import UserError
 from maexp.envs.specs import REWARD_TERMS
 
 _SEPARATOR = "/"
+
+
+class WorkerLost(RuntimeError):
+    """A worker process ended in the middle of the training. The message names it and says how it ended."""
 
 
 class TeamCollector(Collector):
     """A Collector whose state holds the simulator and the observation the policy will see next.
 
     TorchRL's own leaves both out, so a run resumed from it starts new episodes.
+
+    Attributes:
+        seconds: what the latest batch took, and what of it the policy took
     """
+
+    seconds = (0.0, 0.0)
+
+    def rollout(self) -> TensorDictBase:
+        """A batch, timed."""
+        begin = time.perf_counter()
+        with Stopwatch(self.policy) as acting:
+            batch = super().rollout()
+        self.seconds = (time.perf_counter() - begin, acting.seconds)
+        return batch
 
     def state_dict(self) -> dict[str, Any]:
         """Counts, the simulator, and the observation at hand, as containers of tensors."""
@@ -37,8 +57,8 @@ class TeamCollector(Collector):
         return [key if isinstance(key, tuple) else (key,) for key in keys]
 
 
-def make_collector(env, policy, steps: int) -> TeamCollector:
-    """An endless collector of batches [envs, steps]."""
+def make_collector(env, policy, steps: int, storing_device: torch.device | None = None) -> TeamCollector:
+    """An endless collector of batches [envs, steps], which end up on `storing_device` (default: the env's)."""
     return TeamCollector(
         env,
         policy,
@@ -46,8 +66,93 @@ def make_collector(env, policy, steps: int) -> TeamCollector:
         total_frames=-1,
         env_device=env.device,
         policy_device=env.device,
-        storing_device=env.device,
+        storing_device=storing_device or env.device,
+        auto_register_policy_transforms=False,
     )
+
+
+@dataclass(frozen=True)
+class Teams:
+    """Teams of one size among those of a run: teams `first_env` to `first_env + num_envs` - 1."""
+
+    num_robots: int
+    num_envs: int
+    first_env: int
+
+    def split(self, parts: int) -> list["Teams"]:
+        """Equal shares, one for each worker."""
+        size = self.num_envs // parts
+        return [Teams(self.num_robots, size, self.first_env + k * size) for k in range(parts)]
+
+
+def divide_teams(num_envs: int, sizes: Sequence[int], workers: int = 1) -> list[Teams]:
+    """Share `num_envs` teams among the team sizes as evenly as `workers` equal shares of each allow.
+
+    Raises:
+        UserError: there are too few, or they cannot be shared evenly.
+    """
+    units, rest = divmod(num_envs, workers)
+    if rest:
+        raise UserError(f"num_envs={num_envs} cannot be shared evenly by collector.workers={workers}.")
+    if units < len(sizes):
+        raise UserError(
+            f"num_envs={num_envs} is too few for {len(sizes)} team sizes with collector.workers={workers} each: "
+            f"choose {len(sizes) * workers} or more."
+        )
+    result, first = [], 0
+    for k, size in enumerate(sizes):
+        count = workers * (units * (k + 1) // len(sizes) - units * k // len(sizes))
+        result.append(Teams(size, count, first))
+        first += count
+    return result
+
+
+class Experience:
+    """The batches that each iteration learns from: one per team size, collected in this process.
+
+    Attributes:
+        lag: by how many batches the policy that acts is older than the one that learns
+        seconds: of the latest batches, in all (`wait`) and what of it the policy took
+    """
+
+    lag = 0
+
+    def __init__(self, collectors: Sequence[TeamCollector]):
+        self.collectors = list(collectors)
+        self.seconds = {"wait": 0.0, "policy": 0.0, "simulate": 0.0}
+
+    def next(self) -> list[TensorDictBase]:
+        """A batch [envs, steps] of every team size."""
+        begin = time.perf_counter()
+        batches = [one.next() for one in self.collectors]
+        self.time(begin, [one.seconds for one in self.collectors])
+        return batches
+
+    def time(self, begin: float, spent: Sequence[tuple[float, float]]) -> None:
+        """Note where the time since `begin` went; `spent` holds seconds of batches and their policies."""
+        policy = sum(one for _, one in spent)
+        simulate = sum(one for one, _ in spent) - policy
+        self.seconds = {"wait": time.perf_counter() - begin, "policy": policy, "simulate": simulate}
+
+    def update_policy_weights_(self) -> None:
+        """Act with what was learned."""
+        for one in self.collectors:
+            one.update_policy_weights_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the next batches depend on, but for the policy and the random numbers."""
+        return {str(k): one.state_dict() for k, one in enumerate(self.collectors)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on where `state_dict` was called; ValueError where the state does not fit."""
+        for k, one in enumerate(self.collectors):
+            one.load_state_dict(state[str(k)])
+        self.update_policy_weights_()
+
+    def shutdown(self) -> None:
+        """Free what the collectors hold."""
+        for one in self.collectors:
+            one.shutdown()
 
 
 class Stopwatch:
@@ -77,23 +182,32 @@ class Stopwatch:
         self.seconds += time.perf_counter() - self._begun
 
 
-def batch_statistics(batch: TensorDictBase) -> dict[str, float]:
-    """What the log says about a batch [envs, steps]: rewards per step, and how the episodes in it ended.
+def batch_statistics(*batches: TensorDictBase) -> dict[str, float]:
+    """What the log says about batches [envs, steps]: rewards per step, and how the episodes in them ended.
 
-    Means over ended episodes are NaN where none ended.
+    Several batches, of teams of several sizes, count as one: every robot's step, every episode alike. Means over
+    ended episodes are NaN where none ended.
     """
+    parts = [_statistics(batch) for batch in batches]
+    rewards, ends = ({name: torch.cat([part[k][name] for part in parts]) for name in parts[0][k]} for k in (0, 1))
+    return {
+        **{name: value.mean().item() for name, value in rewards.items()},
+        "episodes": len(ends["coverage"]),
+        **{name: value.mean().item() for name, value in ends.items()},
+    }
+
+
+def _statistics(batch: TensorDictBase) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Rewards of every robot and step [n], and what became of every episode that ended [m]."""
     after, info = batch["next"], batch["next", "info"]
-    done = after["done"].squeeze(-1)
-    success = after["terminated"].squeeze(-1) & ~info["collided"].all(-1)
-    at_the_end = {
+    rewards = {f"reward_{term}": info[f"reward_{term}"] for term in REWARD_TERMS}
+    rewards = {"reward": after["agents", "reward"]} | rewards
+    ends = {
         "coverage": info["coverage"].squeeze(-1),
-        "success_rate": success,
+        "success_rate": after["terminated"].squeeze(-1) & ~info["collided"].all(-1),
         "collisions": info["collided"].sum(-1),
         "path_length": info["path_length"].mean(-1),
     }
-    return {
-        "reward": after["agents", "reward"].mean().item(),
-        **{f"reward_{term}": info[f"reward_{term}"].mean().item() for term in REWARD_TERMS},
-        "episodes": int(done.sum()),
-        **{name: value[done].float().mean().item() for name, value in at_the_end.items()},
-    }
+    done = after["done"].squeeze(-1)
+    flat = {name: value.reshape(-1).float() for name, value in rewards.items()}
+    return flat, {name: value[done].float() for name, value in ends.items()}

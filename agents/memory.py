@@ -8,18 +8,19 @@ from maexp.agents.errors import UserError
 COPIES = 3  # the collector's list of steps, the stacked batch, and the updater's selection
 
 
-def check_batch_memory(env, steps: int) -> None:
-    """Refuse batches that cannot fit.
+def check_batch_memory(env, steps: int, num_envs: int | None = None) -> None:
+    """Refuse batches that cannot fit, of `num_envs` teams like those of `env` (default: as many as it has).
 
     Raises:
         UserError: names the settings to lower.
     """
     from maexp.envs.simulation import bytes_per_env  # here, for the command line starts without torch
 
+    num_envs = num_envs or env.num_envs
     specs = [env.observation_spec, env.full_action_spec]
-    one_step = sum(leaf.zero().nbytes for spec in specs for leaf in spec.values(True, True))
-    simulation = bytes_per_env(env) * env.num_envs
-    need = simulation + COPIES * 2 * one_step * steps  # each step is stored as it was and as it became
+    one_step = sum(leaf.zero().nbytes for spec in specs for leaf in spec.values(True, True)) / env.num_envs
+    simulation = bytes_per_env(env) * num_envs
+    need = simulation + COPIES * 2 * one_step * num_envs * steps  # each step is stored as it was and as it became
     if env.device.type == "cuda":
         import torch
 
@@ -28,7 +29,7 @@ def check_batch_memory(env, steps: int) -> None:
         have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if need > have:
         raise UserError(
-            f"One batch of num_envs={env.num_envs} x collector.steps={steps} needs about {need / 2**30:.1f} GiB "
+            f"One batch of num_envs={num_envs} x collector.steps={steps} needs about {need / 2**30:.1f} GiB "
             f"({simulation / 2**30:.1f} GiB of it for the simulation), more than the {have / 2**30:.1f} GiB of "
             f"{env.device}: lower num_envs or collector.steps."
         )

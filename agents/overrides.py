@@ -11,6 +11,7 @@ from maexp.agents.schema import schema
 
 PATHS = ("scenario.path", "checkpoint", "resume", "file", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir")
 LISTS = {
+    "train": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
     "bench": ("num_robots",),
     "benchmark": (
@@ -66,7 +67,7 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
             value = str(Path(value).expanduser().absolute())
         return f"{name}={quote(value)}"
-    if name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
+    if not multirun and name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
     for word in (f"{name}={value}", f"{name}={quote(value)}"):
         try:

@@ -4,14 +4,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.build import make_env
+from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.checks import check_counts
+from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError
 from maexp.agents.overrides import find_override
 from maexp.agents.run_evaluate import evaluate_all, report
 from maexp.agents.run_folder import check_writable, short
-from maexp.agents.train import TrainingRun, train, write_config
+from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130
 
@@ -40,9 +40,10 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 def check(cfg: Any) -> None:
     """Raise UserError for counts out of range."""
-    check_counts(cfg, "num_envs", "num_robots", "total_frames", "checkpoint_every", "checkpoint_keep")
+    check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep")
     check_counts(cfg, "episodes", "evaluate_every", least=0)
-    check_counts(cfg.collector, "steps", prefix="collector.")
+    team_sizes(cfg.num_robots)
+    check_collector(cfg.collector)
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
@@ -51,13 +52,26 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(cfg, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
-          f"{cfg.num_robots} robots; everything goes to {short(where)}", flush=True)  # fmt: skip
+          f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}", flush=True)  # fmt: skip
     train(training)
     if training.stopped:
         print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={short(where)}")
         return STOPPED
     finish(training)
     return 0
+
+
+def _list(sizes: list[int]) -> str:
+    """2, 3 and 4."""
+    return " and ".join(filter(None, (", ".join(map(str, sizes[:-1])), str(sizes[-1]))))
+
+
+def _describe(cfg: Any) -> str:
+    """Who simulates, where that is not this process; and whether what is learned from is one batch old."""
+    if cfg.collector.backend == "single":
+        return ""
+    late = "; the policy that acts is one batch older than the one that learns" * cfg.collector.overlap
+    return f", simulated by {describe_workers(cfg)} on {choose_device(cfg, 'sample_device')}{late}"
 
 
 def finish(done: TrainingRun) -> None:
@@ -67,8 +81,10 @@ def finish(done: TrainingRun) -> None:
     draw_curves(where)
     written.append("curves.png")
     if cfg.episodes:
-        env = make_env(cfg, done.suite.held_out, cfg.num_robots)
-        results = evaluate_all(cfg, env, {"trained": done.learner.policy, "random": "random"})
+        policies = {"trained": done.learner.policy, "random": "random"}
+        device = choose_device(cfg, "train_device")
+        envs = (make_env(cfg, done.suite.held_out, size, device=device) for size in done.sizes)
+        results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
         report(cfg, results, done.suite.held_out, where / "summary.json", training_seconds=round(done.seconds, 2))
         written.append("summary.json")
     draw_rollout(cfg, done, where / "rollout.gif")
@@ -91,7 +107,7 @@ def draw_rollout(cfg: Any, done: TrainingRun, path: Path) -> None:
     from maexp.envs.film import write_gif
     from maexp.envs.render import record_episode
 
-    env = make_env(cfg, done.suite.held_out[:1], cfg.num_robots, num_envs=1)
+    env = make_env(cfg, done.suite.held_out[:1], done.sizes[0], 1, device=choose_device(cfg, "train_device"))
     with torch.random.fork_rng([]), torch.no_grad():
         torch.manual_seed(cfg.seed)
         env.set_episodes(torch.zeros(1, dtype=torch.int64, device=env.device))

@@ -93,6 +93,12 @@ class CollectorSettings:
     """How experience is gathered."""
 
     steps: int = 15  # macro steps of every team in one iteration
+    backend: str = "single"  # or processes, ray
+    workers: int = 1  # worker processes, for each team size
+    overlap: bool = False  # collect the next batch while learning from this one; the policy that acts is one batch old
+    sample_device: str | None = None  # null: device
+    train_device: str | None = None  # null: device
+    ray_address: str | None = None  # of a cluster's head, or auto; null: a cluster of this machine alone
 
 
 @dataclass
@@ -133,7 +139,7 @@ class LearnerSettings(EnvSettings):
 class TrainSettings(LearnerSettings):
     """`maexp train`."""
 
-    num_robots: int = setting(3, "robots in a team")
+    num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")

@@ -3,17 +3,20 @@
 import math
 import signal
 import time
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
 
-from maexp.agents.build import Learner, MapSuite, load_maps, make_env, make_learner
+from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
-from maexp.agents.collect import Stopwatch, TeamCollector, batch_statistics, make_collector
+from maexp.agents.checks import check_counts, team_sizes
+from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
@@ -22,33 +25,37 @@ from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
 from maexp.agents.results import plain
 
+BACKENDS = ("single", "processes", "ray")
+
 
 def train(run: "TrainingRun") -> None:
-    """Train until `total_frames`, from where `run` is; every file goes to its folder.
+    """Train until `total_frames`, from where `run` is; every file goes to its folder. Ends the run's collectors.
 
     On the CPU a run that is stopped and resumed gives bit for bit what an uninterrupted one gives.
     """
-    cfg = run.cfg
+    cfg, learner, experience = run.cfg, run.learner, run.experience
     log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, config=plain(cfg))
-    with stop_on_signals() as stop, Progress("training", cfg.total_frames, run.frames) as progress:
+    with (
+        closing(log),
+        ending(experience),
+        stop_on_signals() as stop,
+        Progress("training", cfg.total_frames, run.frames) as progress,
+    ):
         if run.iteration == 0:
             run.save()
         while run.iteration < run.iterations and not stop:
-            begin = time.perf_counter()
-            with Stopwatch(run.learner.policy) as acting:
-                batch = run.collector.next()
-            collected = time.perf_counter() - begin
-            row = batch_statistics(batch)
             with name_iteration(run):
-                row |= run.learner.updater.update(batch, progress=run.iteration / run.iterations)
-            run.collector.update_policy_weights_()
-            run.iteration += 1
-            row |= run.evaluate_if_due()
-            log.write(run.timed(row, collected, acting.seconds, begin))
-            average = run.smooth(row["coverage"])
-            run.keep(row, log, last=bool(stop) or run.iteration == run.iterations)
+                begin = time.perf_counter()
+                batches = experience.next()
+                row = batch_statistics(*batches)
+                row |= learner.updater.update(*batches, progress=run.iteration / run.iterations)
+                experience.update_policy_weights_()
+                run.iteration += 1
+                row |= run.evaluate_if_due()
+                log.write(run.timed(row, begin))
+                average = run.smooth(row["coverage"])
+                run.keep(row, log, last=bool(stop) or run.iteration == run.iterations)
             progress.show(min(run.frames, cfg.total_frames), f"coverage {average:.3f}")
-    log.close()
     run.stopped = bool(stop)
 
 
@@ -67,7 +74,7 @@ class TrainingRun:
     overrides: list[str]
     suite: MapSuite
     learner: Learner
-    collector: TeamCollector
+    experience: Experience
     iteration: int = 0
     best: float = -math.inf
     average: float = math.nan
@@ -84,14 +91,16 @@ class TrainingRun:
         seed_everything(cfg.seed)
         with blame_input():
             suite = load_maps(cfg.scenario)
-            env = make_env(cfg, suite.train, cfg.num_robots)
-            check_batch_memory(env, cfg.collector.steps)
-            learner = make_learner(cfg, env)
-            collector = make_collector(env, learner.policy, cfg.collector.steps)
-            run = cls(cfg, folder, overrides, suite, learner, collector)
+            learner, experience = make_both(cfg, suite.train)
+            run = cls(cfg, folder, overrides, suite, learner, experience)
             if saved is not None:
                 run.restore(saved)
         return run
+
+    @property
+    def sizes(self) -> list[int]:
+        """The team sizes, one or several."""
+        return team_sizes(self.cfg.num_robots)
 
     @property
     def batch_frames(self) -> int:
@@ -116,7 +125,9 @@ class TrainingRun:
             "seconds": self.seconds,
             "updater": self.learner.updater.state_dict(),
             "policy": self.learner.policy.state_dict(),
-            "collector": self.collector.state_dict(),
+            "collector": self.experience.state_dict(),
+            "teams": describe_teams(self.cfg),
+            "workers": describe_workers(self.cfg),
             "random": random_state(),
         }
         return save_checkpoint(self.folder / "checkpoints", state, self.iteration, self.cfg.checkpoint_keep, best)
@@ -125,21 +136,41 @@ class TrainingRun:
         """Go on where `save` was called."""
         check_action(saved, self.cfg)
         load_matching(self.learner.policy, saved["policy"])
-        self.collector.load_state_dict(saved["collector"])
         self.learner.updater.load_state_dict(saved["updater"])
+        self.restore_experience(saved)
         self.iteration, self.best = saved["iteration"], saved["best"]
         self.average, self.seconds = saved["average"], saved["seconds"]
         set_random_state(saved["random"])
 
+    def restore_experience(self, saved: dict) -> None:
+        """Go on with the episodes of `saved`, or with new ones where other workers ran them."""
+        before, now = saved.get("teams", ""), describe_teams(self.cfg)
+        if before and before != now:
+            raise UserError(f"The checkpoint was trained with {before}, not {now}: leave these settings as they were.")
+        if saved.get("workers") == describe_workers(self.cfg):
+            self.experience.load_state_dict(saved["collector"])
+            return
+        warnings.warn(
+            f"the checkpoint was written by {saved.get('workers', 'an earlier version')}, not by "
+            f"{describe_workers(self.cfg)}: new episodes begin, and the result differs from that of a run in one go",
+            stacklevel=2,
+        )
+        self.experience.update_policy_weights_()
+
     def evaluate_if_due(self) -> dict[str, float]:
-        """Coverage on held-out maps, every `evaluate_every` iterations; else NaN."""
+        """Coverage on held-out maps, every `evaluate_every` iterations; else NaN. The mean over team sizes."""
         every = self.cfg.evaluate_every
         if not every or self.iteration % every:
             return {"held_out_coverage": math.nan}
-        if not hasattr(self, "_held_out_env"):
-            self._held_out_env = make_env(self.cfg, self.suite.held_out, self.cfg.num_robots)
-        result = evaluate(self.learner.policy, self._held_out_env, self._held_out_env.num_envs, seed=self.cfg.seed)
-        return {"held_out_coverage": result.summary()["exploration_ratio"]["mean"]}
+        if not hasattr(self, "_held_out_envs"):
+            shares = divide_teams(self.cfg.num_envs, self.sizes)
+            device = choose_device(self.cfg, "train_device")
+            self._held_out_envs = [
+                make_env(self.cfg, self.suite.held_out, one.num_robots, one.num_envs, device=device) for one in shares
+            ]
+        policy, seed = self.learner.policy, self.cfg.seed
+        results = [evaluate(policy, env, env.num_envs, seed=seed).summary() for env in self._held_out_envs]
+        return {"held_out_coverage": fmean(one["exploration_ratio"]["mean"] for one in results)}
 
     def keep(self, row: dict[str, float], log: MetricsLog, last: bool) -> None:
         """Save when it is time to, or when the coverage is the best so far."""
@@ -157,18 +188,70 @@ class TrainingRun:
             self.average = coverage if math.isnan(self.average) else 0.9 * self.average + 0.1 * coverage
         return self.average
 
-    def timed(self, row: dict[str, float], collected: float, policy: float, begin: float) -> dict[str, float]:
-        """The row with its place in the run in front, and where the time went at the end."""
+    def timed(self, row: dict[str, float], begin: float) -> dict[str, float]:
+        """The row with its place in the run in front, and where the time since `begin` went at the end."""
         spent = time.perf_counter() - begin
         self.seconds += spent
-        times = {"simulate": collected - policy, "policy": policy}
-        times |= {name: row.pop(name) for name in ("advantage", "update")}
+        times = self.experience.seconds | {name: row.pop(name) for name in ("advantage", "update")}
         return (
             {"iteration": self.iteration, "frames": self.frames}
             | row
+            | {"policy_lag": self.experience.lag}
             | {f"time_{name}": round(seconds, 4) for name, seconds in times.items()}
             | {"frames_per_second": round(self.batch_frames / spent, 2), "seconds": round(self.seconds, 3)}
         )
+
+
+def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
+    """The networks that learn and what gathers their experience, each on its device.
+
+    Raises:
+        UserError, ValueError: settings that cannot be used.
+    """
+    check_collector(cfg.collector)
+    alone, workers, steps = cfg.collector.backend == "single", cfg.collector.workers, cfg.collector.steps
+    here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
+    teams = divide_teams(cfg.num_envs, team_sizes(cfg.num_robots), workers)
+    envs = [
+        make_env(cfg, maps, one.num_robots, one.num_envs if alone else 1, device=here if alone else there,
+                 first_env=one.first_env)
+        for one in teams
+    ]  # fmt: skip
+    for env, one in zip(envs, teams, strict=True):
+        check_batch_memory(env, steps, one.num_envs)
+    like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
+    learner = make_learner(cfg, like)
+    if alone:
+        return learner, Experience([make_collector(env, learner.policy, steps, there) for env in envs])
+    from maexp.agents.workers import make_workers  # here: most runs have none
+
+    return learner, make_workers(cfg, maps, teams, learner.policy)
+
+
+def check_collector(settings: Any) -> None:
+    """Raise UserError for settings of `collector` that do not go together."""
+    check_counts(settings, "steps", "workers", prefix="collector.")
+    if settings.backend not in BACKENDS:
+        raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
+    if settings.backend == "single":
+        for name, default in (("workers", 1), ("overlap", False)):
+            if settings[name] != default:
+                raise UserError(f"collector.{name}={settings[name]} needs collector=processes or collector=ray.")
+    if settings.ray_address is not None and settings.backend != "ray":
+        raise UserError(f"collector.ray_address={settings.ray_address} needs collector=ray.")
+
+
+def describe_teams(cfg: Any) -> str:
+    """Which teams a run has, as one types it."""
+    return f"num_envs={cfg.num_envs} num_robots={','.join(map(str, team_sizes(cfg.num_robots)))}"
+
+
+def describe_workers(cfg: Any) -> str:
+    """Which processes simulate, for messages and to tell whether a checkpoint's state fits."""
+    if cfg.collector.backend == "single":
+        return "one process"
+    late = ", one batch behind" if cfg.collector.overlap else ""
+    return f"{cfg.collector.workers} workers ({cfg.collector.backend}{late})"
 
 
 def check_action(saved: dict, cfg: Any) -> None:
@@ -204,14 +287,24 @@ def load_matching(policy: Any, state: dict) -> None:
 
 @contextmanager
 def name_iteration(run: TrainingRun) -> Iterator[None]:
-    """A loss that became NaN or infinite ends the run with its name; the checkpoints stay as they are."""
+    """A loss that became NaN or infinite, or a lost worker, ends the run with its name; the checkpoints stay."""
+    number = run.iteration + 1
     try:
         yield
-    except ArithmeticError as error:
+    except (ArithmeticError, WorkerLost) as error:
         raise UserError(
-            f"Training stopped in iteration {run.iteration + 1}: {error} The last good checkpoint is kept in "
+            f"Training stopped in iteration {number}: {error} The last good checkpoint is kept in "
             f"{run.folder / 'checkpoints'}."
         ) from error
+
+
+@contextmanager
+def ending(experience: Experience) -> Iterator[None]:
+    """Ends the collectors, however the training ends."""
+    try:
+        yield
+    finally:
+        experience.shutdown()
 
 
 @contextmanager

@@ -53,13 +53,14 @@ class ExplorationEnv(EnvBase):
         num_envs: teams in the batch, E.
         num_robots: robots in a team, N.
         device: "cpu" or "cuda".
-        seed: key of all random numbers: env i's episode k depends on (seed, i, k) alone.
+        seed: key of all random numbers: env i's episode k depends on (seed, first_env + i, k) alone.
         robot, radar, planner, reward, observation, comm: see `maexp.envs.config`.
         local_steps: control steps of 0.1 s in one ``env.step``.
         macro_steps: ``env.step`` calls in an episode before it is truncated.
         collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
         success_coverage: coverage that ends an episode as a success.
         num_threads: CPU threads of the simulation; results do not depend on it.
+        first_env: number of the first env in the random keys, where several processes share one batch of envs.
 
     Raises:
         ValueError: a setting is out of its range (named, with its value).
@@ -87,6 +88,7 @@ class ExplorationEnv(EnvBase):
         collision: str = "centre",
         success_coverage: float = 0.95,
         num_threads: int | None = None,
+        first_env: int = 0,
     ):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
         if not maps:
@@ -97,6 +99,8 @@ class ExplorationEnv(EnvBase):
                 raise ValueError(f"maps holds {m!r}: give PointCloudMaps, from make_map or import_map")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
             raise ValueError(f"seed={seed!r} must be a whole number")
+        if isinstance(first_env, bool) or not isinstance(first_env, int | np.integer) or first_env < 0:
+            raise ValueError(f"first_env={first_env!r} must be a whole number, 0 or more")
         fewest = min(maps, key=lambda m: len(m.free))
         if num_robots > len(fewest.free):
             raise MapError(
@@ -131,6 +135,7 @@ class ExplorationEnv(EnvBase):
         check_memory(self)
         threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
         self.simulation = build_simulation(self, seed, threads if self.device.type == "cpu" else 1)
+        self.simulation.tensors["env_id"] += int(first_env)
         self._hook: tuple[Callable, int] | None = None
         direct = self.planner_config.name == "direct"
         self.observation_spec = observation_spec(num_envs, num_robots, self.device)

@@ -43,13 +43,13 @@ def test_every_verb_composes():
 @pytest.mark.parametrize(
     ("word", "wanted"),
     [
-        ("num_robots=three", ("num_robots=three", "whole number")),
-        ("num_robots=", ("num_robots=", "whole number")),
+        ("num_envs=three", ("num_envs=three", "whole number")),
+        ("num_envs=", ("num_envs=", "whole number")),
         ("radar.range=far", ("radar.range=far", "a number")),
         ("scenario=labyrinth", ("scenario=labyrinth", "maze_small")),
         ("num_robot=3", ("num_robot ", "num_robots")),
         ("radar.rang=3", ("radar.rang ", "radar.range")),
-        ("num_robots=1,2", ("num_robots=1,2", "-m")),
+        ("num_envs=1,2", ("num_envs=1,2", "-m")),
         ("maze", ("'maze'", "name=value")),
     ],
 )
@@ -77,6 +77,8 @@ def test_quote_round_trip_of_trailing_backslashes():
 def test_lists_of_values_only_where_they_mean_a_list():
     cfg = compose_config("evaluate", make_overrides("evaluate", ["num_robots=1,2", "policy=random,nearest_frontier"]))
     assert (list(cfg.num_robots), list(cfg.policy)) == ([1, 2], ["random", "nearest_frontier"])
+    assert make_overrides("train", ["num_robots=2,3"]) == ["num_robots=[2,3]"]
+    assert make_overrides("train", ["num_robots=2,3"], multirun=True) == ["num_robots=2,3"], "a sweep"
 
 
 def test_without_drops_groups_and_their_values():

@@ -21,7 +21,9 @@ TINY = [
     "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
 ]  # fmt: skip
 BATCH = 6
-CLOCKS = ("seconds", "frames_per_second", "time_simulate", "time_policy", "time_advantage", "time_update")
+CLOCKS = (
+    "seconds", "frames_per_second", "time_wait", "time_simulate", "time_policy", "time_advantage", "time_update"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +79,9 @@ def test_the_files_of_a_run(capsys):
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert [row["frames"] for row in rows] == [BATCH, 2 * BATCH, 3 * BATCH]
     assert all(row[name] > 0 for row in rows for name in CLOCKS)
-    assert all(sum(row[name] for name in CLOCKS[2:]) < row["seconds"] for row in rows)
+    assert all(sum(row[name] for name in CLOCKS[3:]) < row["seconds"] for row in rows)
+    assert all(row["time_simulate"] + row["time_policy"] <= row["time_wait"] + 2e-4 for row in rows)
+    assert {row["policy_lag"] for row in rows} == {0}
     assert sum(row["episodes"] for row in rows) == 3 * 2  # 6 macro steps of 3 teams, 3 to an episode
     assert rows[1]["held_out_coverage"] > 0 and rows[0]["held_out_coverage"] != rows[0]["held_out_coverage"]
     assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2"]
@@ -96,6 +100,24 @@ def test_resumed_is_uninterrupted(algorithm):
     whole = run("whole", 6, f"algorithm={algorithm}")
     parts = resume(run("parts", 3, f"algorithm={algorithm}"), 6)
     assert_same_runs(whole, parts)
+
+
+def test_teams_of_several_sizes_in_one_batch(capsys):
+    """Resumed is uninterrupted; the teams are those that runs of one size would have; each size is evaluated."""
+    words = ["num_robots=1,3", "num_envs=5"]
+    frames = [f"total_frames={count * 5 * 2}" for count in (6, 3)]
+    for folder, count in (("whole", frames[0]), ("parts", frames[1])):
+        assert main(["train", *TINY, *words, f"hydra.run.dir={folder}", count, "episodes=3"]) == 0
+    summary = json.loads(Path("parts/summary.json").read_text())
+    assert {name for name in summary if name != "run"} == {f"{p} N={n}" for p in ("trained", "random") for n in (1, 3)}
+    assert summary["run"]["num_robots"] == [1, 3]
+    assert "5 teams of 1 and 3 robots" in capsys.readouterr().out
+    assert main(["train", "resume=parts", frames[0], "episodes=0"]) == 0
+    assert_same_runs(Path("whole"), Path("parts"))
+    assert main(["train", "resume=parts", "num_robots=1,2"]) == 2
+    assert "num_robots=1,3, not num_envs=5 num_robots=1,2" in capsys.readouterr().err
+    assert main(["train", *TINY, "num_envs=2", "num_robots=1,2,3", "hydra.run.dir=few"]) == 2
+    assert "num_envs=2 is too few for 3 team sizes" in capsys.readouterr().err
 
 
 def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
