@@ -1,0 +1,30 @@
+"""The radar's kernels beside a dense PyTorch version of the same filter: the same verdicts, and a ratio of times."""
+
+import torch
+from dense_radar import Scene, measure_ratio
+
+RECORDED_RATIO = 1000
+"""Dense over kernels, one thread. To record it anew: `python tests/dense_radar.py` on a quiet machine."""
+ATTEMPTS = 3
+
+
+def test_the_dense_filter_gives_the_same_verdicts():
+    scene = Scene(torch.float64)
+    for e, dense in enumerate(scene.dense()):
+        seen = torch.as_tensor(scene.env.snapshot(e)["visible"][0])
+        assert torch.equal(dense, seen), f"env {e}: {int((dense != seen).sum())} points differ"
+        assert 0 < int(seen.sum()) < len(seen)
+
+
+def test_the_ratio_to_the_dense_filter_holds():
+    """Both run in turns on one thread, so a noisy machine slows both; only a change of more than 2 x fails."""
+    ratios = []
+    for _ in range(ATTEMPTS):
+        ratios.append(measure_ratio())
+        if RECORDED_RATIO / 2 < ratios[-1] < RECORDED_RATIO * 2:
+            return
+    found = ", ".join(f"{one:.0f}" for one in ratios)
+    raise AssertionError(
+        f"the dense filter takes {found} times as long as the kernels, recorded is {RECORDED_RATIO}: the radar became "
+        "slower, or so much faster that the record is out of date (see RECORDED_RATIO)"
+    )
