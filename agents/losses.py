@@ -129,8 +129,8 @@ class NormalisedValues:
 class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
     """Unclipped surrogate with its divergence from the acting policy, for a trust-region step.
 
-    `surrogate` gives the two terms a trust-region step needs; `forward` adds the critic's, so that any loop
-    may use the loss.
+    `surrogate` gives the two terms a trust-region step needs and leaves its parts in `terms`, to be logged;
+    `forward` adds the critic's, so that any loop may use the loss.
     """
 
     default_value_estimator = ValueEstimators.MAGAE
@@ -145,8 +145,9 @@ class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
         log_weight, dist, _, _ = self._log_weight(batch.copy(), adv_shape=advantage.shape[:-1])
         entropy = sum(head.entropy() for head in dist.dists.values()).unsqueeze(-1)
-        loss = -(log_weight.exp() * advantage + self.entropy_coeff * entropy).mean()
-        return loss, policy_divergence(batch, dist).mean()
+        objective, entropy = -(log_weight.exp() * advantage).mean(), entropy.mean()
+        self.__dict__["terms"] = {"loss_objective": objective.item(), "entropy": entropy.item()}
+        return objective - self.entropy_coeff * entropy, policy_divergence(batch, dist).mean()
 
     def divergence(self, batch: TensorDictBase) -> Tensor:
         """Mean divergence from the acting policy, a scalar with its graph."""
@@ -186,7 +187,9 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
         with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
             value = self.critic_network(tensordict.select(*self.critic_network.in_keys))
         target = tensordict.get(self.tensor_keys.value_target)
-        target, value, _ = self._critic_loss_inputs(target, value.get(self.tensor_keys.value), None)
+        value = value.get(self.tensor_keys.value)
+        self.__dict__["_explained"] = 1 - (target - value.detach()).var() / target.var().clamp_min(1e-8)
+        target, value, _ = self._critic_loss_inputs(target, value, None)
         return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -201,4 +204,5 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
         if self.normalize_advantage:
             advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
         tensordict.set(self.tensor_keys.advantage, advantage)
-        return super().forward(tensordict).set("kl", self._divergence)
+        terms = super().forward(tensordict).set("kl", self._divergence)
+        return terms.set("explained_variance", self._explained)

@@ -194,7 +194,7 @@ class TrustRegionUpdater(Updater):
         for number, parts in enumerate(self.minibatches(steps, self.settings.policy_minibatch_size)):
             if number:
                 self._act_again(parts)
-            meter.add(self.policy_optimizer.step(*self._closures(parts)))
+            meter.add(self.policy_optimizer.step(*self._closures(parts)) | self.loss.terms)
         for _ in range(self.settings.critic_epochs):
             for parts in self.minibatches(steps, self.settings.minibatch_size):
                 meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))

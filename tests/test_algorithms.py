@@ -68,7 +68,8 @@ def test_one_update_moves_policy_and_critic_and_reports(name):
     after = [*policy.parameters(), *critic.parameters()]
     moved = [not torch.equal(a, b) for a, b in zip(before, after, strict=True)]
     assert sum(moved) > 0.9 * len(moved)
-    assert {"kl", "loss_critic", "critic_gradient_norm", "advantage", "update"} <= set(metrics)
+    shared = {"kl", "entropy", "loss_objective", "loss_critic", "explained_variance", "critic_gradient_norm"}
+    assert shared | {"advantage", "update"} <= set(metrics)
     assert all(isinstance(v, float) and math.isfinite(v) for v in metrics.values())
     assert metrics["advantage"] > 0 and metrics["update"] > 0
     assert (batch == stored).all(), "the batch belongs to the caller"
