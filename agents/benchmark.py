@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from maexp.agents.results import plain, write_json
 from maexp.envs.scenarios import SCENARIOS, find_scenario, split
 
 PLAN = "benchmark.json"
-SUITES = ("held_out", "trained")
+SUITES = {"held_out": "held-out maps", "trained": "training maps"}
 SECTIONS = (
     "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
     "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
@@ -264,9 +265,11 @@ def lock(where: Path) -> Iterator[None]:
     Raises:
         UserError: another process is at it.
     """
-    with open(where / "benchmark.lock", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise UserError(f"Another maexp benchmark is running in {where}: wait for it or stop it.") from error
+    handle = os.open(where, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
+    except BlockingIOError as error:
+        raise UserError(f"Another maexp benchmark is running in {where}: wait for it or stop it.") from error
+    finally:
+        os.close(handle)

@@ -4,7 +4,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.benchmark import Cell
+import numpy as np
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.benchmark import SUITES, Cell, as_list
 from maexp.agents.benchmark_cell import CellResult, finished, read_result
 from maexp.agents.benchmark_table import (
     Column,
@@ -14,7 +17,11 @@ from maexp.agents.benchmark_table import (
     table_latex,
     table_markdown,
 )
+from maexp.agents.paper_results import paper_value
 from maexp.agents.results import PACKAGES, find_commit, write_json, write_text
+from maexp.agents.run_folder import short
+
+SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
 
 
 class Report:
@@ -53,7 +60,9 @@ class Report:
             return
         written = ["table.csv", "table.md", "table.tex", "summary.json", *self.draw(tables)]
         print_tables(tables)
-        print(f"Written to {self.where}: {', '.join(written)}")
+        if self.cfg.preset == "smoke":
+            print(SMOKE)
+        print(f"Written to {short(self.where)}: {', '.join(written)}")
 
     def results(self, scenario: str, policy: str, suite: str) -> list[tuple[Cell, CellResult]]:
         """The finished cells of a policy in a scenario."""
@@ -91,14 +100,24 @@ class Report:
         tables = self.tables()
         if tables:
             write_text(self.where / "table.csv", table_csv(tables))
-            write_text(self.where / "table.md", table_markdown(tables))
-            write_text(self.where / "table.tex", table_latex(tables))
+            write_text(self.where / "table.md", table_markdown(tables, self.heading()))
+            write_text(self.where / "table.tex", table_latex(tables, self.heading()))
             for scenario, columns in tables.items():
                 named = {one.name: one.summary for one in columns}
                 write_json(self.where / "summaries" / f"{scenario}.json", named | {"run": self.describe([scenario])})
             content = {scenario: {one.name: one.summary for one in columns} for scenario, columns in tables.items()}
             write_json(self.where / "summary.json", content | {"run": self.describe(list(tables))})
         return tables
+
+    def heading(self) -> str:
+        """A sentence on what the tables show."""
+        cfg = self.cfg
+        length = f"{cfg.total_frames:,} macro steps" if cfg.iterations is None else f"{cfg.iterations:,} iterations"
+        seeds = ", ".join(str(one) for one in as_list(cfg.seeds))
+        text = f"maexp benchmark, preset {cfg.preset}: {cfg.num_robots} robots, planner {cfg.planner.name}, "
+        text += f"{length} of training for each algorithm, seeds {seeds}, {cfg.episodes} episodes each, "
+        text += f"commit {find_commit()}."
+        return text + (f" {SMOKE}" if cfg.preset == "smoke" else "")
 
     def describe(self, scenarios: list[str]) -> dict:
         """What was run, of the cells that are done."""
@@ -124,5 +143,71 @@ class Report:
     # Pictures
 
     def draw(self, tables: dict[str, list[Column]]) -> list[str]:
-        """All pictures; returns their names."""
-        return []
+        """All pictures and the table behind the comparison; returns their names."""
+        written = []
+        for suite in self.suites:
+            played = {name: [one for one in columns if one.suite == suite] for name, columns in tables.items()}
+            played = {name: columns for name, columns in played.items() if columns}
+            if played:
+                written += self._draw_suite(suite, played)
+        return written
+
+    def _draw_suite(self, suite: str, played: dict[str, list[Column]]) -> list[str]:
+        """Those of one set of maps; the training maps have a mark in the file's name."""
+        from maexp.agents.benchmark_compare import compare_all, pairs_csv
+        from maexp.agents.plots_benchmark import draw_coverage_panels, draw_improvement, draw_overview
+
+        mark, paths = "" if suite == "held_out" else f"_{suite}", []
+        for scenario, columns in played.items():
+            title = f"{scenario.replace('_', ' ')}, {SUITES[suite]}"
+            path = self.where / f"coverage_{scenario}{mark}.png"
+            paths.append(draw_coverage_panels(self._curves(scenario, columns), title, path))
+        points = {scenario: _points(scenario, columns) for scenario, columns in played.items()}
+        paths.append(draw_overview(points, self.where / f"overview{mark}.png"))
+        values = self._coverage(suite, played)
+        if len(values) > 1:
+            pairs = compare_all(values)
+            paths.append(self.where / f"improvement{mark}.csv")
+            write_text(paths[-1], pairs_csv(pairs))
+            trained = [name for name in values if name in ALGORITHMS]
+            listed = trained if len(trained) > 1 else list(values)[:6]
+            paths.append(draw_improvement(pairs, listed, self.where / f"improvement{mark}.png"))
+        return [path.name for path in paths]
+
+    def _coverage(self, suite: str, played: dict[str, list[Column]]) -> dict[str, dict[str, np.ndarray]]:
+        """Policy -> scenario -> final coverage of all episodes."""
+        values: dict[str, dict[str, np.ndarray]] = {}
+        for scenario, columns in played.items():
+            for one in columns:
+                found = self.results(scenario, one.policy, suite)
+                cells = [result.episodes["exploration_ratio"] for _, result in found]
+                values.setdefault(one.policy, {})[scenario] = np.concatenate(cells)
+        return values
+
+    def _curves(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
+        """Panel -> policy -> (seconds, coverage of all episodes); `random` is in both panels, to compare with."""
+        curves = {}
+        for one in columns:
+            curves[one.policy] = pool_curves([result for _, result in self.results(scenario, one.policy, one.suite)])
+        trained = {name: curve for name, curve in curves.items() if name in ALGORITHMS}
+        classical = {name: curve for name, curve in curves.items() if name not in ALGORITHMS}
+        if trained and "random" in classical:
+            trained["random"] = classical["random"]
+        return {"trained": trained, "classical": classical}
+
+
+def pool_curves(results: list[CellResult]) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and coverage [episodes, times] of several cells; what has ended keeps its coverage."""
+    times = np.unique(np.concatenate([one.seconds for one in results]))
+    coverage = [np.stack([np.interp(times, one.seconds, curve) for curve in one.coverage]) for one in results]
+    return times, np.concatenate(coverage)
+
+
+def _points(scenario: str, columns: list[Column]) -> list[tuple]:
+    """What `draw_overview` shows of a scenario."""
+    points = []
+    for one in columns:
+        kind = "trained" if one.policy in ALGORITHMS else "classical"
+        found, published = one.summary["exploration_ratio"], paper_value(scenario, one.policy, "exploration_ratio")
+        points.append((one.policy, kind, found["mean"], found["ci95"], published and published[0] / 100))
+    return points

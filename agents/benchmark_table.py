@@ -127,10 +127,10 @@ def interval_text(column: Column, row: Row) -> str:
     return f"[{low}, {high}]" + (f" {count}" if row.label.startswith(("CS", "MO")) else "")
 
 
-def paper_text(scenario: str, column: Column, row: Row) -> str | None:
-    """The paper's value of the same scenario and algorithm."""
+def paper_text(scenario: str, column: Column, row: Row, digits: int | None = None) -> str | None:
+    """The paper's value of the same scenario and algorithm, to the digits it was printed with or to `digits`."""
     value = paper_value(scenario, column.policy, row.metric)
-    digits = 2 if row.digits else 0
+    digits = (0 if row.label.startswith("CS") else 2) if digits is None else digits
     return None if value is None else f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
 
 
@@ -138,11 +138,13 @@ def paper_text(scenario: str, column: Column, row: Row) -> str | None:
 
 
 def print_tables(tables: dict[str, list[Column]], console: Console | None = None) -> None:
-    """A table per scenario, policies as rows; fits 100 columns."""
+    """A table per scenario, policies as rows, and one of the coverage in all of them; fits 100 columns."""
     console = console or Console()
     console = Console(file=console.file, width=max(100, console.width), force_terminal=console.is_terminal)
     for scenario, columns in tables.items():
         console.print(draw_table(scenario, columns))
+    if len(tables) > 1:
+        console.print(draw_overview(tables))
     console.print(Group(*(Text(one, style="dim") for one in NOTES)))
 
 
@@ -152,7 +154,7 @@ def draw_table(scenario: str, columns: list[Column]) -> Table:
                   pad_edge=False, collapse_padding=True, padding=(0, 1))  # fmt: skip
     table.add_column("policy", no_wrap=True)
     for row in ROWS:
-        table.add_column(row.title, justify="right", no_wrap=True)
+        table.add_column(row.title.replace(" steps", ""), justify="right", no_wrap=True)
     bold = {row.metric: best_columns(columns, row) for row in ROWS}
     for column in columns:
         cells = []
@@ -160,14 +162,32 @@ def draw_table(scenario: str, columns: list[Column]) -> Table:
             cell = Text(value_text(column, row), style="bold" if column.name in bold[row.metric] else "")
             cells.append(cell.append(f"\n{_narrow(column, row)}", style="not bold dim"))
         table.add_row(column.name.replace(" (", "\n("), *cells)
-        published = [paper_text(scenario, column, row) for row in ROWS]
+        published = [paper_text(scenario, column, row, row.digits) for row in ROWS]
         if any(published):
             table.add_row(Text("  paper", style="dim"), *(Text(one or "-", style="dim") for one in published))
     return table
 
 
+def draw_overview(tables: dict[str, list[Column]]) -> Table:
+    """Exploration ratio of every policy in every scenario."""
+    row = ROWS[0]
+    table = Table(title=f"all scenarios: {row.title}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False,
+                  collapse_padding=True, padding=(0, 1))  # fmt: skip
+    table.add_column("policy", no_wrap=True)
+    for scenario in tables:
+        table.add_column(scenario.replace("_", "\n", 1), justify="right", no_wrap=True)
+    for name in dict.fromkeys(one.name for columns in tables.values() for one in columns):
+        cells = []
+        for columns in tables.values():
+            bold = best_columns(columns, row)
+            found = next((one for one in columns if one.name == name), None)
+            cells.append(Text(value_text(found, row) if found else "", style="bold" if name in bold else ""))
+        table.add_row(name.replace(" (", "\n("), *cells)
+    return table
+
+
 def _narrow(column: Column, row: Row) -> str:
-    """The interval; for CS and MO, where there is no room for both, for CS how many and for MO the interval."""
+    """How many got there for CS, else the interval: there is no room for both."""
     one = column.summary[row.metric]
     if row.label.startswith("CS") or not one["n"]:
         return f"({one['n']}/{column.total})"
@@ -205,9 +225,9 @@ def _csv_number(value) -> str:
     return value if value == "" else f"{value:.6g}"
 
 
-def table_markdown(tables: dict[str, list[Column]]) -> str:
-    """A table per scenario as in the paper: metrics as rows, policies as columns."""
-    parts = []
+def table_markdown(tables: dict[str, list[Column]], heading: str = "") -> str:
+    """A table per scenario as in the paper: metrics as rows, policies as columns. `heading`: what was run."""
+    parts = [heading] if heading else []
     for scenario, columns in tables.items():
         lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
         lines += ["| | " + " | ".join(one.name for one in columns) + " |", "| --- |" + " --- |" * len(columns)]
@@ -226,10 +246,11 @@ def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> s
     return "<br>".join([text, interval_text(column, row), *([f"paper {published}"] if published else [])])
 
 
-def table_latex(tables: dict[str, list[Column]]) -> str:
+def table_latex(tables: dict[str, list[Column]], heading: str = "") -> str:
     """One tabular for \\input: scenarios and metrics as rows, policies as columns; needs booktabs and multirow."""
     names = list(dict.fromkeys(one.name for columns in tables.values() for one in columns))
-    lines = [r"% \usepackage{booktabs,multirow}", rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
+    lines = [f"% {heading}", r"% \usepackage{booktabs,multirow}"]
+    lines += [rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
     lines += [" & & " + " & ".join(_escape(one) for one in names) + r" \\"]
     for scenario, columns in tables.items():
         lines.append(r"\midrule")

@@ -1,8 +1,4 @@
-"""Plots of runs and evaluations: learning curves, coverage over time, metrics, share of each robot.
-
-Okabe-Ito colours with a line style or marker each, so that they can be told apart in grey and by the colour-blind.
-Figures are drawn without pyplot: no display, no global state. The file's ending chooses the format (png, pdf, svg).
-"""
+"""Plots of runs and evaluations: learning curves, coverage over time, metrics, share of each robot."""
 
 import csv
 import json
@@ -13,22 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
-STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)), "-", "--")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-LOOK = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#E0E0E0",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "lines.linewidth": 1.6,
-}
-WIDE = 3.6  # inches of a panel
+from maexp.agents.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
@@ -101,7 +82,7 @@ def draw_curves(runs, path) -> Path:
         known = sorted({name for table in tables for name in table})
         raise ValueError(f"{path}: none of the columns {', '.join(known) or '(none)'} is known or has values")
     with rc_context(LOOK):
-        figure, axes = _panels(len(shown))
+        figure, axes = panels(len(shown))
         for ax, (title, unit, factor, columns) in zip(axes, shown, strict=True):
             lines = [(name, seeds, column, label) for column, label in columns for name, seeds in groups.items()]
             if len(groups) > 1:  # colours tell settings apart, so one column each
@@ -109,11 +90,11 @@ def draw_curves(runs, path) -> Path:
                 title = f"{title}: {columns[0][1]}" if len(columns) > 1 else title
             for k, (name, seeds, column, label) in enumerate(lines):
                 _draw_seeds(ax, seeds, column, factor, name or label, k)
-            _finish(ax, title, unit, legend=len(lines) > 1 and (len(groups) == 1 or ax is axes[0]))
+            finish(ax, title, unit, legend=len(lines) > 1 and (len(groups) == 1 or ax is axes[0]))
             ax.set_xlabel(_x_label(tables))
             ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.xaxis.set_major_formatter(EngFormatter(sep=""))
-        return _save(figure, path)
+        return save(figure, path)
 
 
 def _read_seeds(source) -> list[dict[str, np.ndarray]]:
@@ -223,26 +204,39 @@ def draw_coverage(curves: dict, path) -> Path:
     with rc_context(LOOK):
         figure = Figure(figsize=(5.2, 3.4), layout="constrained")
         ax = figure.subplots()
-        for k, (name, (seconds, coverage)) in enumerate(curves.items()):
-            seconds, coverage = np.asarray(seconds, dtype=float), np.atleast_2d(np.asarray(coverage, dtype=float))
-            if coverage.shape[1:] != seconds.shape:
-                raise ValueError(
-                    f"curves[{name!r}]: coverage has shape {coverage.shape}, which must be (episodes, {len(seconds)})"
-                )
-            mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
-            colour, style = COLOURS[k % len(COLOURS)], STYLES[k % len(STYLES)]
-            ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
-            ax.fill_between(
-                seconds, np.clip(mean - error, 0, 100), np.clip(mean + error, 0, 100), color=colour, alpha=0.2,
-                linewidth=0,
-            )  # fmt: skip
-        for mark in (85, 95):
-            ax.axhline(mark, color="#808080", linewidth=0.8, linestyle=(0, (2, 2)))
-        ax.set_ylim(0, 101)
-        ax.set_xlim(left=0)
-        ax.set_xlabel("time [s]")
-        _finish(ax, "Coverage over time, mean and its 95 % interval", "%", legend=True)
-        return _save(figure, path)
+        draw_coverage_lines(ax, curves)
+        finish(ax, "Coverage over time, mean and its 95 % interval", "%", legend=True)
+        return save(figure, path)
+
+
+def draw_coverage_lines(ax, curves: dict, looks: dict[str, int] | None = None) -> None:
+    """The lines, bands and marks at 85 and 95 % of `draw_coverage`.
+
+    Args:
+        ax: where to
+        curves: as there
+        looks: number of the colour and line style of a name; default: in order
+
+    Raises:
+        ValueError: shapes that do not fit (named).
+    """
+    for k, (name, (seconds, coverage)) in enumerate(curves.items()):
+        seconds, coverage = np.asarray(seconds, dtype=float), np.atleast_2d(np.asarray(coverage, dtype=float))
+        if coverage.shape[1:] != seconds.shape:
+            raise ValueError(
+                f"curves[{name!r}]: coverage has shape {coverage.shape}, which must be (episodes, {len(seconds)})"
+            )
+        mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
+        k = k if looks is None else looks[name]
+        colour, style = COLOURS[k % len(COLOURS)], STYLES[k % len(STYLES)]
+        ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
+        low, high = np.clip(mean - error, 0, 100), np.clip(mean + error, 0, 100)
+        ax.fill_between(seconds, low, high, color=colour, alpha=0.2, linewidth=0)
+    for mark in (85, 95):
+        ax.axhline(mark, color="#808080", linewidth=0.8, linestyle=(0, (2, 2)))
+    ax.set_ylim(0, 101)
+    ax.set_xlim(left=0)
+    ax.set_xlabel("time [s]")
 
 
 # Metrics
@@ -270,12 +264,12 @@ def draw_summary(summary, path) -> Path:
             f"the summary has no metric that can be drawn; found {', '.join(map(str, summary)) or 'nothing'}"
         )
     with rc_context(LOOK):
-        figure, axes = _panels(len(shown), height=2.1 + 0.1 * len(policies))
+        figure, axes = panels(len(shown), height=2.1 + 0.1 * len(policies))
         for ax, (metric, title, unit, factor) in zip(axes, shown, strict=True):
             _draw_bars(ax, policies, metric, factor)
             ax.set_title(title, loc="left")
             ax.set_xlabel(unit)
-        return _save(figure, path)
+        return save(figure, path)
 
 
 def _mean(metrics: dict, name: str) -> float | None:
@@ -337,37 +331,5 @@ def draw_contributions(contributions: dict, path) -> Path:
         ax.set_xticks(range(1, largest + 1))
         ax.grid(False, axis="x")
         ax.set_xlabel("robot, by its share within the episode")
-        _finish(ax, "Share of each robot in the exploration", "% of what the team discovered", legend=True)
-        return _save(figure, path)
-
-
-# Figures
-
-
-def _panels(count: int, height: float = 2.5) -> tuple[Figure, list]:
-    """A figure with ``count`` panels in rows of up to three."""
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(WIDE * columns, height * rows), layout="constrained")
-    axes = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
-    for ax in axes[count:]:
-        ax.set_axis_off()
-    return figure, axes[:count]
-
-
-def _finish(ax, title: str, unit: str, legend: bool) -> None:
-    ax.set_title(title, loc="left")
-    ax.set_ylabel(unit)
-    entries = len(ax.get_legend_handles_labels()[0]) if legend else 0
-    if entries > 3:  # room above the lines
-        low, high = ax.get_ylim()
-        ax.set_ylim(low, high + 0.12 * -(-entries // 2) * (high - low))
-        ax.legend(loc="upper left", ncols=2)
-    elif entries:
-        ax.legend()
-
-
-def _save(figure: Figure, path) -> Path:
-    path = Path(path)
-    figure.savefig(path, dpi=150)
-    return path
+        finish(ax, "Share of each robot in the exploration", "% of what the team discovered", legend=True)
+        return save(figure, path)

@@ -21,13 +21,13 @@ from maexp.agents.benchmark import (
 from maexp.agents.benchmark_cell import finished
 from maexp.agents.benchmark_estimate import Estimate, estimate_cells
 from maexp.agents.benchmark_pool import Outcome, WorkerPool, last_lines
-from maexp.agents.benchmark_report import Report
+from maexp.agents.benchmark_report import SMOKE, Report
 from maexp.agents.build import pick_device
 from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError
 from maexp.agents.overrides import find_override, without
 from maexp.agents.progress import Progress, duration
-from maexp.agents.run_folder import check_writable
+from maexp.agents.run_folder import check_writable, short
 from maexp.agents.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130
@@ -122,7 +122,7 @@ def announce(cfg: Any, where: Path, cells: list[Cell], todo: list[Cell], workers
           f"{len(as_list(cfg.scenarios))} scenarios, seeds {', '.join(map(str, as_list(cfg.seeds)))}, {cfg.episodes} "
           f"episodes each){f', {done} of them done before' if done else ''}; {workers} at once")  # fmt: skip
     if cfg.preset == "smoke":
-        print("smoke shows that everything runs; policies are hardly trained, so its figures are no result")
+        print(SMOKE)
     print(expected.text, flush=True)
     if expected.hours > LONG and not cfg.confirm:
         raise UserError(
@@ -192,9 +192,3 @@ def read_share(log: Path) -> tuple[float, str]:
             training = title == "training"
             return (0.9 * part if training else 0.9 + 0.1 * part), f"{title.split()[0]} {part:.0%}"
     return 0.0, "starting"
-
-
-def short(path: Path) -> str:
-    """The path as one would type it here."""
-    here = Path.cwd()
-    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)

@@ -13,8 +13,8 @@ from maexp.agents.plots import draw_contributions, draw_coverage, draw_curves, d
 @pytest.fixture
 def figures(monkeypatch) -> list:
     """The figures drawn, kept to look into; they are written all the same."""
-    kept, save = [], plots._save
-    monkeypatch.setattr(plots, "_save", lambda figure, path: kept.append(figure) or save(figure, path))
+    kept, save = [], plots.save
+    monkeypatch.setattr(plots, "save", lambda figure, path: kept.append(figure) or save(figure, path))
     return kept
 
 

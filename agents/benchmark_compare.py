@@ -1,0 +1,78 @@
+"""How likely one policy does better than another: P(X > Y) + P(X = Y) / 2, scenario by scenario, with an interval.
+
+The Mann-Whitney U statistic over n m, averaged over scenarios, as rliable's probability of improvement (Agarwal et al.
+2021). The interval is a bootstrap over episodes, stratified by scenario.
+"""
+
+import csv
+import io
+
+import numpy as np
+
+RESAMPLES = 2000
+
+
+def win_shares(x: np.ndarray, y: np.ndarray, counts_x: np.ndarray, counts_y: np.ndarray) -> np.ndarray:
+    """P(X > Y) + P(X = Y) / 2 of weighted samples.
+
+    Args:
+        x, y: values, shapes [n] and [m]
+        counts_x, counts_y: how often each counts in each resample, [resamples, n] and [resamples, m]
+
+    Returns:
+        [resamples]
+    """
+    wins = 0.5 * (np.sign(x[:, None] - y[None, :]) + 1.0)
+    total = counts_x.sum(1) * counts_y.sum(1)
+    return np.einsum("bm,bm->b", counts_x @ wins, counts_y) / total
+
+
+def improvement(x: dict[str, np.ndarray], y: dict[str, np.ndarray], seed: int = 0) -> dict:
+    """{mean, ci95, n}: how likely X has more than Y, over the scenarios that both have.
+
+    Args:
+        x, y: scenario -> values of the episodes
+        seed: of the resampling
+    """
+    rng = np.random.default_rng(seed)
+    shares, once = [], []
+    for scenario in (name for name in x if name in y):
+        one, other = (np.asarray(values, dtype=np.float64) for values in (x[scenario], y[scenario]))
+        once.append(win_shares(one, other, np.ones((1, len(one))), np.ones((1, len(other))))[0])
+        counts = [
+            rng.multinomial(len(values), np.full(len(values), 1 / len(values)), size=RESAMPLES).astype(np.float64)
+            for values in (one, other)
+        ]
+        shares.append(win_shares(one, other, *counts))
+    if not once:
+        return {"mean": np.nan, "ci95": [np.nan, np.nan], "n": 0}
+    low, high = np.percentile(np.mean(shares, axis=0), [2.5, 97.5])
+    return {"mean": float(np.mean(once)), "ci95": [float(low), float(high)], "n": len(once)}
+
+
+def compare_all(values: dict[str, dict[str, np.ndarray]]) -> dict[tuple[str, str], dict]:
+    """`improvement` of every ordered pair of policies.
+
+    Args:
+        values: policy -> scenario -> values of the episodes, of which more is better
+    """
+    names = list(values)
+    pairs = {}
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            found = improvement(values[one], values[other])
+            low, high = found["ci95"]
+            pairs[one, other] = found
+            pairs[other, one] = found | {"mean": 1 - found["mean"], "ci95": [1 - high, 1 - low]}
+    return pairs
+
+
+def pairs_csv(pairs: dict[tuple[str, str], dict]) -> str:
+    """A line per ordered pair."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["policy", "better_than", "probability", "ci95_low", "ci95_high", "scenarios"])
+    for (one, other), found in pairs.items():
+        numbers = [f"{value:.4f}" for value in (found["mean"], *found["ci95"])]
+        writer.writerow([one, other, *numbers, found["n"]])
+    return text.getvalue()

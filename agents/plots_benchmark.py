@@ -1,0 +1,155 @@
+"""Pictures of a benchmark: coverage over time, every policy in every scenario, who does better than whom."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from maexp.agents.figures import COLOURS, LOOK, MARKERS, finish, save
+from maexp.agents.plots import draw_coverage_lines
+
+KINDS = {"trained": (COLOURS[0], MARKERS[0]), "classical": (COLOURS[1], MARKERS[1]), "paper": ("#606060", MARKERS[3])}
+REFERENCE, BLACK = "random", COLOURS.index("#000000")  # looks the same in all panels
+PAIRS = 15  # drawn with intervals at most: those of six
+
+
+def draw_coverage_panels(curves: dict[str, dict], title: str, path) -> Path:
+    """Coverage over time of one scenario, trained and classical policies side by side; returns the path.
+
+    Args:
+        curves: panel's title -> {policy: (seconds (records,), coverage (episodes, records) in [0, 1])}
+        title: of the whole
+        path: picture to write
+
+    Raises:
+        ValueError: no curves.
+    """
+    curves = {name: lines for name, lines in curves.items() if lines}
+    if not curves:
+        raise ValueError("curves is empty; give at least one policy")
+    with rc_context(LOOK):
+        figure = Figure(figsize=(4.2 * len(curves), 4.4), layout="constrained")
+        axes = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+        for ax, (name, lines) in zip(axes, curves.items(), strict=True):
+            others = [one for one in lines if one != REFERENCE]
+            draw_coverage_lines(ax, lines, {one: k for k, one in enumerate(others)} | {REFERENCE: BLACK})
+            finish(ax, name, "coverage [%], mean and its 95 % interval" if ax is axes[0] else "", legend=False)
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+        return save(figure, path)
+
+
+def draw_overview(coverage: dict[str, list], path) -> Path:
+    """Coverage at the end of every policy in every scenario; returns the path.
+
+    Args:
+        coverage: scenario -> [(policy, kind, mean, (low, high), paper's mean or None)] in [0, 1], kind `trained` or
+            `classical`.
+        path: picture to write
+
+    Raises:
+        ValueError: no scenarios.
+    """
+    if not coverage:
+        raise ValueError("coverage is empty; give at least one scenario")
+    names = list(dict.fromkeys(row[0] for rows in coverage.values() for row in rows))
+    columns = min(len(coverage), 4)
+    lines = -(-len(coverage) // columns)
+    with rc_context(LOOK):
+        figure = Figure(figsize=(1.6 + 2.1 * columns, (0.9 + 0.19 * len(names)) * lines + 0.5), layout="constrained")
+        axes = np.ravel(figure.subplots(lines, columns, sharey=True, squeeze=False))
+        for ax, (scenario, rows) in zip(axes, coverage.items(), strict=False):
+            for policy, kind, mean, (low, high), published in rows:
+                _draw_point(ax, names.index(policy), kind, mean, low, high)
+                if published is not None:
+                    colour, marker = KINDS["paper"]
+                    ax.plot(100 * published, names.index(policy), marker, color=colour, mfc="none", markersize=5)
+            ax.set_title(scenario.replace("_", " "), loc="left")
+            ax.set_xlim(0, 100)
+            ax.set_xticks(range(0, 101, 25))
+            ax.set_yticks(range(len(names)), names)
+            ax.set_ylim(len(names) - 0.5, -0.5)
+        for ax in axes[len(coverage) :]:
+            ax.set_axis_off()
+        figure.supxlabel("final coverage [%], 95 % interval", fontsize=9)
+        figure.legend(handles=_kinds(figure, coverage), loc="outside upper right", ncols=3, fontsize=8)
+        return save(figure, path)
+
+
+def _draw_point(ax, row: int, kind: str, mean: float, low: float, high: float) -> None:
+    colour, marker = KINDS[kind]
+    error = [[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]]
+    ax.errorbar(100 * mean, row, xerr=error, fmt=marker, color=colour, markersize=4, capsize=2, linewidth=1.2)
+
+
+def _kinds(figure: Figure, coverage: dict[str, list]) -> list:
+    from matplotlib.lines import Line2D
+
+    have = {row[1] for rows in coverage.values() for row in rows}
+    have |= {"paper"} if any(row[4] is not None for rows in coverage.values() for row in rows) else set()
+    labels = {"paper": "paper (same map trained and tested)"}
+    return [
+        Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=5, label=labels.get(kind, kind),
+               mfc="none" if kind == "paper" else colour)
+        for kind, (colour, marker) in KINDS.items() if kind in have
+    ]  # fmt: skip
+
+
+def draw_improvement(pairs: dict[tuple[str, str], dict], listed: list[str], path) -> Path:
+    """Probability that a policy does better than another, all as a map and some with intervals; returns the path.
+
+    Args:
+        pairs: (policy, other) -> {mean, ci95}, both orders of every pair
+        listed: the policies whose pairs are drawn with intervals
+        path: picture to write
+
+    Raises:
+        ValueError: no pairs.
+    """
+    if not pairs:
+        raise ValueError("pairs is empty; give at least two policies")
+    names = list(dict.fromkeys(one for one, _ in pairs))
+    chosen = [(a, b) for i, a in enumerate(listed) for b in listed[i + 1 :]][:PAIRS]
+    side = 1.9 + 0.42 * len(names)
+    with rc_context(LOOK):
+        wide = 4.2 if chosen else 0.0
+        figure = Figure(figsize=(side + 0.6 + wide, max(side, 1.4 + 0.27 * len(chosen))), layout="constrained")
+        axes = np.ravel(figure.subplots(1, 2 if chosen else 1, width_ratios=[side + 0.6, wide] if chosen else None))
+        _draw_matrix(figure, axes[0], pairs, names)
+        if chosen:
+            _draw_pairs(axes[1], pairs, chosen)
+        return save(figure, path)
+
+
+def _draw_matrix(figure: Figure, ax, pairs: dict, names: list[str]) -> None:
+    """P(row > column) in per cent, bold where the interval leaves out one half."""
+    size = len(names)
+    values = np.full((size, size), np.nan)
+    for (one, other), found in pairs.items():
+        values[names.index(one), names.index(other)] = found["mean"]
+    image = ax.imshow(100 * values, vmin=0, vmax=100, cmap="PuOr_r")
+    for (one, other), found in pairs.items():
+        mean, (low, high) = found["mean"], found["ci95"]
+        if mean == mean:
+            ax.text(names.index(other), names.index(one), f"{100 * mean:.0f}", ha="center", va="center", fontsize=8,
+                    color="white" if abs(mean - 0.5) > 0.38 else "black",
+                    fontweight="bold" if low > 0.5 or high < 0.5 else "normal")  # fmt: skip
+    ax.set_xticks(range(size), names, rotation=90)
+    ax.set_yticks(range(size), names)
+    ax.grid(False)
+    ax.set_title("P(row covers more than column) [%]\nbold: the 95 % interval leaves out 50", loc="left")
+    figure.colorbar(image, ax=ax, shrink=0.7)
+
+
+def _draw_pairs(ax, pairs: dict, chosen: list[tuple[str, str]]) -> None:
+    for row, (one, other) in enumerate(chosen):
+        mean, (low, high) = pairs[one, other]["mean"], pairs[one, other]["ci95"]
+        error = [[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]]
+        ax.errorbar(100 * mean, row, xerr=error, fmt="o", color=COLOURS[0], markersize=4, capsize=2, linewidth=1.2)
+    ax.axvline(50, color="#606060", linewidth=1, linestyle=(0, (4, 2)))
+    ax.set_yticks(range(len(chosen)), [f"{one} > {other}" for one, other in chosen])
+    ax.set_ylim(len(chosen) - 0.5, -0.5)
+    ax.set_xlim(0, 100)
+    ax.set_xlabel("probability [%], 95 % interval")
+    ax.set_title("Probability of improvement", loc="left")
