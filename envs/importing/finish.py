@@ -19,6 +19,8 @@ from .sources import Source
 
 STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of the scenario's
 KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
+CLEANED_CELLS = 6_000_000  # cleaning takes some 200 bytes a cell
+POINTS_IN_RANGE = 2.0  # a radar must reach this many points far
 
 
 def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport):
@@ -52,6 +54,10 @@ def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
     before = grid.count(FREE)
     if options.crop is not None:
         xmin, ymin, xmax, ymax = options.crop
+        corners = grid.to_index(np.array([(x, y) for x in (xmin, xmax) for y in (ymin, ymax)]))
+        limit = np.array(grid.labels.shape)
+        low = np.floor(corners.min(axis=0)).clip(0, limit).astype(int)
+        grid = grid.cut(low, np.maximum(np.ceil(corners.max(axis=0)).clip(0, limit).astype(int), low))
         x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in grid.labels.shape), indexing="ij")
         place = grid.to_world(np.stack([x, y], axis=-1))
         inside = (place[..., 0] >= xmin) & (place[..., 0] <= xmax)
@@ -68,6 +74,12 @@ class _Cleaned:
     """A grid at one resolution after gaps, components and sealing, with the counts for the report."""
 
     def __init__(self, grid: Grid, scenario: Scenario, options: ImportOptions):
+        if grid.labels.size > CLEANED_CELLS:
+            nx, ny = grid.labels.shape
+            raise MapError(
+                f"{nx} x {ny} cells of {grid.cell:g} m are more than {CLEANED_CELLS:,}: crop, or take a coarser "
+                "resolution"
+            )
         self.start = grid
         self.passage = options.min_passage
         if self.passage is None:
@@ -115,6 +127,12 @@ def _choose_resolution(
     coarsest = math.ceil(math.sqrt(area / options.max_points) / 0.05) * 0.05
     if coarsest > sizes[0]:
         sizes = [round(coarsest, 3), *(size for size in sizes if size > coarsest / 4)]
+    if sizes[0] * POINTS_IN_RANGE > scenario.radar_range:
+        raise MapError(
+            f"{report.path}: {area:,.0f} m2 of free space need cells of {sizes[0]:g} m to stay below "
+            f"max_points={options.max_points}, too coarse for a radar of {scenario.radar_range:g} m: crop, check "
+            "units, raise max_points, or take the scenario of a larger robot"
+        )
     tried = {}
 
     def clean(size: float) -> _Cleaned:

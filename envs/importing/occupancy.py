@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from reprlib import repr as brief  # aliases of yaml nest values that would fill the memory when written out
+from reprlib import Repr
 
 import numpy as np
 import yaml
@@ -19,6 +19,8 @@ from .report import ImportReport
 
 MAX_YAML_BYTES = 64 * 1024
 MAX_ORIGIN = 1e8  # [m]
+_BRIEF = Repr()
+_BRIEF.maxlevel = 1
 FORMATS = ("PPM", "PNG", "BMP", "TIFF", "JPEG")
 
 
@@ -84,16 +86,16 @@ def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Shee
 def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
     image = content["image"]
     if not isinstance(image, str):
-        raise MapError(f"{path}: image={brief(image)} must be the path of a pgm or png file")
+        raise MapError(f"{path}: image={_show(image)} must be the path of a pgm or png file")
     origin = content.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) < 2:
-        raise MapError(f"{path}: origin={brief(origin)} must be a list of x, y [m] and yaw [rad]")
+        raise MapError(f"{path}: origin={_show(origin)} must be a list of x, y [m] and yaw [rad]")
     origin = [_number(path, "origin", value) for value in [*origin, 0.0][:3]]
     if max(map(abs, origin)) > MAX_ORIGIN:
         raise MapError(f"{path}: origin={origin} lies farther than {MAX_ORIGIN:g} m away; correct it")
     mode = content.get("mode", "trinary")
     if mode not in ("trinary", "scale", "raw"):
-        raise MapError(f"{path}: mode={brief(mode)} must be trinary, scale or raw")
+        raise MapError(f"{path}: mode={_show(mode)} must be trinary, scale or raw")
     given = {
         "resolution": options.pixel_size or content.get("resolution"),
         "occupied_thresh": _first(options.occupied_threshold, content.get("occupied_thresh"), 0.65),
@@ -125,10 +127,18 @@ def _first(*values):
     return next(value for value in values if value is not None)
 
 
+def _show(value) -> str:
+    """A value of the yaml in short; written out, aliases may stand for billions of values."""
+    try:
+        return _BRIEF.repr(value)
+    except ValueError:  # Python refuses to write out very long integers
+        return "(a huge number)"
+
+
 def _number(path: Path, name: str, value) -> float:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not number or not abs(value) < 1e300:  # an integer of yaml may be too long for a float
-        raise MapError(f"{path}: {name}={brief(value)} must be a number")
+        raise MapError(f"{path}: {name}={_show(value)} must be a number")
     return float(value)
 
 
