@@ -43,6 +43,13 @@ VERBS = {
          "maexp benchmark resume=outputs/DATE/RUN"),
         "run_benchmark",
     ),
+    "view": Verb(
+        "shows a run, a recorded episode or a map in 3D: window, picture or browser",
+        ("maexp view RUN", "maexp view RUN browser=true", "maexp view floor.yaml policy=nearest_frontier",
+         "maexp view maze index=7"),
+        "run_view",
+        ("place",),
+    ),
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",

@@ -13,6 +13,7 @@ from maexp.envs.viewing.episode import Episode, EpisodeRecorder
 
 WRITERS = {"gif": write_gif, "mp4": write_mp4}
 EPISODES = "episodes"  # folder of the episode files
+MOST_TEAMS = 64  # in one film or on one page
 WIDTHS = ((1, 512), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
 
 
@@ -20,8 +21,8 @@ def check_render(cfg: Any) -> None:
     """Raise UserError where no film could be written at the end."""
     if cfg.render_format not in WRITERS:
         raise UserError(f"render_format={cfg.render_format} is unknown: choose one of {', '.join(WRITERS)}.")
-    if type(cfg.render_envs) is not int or not 1 <= cfg.render_envs <= 64:
-        raise UserError(f"render_envs={cfg.render_envs} must be a whole number from 1 to 64.")
+    if type(cfg.render_envs) is not int or not 1 <= cfg.render_envs <= MOST_TEAMS:
+        raise UserError(f"render_envs={cfg.render_envs} must be a whole number from 1 to {MOST_TEAMS}.")
     if cfg.render and cfg.render_format == "mp4":
         try:
             import imageio_ffmpeg  # noqa: F401

@@ -18,12 +18,10 @@ from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, write_results
 from maexp.agents.run_folder import short
+from maexp.agents.schema import schema
 from maexp.agents.train import check_action, load_matching, write_config
 
 PICTURES = 4
-TRAINING_ONLY = (
-    "total_frames", "resume", "checkpoint_every", "checkpoint_keep", "evaluate_every", "collector", "logger",
-)  # fmt: skip
 
 
 def prepare(overrides: list[str]) -> list[str]:
@@ -36,9 +34,16 @@ def prepare(overrides: list[str]) -> list[str]:
         raise UserError("Nothing to evaluate: give checkpoint=RUN or policy=nearest_frontier.")
     if place is None:
         return overrides
-    kept = without(find_checkpoint(place)[1]["overrides"], *TRAINING_ONLY)
+    return settings_of_run(place, overrides, "evaluate")
+
+
+def settings_of_run(place: str, overrides: list[str], verb: str, *drop: str) -> list[str]:
+    """The overrides of a run of maexp train that `verb` has settings for, less those in `drop`, then `overrides`."""
+    kept = find_checkpoint(place)[1]["overrides"]
+    names = [word.partition("=")[0].lstrip("+~") for word in kept]
+    foreign = [name for name in names if name.split(".")[0] not in schema(verb).__dataclass_fields__]
     chosen = [word.partition("=")[0] for word in overrides if "." not in word.partition("=")[0]]
-    return without(kept, *chosen) + overrides
+    return without(kept, *foreign, *drop, *chosen) + overrides
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:

@@ -164,6 +164,30 @@ class EvaluateSettings(LearnerSettings):
     render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")
 
 @dataclass
+class ViewSettings(LearnerSettings):
+    """`maexp view`."""
+
+    place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
+    index: int = setting(0, "which map of the scenario")
+    policy: str | None = setting(None, "a classical policy to watch, on the place's map or a held-out one")
+    checkpoint: str | None = None  # what `place` becomes where it is a run
+    num_robots: int = setting(3, "robots in a team")
+    num_envs: int = setting(1, "teams to watch, each in a held-out episode of its own")
+    episode: int = setting(0, "number of the first held-out episode to watch")
+    seconds: float | None = setting(None, "moment of the picture [s]; default: the end")
+    seen_by: int | None = setting(None, "count as explored only what this robot has seen, from 0")
+    browser: bool = setting(False, "replay on a page in the browser, with the extra maexp[view]")
+    port: int = setting(8080, "of the page; another one where it is taken")
+    out: str | None = setting(None, "file to write: .png, or .html for a page that needs no server")
+    renderer: str = setting("auto", "of the picture: open3d, painter (ours), or auto: the first that works")
+    size: int = setting(1200, "width of the picture [px]")
+    azimuth: float = setting(-60.0, "where the camera stands, counter-clockwise from x [degrees]")
+    elevation: float = setting(50.0, "of the camera over the ground [degrees]")
+    cut: float | None = setting(None, "highest walls drawn [m]; default: as scanned, with a team 6 % of the map's side")
+
+
+
+@dataclass
 class MapsSettings:
     """`maexp maps`."""
 
@@ -221,6 +245,7 @@ class BenchmarkSettings(LearnerSettings):
 
 SCHEMAS = {
     "train": TrainSettings,
+    "view": ViewSettings,
     "evaluate": EvaluateSettings,
     "maps": MapsSettings,
     "bench": BenchSettings,

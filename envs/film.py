@@ -29,7 +29,7 @@ def write_gif(frames, path, fps: float = 10.0) -> Path:
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [max(20, round(100 / fps) * 10)] * len(images)
     durations[-1] += round(1000 * HOLD)
-    with _whole_file(path) as part:
+    with whole_file(path) as part:
         images[0].save(part, "GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
     return path
 
@@ -50,7 +50,7 @@ def write_mp4(frames, path, fps: float = 10.0) -> Path:
         raise ImportError('MP4 needs imageio-ffmpeg: pip install "maexp[video]", or write a .gif') from error
     height, width = frames[0].shape[:2]
     border = ((0, height % 2), (0, width % 2), (0, 0))  # the codec wants even sides
-    with _whole_file(path) as part:
+    with whole_file(path) as part:
         writer = imageio_ffmpeg.write_frames(
             part, (width + width % 2, height + height % 2), fps=fps, codec="libx264", quality=8, macro_block_size=2,
             output_params=["-f", "mp4"], ffmpeg_log_level="error",
@@ -100,7 +100,7 @@ def _unpack(packed: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def _whole_file(path: Path):
+def whole_file(path: Path):
     """Yields a temporary path beside ``path`` that replaces it at the end, or vanishes on an error."""
     handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)

@@ -50,12 +50,12 @@ ROBOT_COLOURS = (
 LIGHT = 0.45  # share of white in what a robot sees now; a tint in its colour would blur the classes
 TRAIL_STEPS = 200  # local steps until a trail has faded away
 _TRAIL_BANDS = 20
-_SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture
+SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture
 _AA = 2  # overlays are drawn this many times larger, then averaged
 
 
-def robot_colour(index: int) -> tuple[int, int, int]:
-    """Colour of robot ``index``; colours repeat after eight robots."""
+def robot_colour(index: int, count: int = 1) -> tuple[int, int, int]:
+    """Colour of robot ``index`` of ``count``; colours repeat after eight robots."""
     return ROBOT_COLOURS[index % len(ROBOT_COLOURS)]
 
 
@@ -74,9 +74,9 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
         raise ValueError(f"size={size} is not a picture width; give an integer of at least 64 pixels")
     size = int(size)
     raster = map_raster(snapshot["map"], size)
-    picture = Image.fromarray(raster.paint(_point_colours(snapshot, raster)))
+    picture = Image.fromarray(raster.paint(point_colours(snapshot, raster.num_free, raster.num_boundary)))
     picture = _draw_moving(snapshot, raster, picture)
-    strip = _draw_strip(snapshot, raster, size)
+    strip = Image.fromarray(draw_caption(snapshot, size, raster.scale))
     height = raster.height + strip.height
     frame = Image.new("RGB", (size + size % 2, height + height % 2), STRIP)  # even sides, for video codecs
     frame.paste(NOTHING, (0, 0, frame.width, raster.height))
@@ -169,21 +169,21 @@ def check_teams(env, teams) -> list[int]:
 # Colours of the points
 
 
-def _point_colours(snapshot: dict, raster: MapRaster) -> np.ndarray:
-    """Colour table of the raster, uint8 (1 + free + boundary + 1, 3)."""
+def point_colours(snapshot: dict, num_free: int, num_boundary: int) -> np.ndarray:
+    """Colours of nothing, the free points, the boundary points and all other obstacles: uint8 (entries, 3)."""
     seen_free, seen_boundary = np.asarray(snapshot["seen_free"]), np.asarray(snapshot["seen_boundary"])
     visible = np.asarray(snapshot["visible"])
     for name, flags, count in (
-        ("seen_free", seen_free, raster.num_free),
-        ("visible", visible, raster.num_free),
-        ("seen_boundary", seen_boundary, raster.num_boundary),
+        ("seen_free", seen_free, num_free),
+        ("visible", visible, num_free),
+        ("seen_boundary", seen_boundary, num_boundary),
     ):
         if flags.ndim != 2 or flags.shape[1] != count:
             raise ValueError(f"snapshot {name} has shape {flags.shape}; the map needs (robots, {count})")
     classes = np.array([UNEXPLORED, EXPLORED, OVERLAP], dtype=np.uint8)
-    table = np.empty((2 + raster.num_free + raster.num_boundary, 3), dtype=np.uint8)
+    table = np.empty((2 + num_free + num_boundary, 3), dtype=np.uint8)
     table[0], table[-1] = NOTHING, WALL_UNSEEN
-    free, boundary = table[1 : 1 + raster.num_free], table[1 + raster.num_free : -1]
+    free, boundary = table[1 : 1 + num_free], table[1 + num_free : -1]
     free[:] = classes[np.minimum(np.count_nonzero(seen_free, axis=0), 2)]
     boundary[:] = np.where(seen_boundary.any(axis=0)[:, None], WALL_SEEN, WALL_UNSEEN)
     now = visible.any(axis=0)
@@ -198,7 +198,7 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     """The picture of the points with everything that moves on top, smoothed."""
     large = picture.resize((raster.width * _AA, raster.height * _AA), Image.Resampling.NEAREST)
     unit = max(large.size) / 512  # line widths follow the picture's size
-    _draw_trails(large, raster.to_pixels(_smooth(snapshot["trail"], snapshot["center"])) * _AA, unit)
+    _draw_trails(large, raster.to_pixels(smooth_trail(snapshot["trail"], snapshot["center"])) * _AA, unit)
     draw = ImageDraw.Draw(large, "RGBA")
     centers = raster.to_pixels(snapshot["center"]) * _AA
     for i, (x, y) in enumerate(centers):
@@ -209,7 +209,7 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     for i, goal in enumerate(raster.to_pixels(snapshot["goal"]) * _AA):
         if np.isfinite(goal).all():
             _draw_goal(draw, np.clip(goal, 8 * unit, corners - 8 * unit), robot_colour(i), unit)
-    least = _SMALLEST_ROBOT * max(large.size)
+    least = SMALLEST_ROBOT * max(large.size)
     for i, center in enumerate(centers):
         length, width = np.asarray(snapshot["body"][i], dtype=float) * raster.scale * _AA
         grow = max(1.0, least / length)
@@ -219,7 +219,7 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     return large.reduce(_AA)
 
 
-def _smooth(trail, center) -> np.ndarray:
+def smooth_trail(trail, center) -> np.ndarray:
     """Latest part of a trail (steps, robots, 2), smoothed: it may come off a grid. Ends at ``center``."""
     trail = np.array(trail[-TRAIL_STEPS - 1 :], dtype=np.float64)
     padded = np.pad(trail, ((3, 3), (0, 0), (0, 0)), mode="edge")
@@ -285,9 +285,13 @@ def _font(pixels: int):
     return ImageFont.load_default(size=pixels)  # Pillow's own: the same on every machine
 
 
-def _draw_strip(snapshot: dict, raster: MapRaster, width: int) -> Image.Image:
-    """Caption: map, team and time; a bar of coverage; scale and legend."""
-    text, small = max(8, width // 34), max(7, width // 42)
+def draw_caption(snapshot: dict, width: int, scale: float | None = None, text: int | None = None) -> np.ndarray:
+    """Map, team and time; a bar of coverage; legend, and a length at ``scale`` [px / m]: uint8 (height, width, 3).
+
+    ``text`` is the height of the letters in pixels; by default they fill the width.
+    """
+    text = text or max(8, width // 34)
+    small = max(7, text * 34 // 42)
     pad, row = width // 64, int(1.45 * text)
     strip = Image.new("RGB", (width, 3 * row + 2 * pad), STRIP)
     draw = ImageDraw.Draw(strip)
@@ -302,8 +306,9 @@ def _draw_strip(snapshot: dict, raster: MapRaster, width: int) -> Image.Image:
     bar = (pad, pad + row, right, pad + 2 * row - pad // 2)
     _draw_bar(draw, bar, float(snapshot["coverage"]), _font(text))
     _draw_legend(draw, (pad, int(pad + 2.5 * row)), _font(small), small)
-    _draw_scale(draw, (right, int(pad + 2.5 * row)), raster.scale, width, _font(small))
-    return strip
+    if scale is not None:
+        _draw_scale(draw, (right, int(pad + 2.5 * row)), scale, width, _font(small))
+    return np.asarray(strip)
 
 
 def _fit(text: str, font, width: float) -> str:
@@ -325,10 +330,14 @@ def _draw_bar(draw: ImageDraw.ImageDraw, box, coverage: float, font) -> None:
     for mark in (0.85, 0.95):
         x = left + mark * (right - left)
         draw.line([(x, top), (x, bottom)], fill=INK)
-    percent = np.floor(coverage * 1000 + 1e-3) / 10  # down: never shows 95 % before it is reached
-    label = f"explored {percent:.1f} %"
+    label = f"explored {percent(coverage):.1f} %"
     draw.text((left + (right - left) // 64, (top + bottom) // 2), label, INK, font, "lm")
     draw.rectangle(box, outline=INK)
+
+
+def percent(coverage: float) -> float:
+    """Coverage in percent to one digit, rounded down: never 95 before that is reached."""
+    return float(np.floor(coverage * 1000 + 1e-3) / 10)
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, at, font, box: int) -> None:

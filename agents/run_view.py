@@ -1,0 +1,221 @@
+"""`maexp view`: a run, a recorded episode or a map in three dimensions: a window, a picture, a page in the browser."""
+
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.build import import_file, load_maps, make_env
+from maexp.agents.checks import check_counts
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
+from maexp.agents.overrides import find_override, quote, without
+from maexp.agents.policies import POLICIES
+from maexp.agents.run_evaluate import bind, load_policy, settings_of_run
+from maexp.agents.run_folder import remove_if_empty, short
+from maexp.agents.schema import given
+from maexp.envs import PointCloudMap, import_map, make_map
+from maexp.envs.render import percent
+from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.viewing import show
+from maexp.envs.viewing.episode import Episode
+from maexp.envs.viewing.scene import Stage
+
+CUT_SHARE = 0.06  # walls of an episode's picture are cut here, a share of the map's longer side: robots stay in sight
+ENDINGS = (".png", ".html")
+
+
+def prepare(overrides: list[str]) -> list[str]:
+    """The place to view by what it is: a scenario's name, or a run, whose own settings come first."""
+    place = find_override(overrides, "place")
+    if place in SCENARIOS and not Path(place).exists():
+        return [f"scenario={place}", *without(overrides, "place")]
+    if place is not None and is_run(Path(place)):
+        overrides = [*without(overrides, "place"), f"checkpoint={quote(place)}"]
+    run = find_override(overrides, "checkpoint")
+    return overrides if run is None else settings_of_run(run, without(overrides, "place"), "view", "num_envs")
+
+
+def is_run(place: Path) -> bool:
+    """Whether this is a checkpoint or the folder of a run of `maexp train`."""
+    return place.suffix == ".pt" or (place / "checkpoints").is_dir() or any(place.glob("iteration_*.pt"))
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
+    """Every view has a new folder of its own, for what it writes."""
+    return claim()
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for what cannot be viewed, before a folder is made."""
+    check_counts(cfg, "num_envs", "num_robots")
+    check_counts(cfg, "index", "episode", "port", least=0)
+    if cfg.num_envs > MOST_TEAMS:
+        raise UserError(f"num_envs={cfg.num_envs} teams cannot be viewed at once: give at most {MOST_TEAMS}.")
+    if cfg.policy is not None and cfg.policy not in POLICIES:
+        raise UserError(f"policy={cfg.policy} is unknown: choose one of {', '.join(POLICIES)}.")
+    if cfg.policy is not None and cfg.checkpoint is not None:
+        raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
+    if cfg.renderer not in show.RENDERERS:
+        raise UserError(f"renderer={cfg.renderer} is unknown: choose one of {', '.join(show.RENDERERS)}.")
+    if not 1 <= cfg.elevation <= 89:
+        raise UserError(f"elevation={cfg.elevation:g} must lie between 1 and 89 degrees.")
+    if cfg.cut is not None and not 0 < cfg.cut < float("inf"):
+        raise UserError(f"cut={cfg.cut:g} must be a height above 0 m.")
+    if cfg.out is not None:
+        check_out(Path(cfg.out))
+
+
+def check_out(out: Path) -> None:
+    """Raise UserError unless `out` can be written and its ending says what it is to be."""
+    if out.suffix not in ENDINGS:
+        raise UserError(f"out={out} must end in .png (a picture) or .html (a page that needs no server).")
+    if out.exists():
+        raise UserError(f"out={out} exists already and is left alone: choose another name.")
+    if not out.parent.is_dir():
+        raise UserError(f"out={out} lies in no folder: make {out.parent} first.")
+
+
+def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """Find what is to be seen, and show it as asked and as this machine can."""
+    with blame_input():
+        episodes, world = find_subject(cfg, where)
+        check_seen_by(cfg.seen_by, episodes)
+        for episode in episodes:
+            print(describe(episode))
+        if cfg.browser or str(cfg.out).endswith(".html"):
+            status = show_page(cfg, episodes, world)
+        else:
+            status = show_scene(cfg, episodes, world, where)
+    remove_if_empty(where)
+    return status
+
+
+def find_subject(cfg: Any, where: Path) -> tuple[list[Episode], PointCloudMap | None]:
+    """The episodes to be seen, or else the map.
+
+    Raises:
+        UserError: there is nothing at the place.
+    """
+    place = None if cfg.place is None else Path(cfg.place)
+    if place is not None and (files := episode_files(place)):
+        return [Episode.load(file) for file in files], None
+    if cfg.checkpoint is None and cfg.policy is None:
+        return [], find_map(cfg, place)
+    maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
+    env = make_env(cfg, maps, cfg.num_robots)
+    policy, name = (cfg.policy, cfg.policy) if cfg.checkpoint is None else (load_policy(cfg, env), "trained")
+    episodes = play_teams(env, bind(policy, env), name, first=cfg.episode, seed=cfg.seed)
+    (where / EPISODES).mkdir()
+    for k, episode in enumerate(episodes):
+        episode.save(where / EPISODES / f"{name}_{cfg.episode + k}.npz")
+    return episodes, None
+
+
+def episode_files(place: Path) -> list[Path]:
+    """The episode files that a place holds; none where it is a map.
+
+    Raises:
+        UserError: it is a folder without any.
+    """
+    if place.is_dir():
+        files = sorted((place / EPISODES if (place / EPISODES).is_dir() else place).glob("*.npz"))
+        if not files:
+            advice = "give a run of maexp train, or of maexp evaluate with render=true"
+            raise UserError(f"{place} holds neither checkpoints nor episodes: {advice}.")
+        return files[:MOST_TEAMS]
+    try:
+        with zipfile.ZipFile(place) as archive:
+            return [place] if "episode_format.npy" in archive.namelist() else []
+    except (OSError, zipfile.BadZipFile):
+        return []  # a map of another format, or nothing readable: the import says what is wrong
+
+
+def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
+    """The map of a file, of scenario=pointcloud, or of a scenario and an index."""
+    if place is not None:
+        return import_map(str(place), **given(cfg.scenario.importing))
+    if SCENARIOS[cfg.scenario.name].build is None:
+        return import_file(cfg.scenario)
+    return make_map(cfg.scenario.name, cfg.index)
+
+
+def check_seen_by(robot: int | None, episodes: list[Episode]) -> None:
+    """Raise UserError for a robot that is not in every team."""
+    fewest = min((one.num_robots for one in episodes), default=None)
+    if robot is not None and (fewest is None or not 0 <= robot < fewest):
+        choice = "there is no team" if fewest is None else f"give one of 0 to {fewest - 1}"
+        raise UserError(f"seen_by={robot} is not here: {choice}.")
+
+
+def describe(episode: Episode) -> str:
+    """A line about an episode."""
+    crashed = int(episode.collided[-1].sum())
+    words = [episode.map.name, episode.policy, f"{episode.num_robots} robots", *[f"{crashed} collided"] * (crashed > 0)]
+    return f"{', '.join(words)}: {percent(episode.coverage[-1]):.1f} % explored after {episode.seconds[-1]:.1f} s"
+
+
+def record_at(episode: Episode, seconds: float | None) -> int:
+    """The record at a time; the last one by default."""
+    if seconds is None:
+        return len(episode) - 1
+    return max(int(np.searchsorted(episode.seconds, seconds + 1e-6, side="right")) - 1, 0)
+
+
+def show_scene(cfg: Any, episodes: list[Episode], world: PointCloudMap | None, where: Path) -> int:
+    """The first episode, or the map: a window where there is a display, else a picture."""
+    snapshot = None
+    if episodes:
+        snapshot = episodes[0].snapshot(record_at(episodes[0], cfg.seconds))
+        scene = make_stage(cfg, episodes[0].map, True).moment(snapshot, cfg.seen_by)
+    else:
+        scene = make_stage(cfg, world, False).empty()
+    view = {"azimuth": cfg.azimuth, "elevation": cfg.elevation}
+    name = world.name if snapshot is None else episodes[0].map.name
+    if show.has_display() and cfg.out is None and cfg.renderer != "painter":
+        print("Opening a window of Open3D; close it to end.", flush=True)
+        reason = show.open_window(scene, f"MAexp: {name}", **view)
+        if reason is None:
+            return 0
+        print(f"There was no window ({reason}): here is a picture instead.")
+    picture, how = show.draw_scene(scene, cfg.size, cfg.renderer, **view)
+    out = Path(cfg.out) if cfg.out else where / "view.png"
+    show.write_picture(picture, out, snapshot)
+    print(f"Written: {short(out.absolute())} ({how})")
+    if episodes:
+        print(f"Next: maexp view {next_place(cfg, where)} browser=true")
+    return 0
+
+
+def next_place(cfg: Any, where: Path) -> str:
+    """Where what was just seen can be seen again without playing it anew."""
+    return short(where) if (where / EPISODES).is_dir() else str(cfg.place)
+
+
+def make_stage(cfg: Any, world: PointCloudMap, has_team: bool) -> Stage:
+    """The map with its walls cut: as set, or so that a team can be seen between them."""
+    (xmin, ymin), (xmax, ymax) = world.extent
+    default = CUT_SHARE * max(xmax - xmin, ymax - ymin) if has_team else None
+    return Stage(world, default if cfg.cut is None else cfg.cut)
+
+
+def show_page(cfg: Any, episodes: list[Episode], world: PointCloudMap | None) -> int:
+    """The page in the browser until interrupted, or the page as a file."""
+    from maexp.envs.viewing.page import Page, write_page
+
+    stages = [make_stage(cfg, one.map, True) for one in episodes] or [make_stage(cfg, world, False)]
+    if cfg.out is not None:
+        write_page(stages[0], episodes[0] if episodes else None, Path(cfg.out), cfg.seen_by)
+        print(f"Written: {short(Path(cfg.out).absolute())} (open it in a browser; needs no server)")
+        return 0
+    page = Page(stages, episodes, port=cfg.port, seen_by=cfg.seen_by)
+    print(f"Open {page.address} in a browser; Ctrl-C here ends it.", flush=True)
+    try:
+        page.run()
+    except KeyboardInterrupt:
+        print()
+    finally:
+        page.stop()
+    return 0
