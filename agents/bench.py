@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from maexp.agents.checks import check_counts, team_sizes
@@ -82,9 +83,9 @@ def describe_point(env: Any, cfg: Any) -> dict[str, Any]:
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """A table on the terminal: the first column is text, the others are numbers."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for k, name in enumerate(columns):
-        table.add_column(name, justify="right" if k else "left", no_wrap=True)
+        table.add_column(escape(name), justify="right" if k else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row, style="bold" if row[0].startswith("=") else None)
     Console(width=max(WIDTH, Console().width)).print(table)

@@ -17,15 +17,16 @@ SAMPLE = 64  # robots that are looked at one by one
 _BINS = int(BINS)
 
 
-def count_moment(env: ExplorationEnv, shard: Any) -> dict[str, float]:
+def count_moment(env: ExplorationEnv, shard: Any, active: torch.Tensor) -> dict[str, float]:
     """Means per robot of a shard at this moment; robots of frozen envs count as zeros.
 
-    The scratch of the last scan must still be there: call it right after a local step.
+    The scratch of the last scan must still be there: call it right after a local step, with what was `active` [E]
+    before it (a step may end an episode).
     """
     envs = np.arange(shard.first, shard.last)
     pairs = [(e, i) for e in envs for i in range(env.num_robots)]
     pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(SAMPLE, len(pairs))).astype(int)]
-    rows = [count_robot(env, e, i) for e, i in pairs]
+    rows = [count_robot(env, e, i, bool(active[e])) for e, i in pairs]
     counts = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return counts | count_sizes(env, shard)
 
@@ -76,15 +77,15 @@ def _pixels_per_body(env: ExplorationEnv) -> float:
     return float(np.mean([min(side, float(PIXELS)) ** 2 for side in sides]))
 
 
-def count_robot(env: ExplorationEnv, e: int, i: int) -> dict[str, float]:
-    """What robot i of env e meets in one local step."""
+def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, float]:
+    """What robot i of env e meets in one local step; nothing where the env is not active."""
     s = env.simulation.tensors
     names = (
         "active driving rows plan_rows free_near free_in undecided pair_tests visible occluder_near occluders "
         "bins_touched outline_points boundary_near boundary_new boundary_in neighbours plan_near plan_known hit_near"
     )
     counts = dict.fromkeys(names.split(), 0.0)
-    if not bool(s["active"][e]):
+    if not active:
         return counts
     m, at = int(s["map_id"][e]), s["center"][e, i].double().cpu().numpy()
     robot, reach = env.robot_configs[i], env.radar_configs[i].range

@@ -126,7 +126,8 @@ def measure_kernels(env: ExplorationEnv, cfg: Any) -> list[dict]:
     steps = record_steps(env, shard)
     stream = None if shard.device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(env.device))
     run = Runner(env.device, stream)
-    in_place, counts = run.in_place(steps, cfg.seconds / 2, lambda: count_moment(env, shard))
+    active = env.simulation.tensors["active"].clone()
+    in_place, counts = run.in_place(steps, cfg.seconds / 2, lambda: count_moment(env, shard, active))
     alone = run.alone(steps, cfg.seconds / 2)
     robots = (shard.last - shard.first) * env.num_robots
     rows = []

@@ -61,10 +61,10 @@ VERBS = {
     "bench": Verb(
         "measures throughput, as a table and JSON",
         ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",
-         "maexp bench train model=small,paper"),
+         "maexp bench train model=small,paper", "maexp bench scale axes=envs,robots"),
         "run_bench",
         ("action",),
-        ("env", "kernels", "train"),
+        ("env", "kernels", "train", "scale"),
     ),
 }  # fmt: skip
 

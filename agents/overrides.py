@@ -13,7 +13,7 @@ PATHS = ("scenario.path", "checkpoint", "resume", "file", "place", "out", "basel
 LISTS = {
     "train": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
-    "bench": ("num_robots",),
+    "bench": ("num_robots", "axes"),
     "benchmark": (
         "scenarios", "algorithms", "policies", "seeds", "maps", "scenario", "algorithm", "policy", "seed",
     ),

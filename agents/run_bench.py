@@ -10,7 +10,7 @@ from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.overrides import move_sweeps
 
-ONE_VALUE = ("action", "seconds", "baseline", "axes", "largest", "device", "hydra")
+ONE_VALUE = ("action", "seconds", "baseline", "largest", "device", "hydra")
 
 
 def prepare(overrides: list[str]) -> list[str]:

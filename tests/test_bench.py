@@ -11,6 +11,7 @@ from maexp.agents import bench_kernels
 from maexp.agents.bench import spread, sweep_points
 from maexp.agents.bench_census import count_moment
 from maexp.agents.bench_counts import FORMULAS, kernel_cost
+from maexp.agents.bench_scale import large_maze
 from maexp.agents.cli import main
 from maexp.agents.compose import compose_config
 from maexp.agents.overrides import make_overrides, move_sweeps
@@ -94,6 +95,32 @@ def test_training_is_split_into_its_parts_for_every_network(capsys):
     assert "robot-steps/s" in capsys.readouterr().out
 
 
+def test_scale_goes_along_its_axes(capsys):
+    words = [*TINY, "scenario.macro_steps=2", "num_robots=1", "largest=4"]
+    assert main(["bench", "scale", *words, "axes=envs,robots", "hydra.run.dir=out"]) == 0
+    axes = report("out", "bench_scale.json")["axes"]
+    assert [row["num_envs"] for row in axes["envs"]["rows"]] == [1, 4]
+    assert [row["num_robots"] for row in axes["robots"]["rows"]] == [2, 4]
+    assert all(row["num_envs"] == 2 for row in axes["robots"]["rows"])  # what was set stays
+    small, large = axes["envs"]["rows"]
+    costs = [one["num_envs"] / one["robot_local_steps_per_second"] for one in (small, large)]
+    assert axes["envs"]["worst_over_linear"] == pytest.approx(costs[1] / costs[0] / 4)
+    assert Path("out/scale_envs.png").stat().st_size > 5000 and "linear" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["axes=walls"], ["largest=0"], ["axes=map", "largest=1"], ["num_envs=2,4"]])
+def test_scale_refuses_what_it_cannot_vary(words, capsys):
+    assert main(["bench", "scale", *words, "hydra.run.dir=out"]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("maexp: ") and err.count("\n") == 1 and not Path("out").exists()
+
+
+def test_the_map_axis_makes_larger_mazes():
+    small, large = large_maze(3), large_maze(6)
+    assert large.extent == make_map("maze_small", 0).extent
+    assert len(large.free) > 3.5 * len(small.free)
+
+
 def test_a_change_is_beyond_the_noise_and_the_spread():
     key = dict.fromkeys(bench_kernels.KEY, 0)
 
@@ -140,7 +167,7 @@ def test_counts_agree_with_the_definitions():
     """Points in range and seen, by brute force over the whole map."""
     env = ExplorationEnv(make_map("maze_small", 0), num_envs=3, num_robots=2, seed=4, num_threads=1)
     env.rollout(2)
-    counts = count_moment(env, env.simulation.shards[0])
+    counts = count_moment(env, env.simulation.shards[0], env.simulation.tensors["active"])
     rows = []
     for e in range(3):
         shot = env.snapshot(e)
@@ -163,7 +190,7 @@ def test_counts_agree_with_the_definitions():
 def test_cost_grows_with_what_is_met():
     env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=2, num_threads=1)
     env.rollout(2)
-    counts = count_moment(env, env.simulation.shards[0])
+    counts = count_moment(env, env.simulation.shards[0], env.simulation.tensors["active"])
     more = counts | {"free_near": 2 * counts["free_near"], "pair_tests": 2 * counts["pair_tests"]}
     assert kernel_cost("_scan_free", more).operations > kernel_cost("_scan_free", counts).operations
     assert kernel_cost("_scan_free", more).bytes > kernel_cost("_scan_free", counts).bytes
@@ -178,7 +205,7 @@ def test_counting_and_timing_change_nothing():
     shard = env.simulation.shards[0]
     steps = bench_kernels.record_steps(env, shard)
     run = bench_kernels.Runner(env.device, None)
-    run.in_place(steps, 0.01, lambda: count_moment(env, shard))
+    run.in_place(steps, 0.01, lambda: count_moment(env, shard, before["active"]))
     run.alone(steps, 0.01)
     scratch = ("mask", "nearby")  # `record_steps` marks all envs; the planner's list is written before it is read
     for name, value in env.simulation.tensors.items():

@@ -1,0 +1,179 @@
+"""`maexp bench scale`: how the cost of a local step grows with envs, robots, map size and radar range.
+
+The cost is the time of one local step of the whole batch, a share of drawing the observation and of resets included.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from maexp.agents.bench import print_table, write_report
+from maexp.agents.bench_env import measure_batch
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.checks import check_counts
+from maexp.agents.compose import compose_config
+from maexp.agents.errors import UserError
+from maexp.agents.overrides import without
+from maexp.agents.plots import COLOURS, LOOK
+from maexp.agents.progress import Progress
+from maexp.envs import PointCloudMap
+from maexp.envs.scenarios.maze import build_maze
+
+TOLERANCE = 1.25
+"""The cost is called linear at most while no value costs this much more than its share of a smaller one's cost."""
+
+INCHES = 3.6  # width of a plot
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What is varied, over which values, and what else is set meanwhile where the user did not set it."""
+
+    title: str
+    values: tuple[int, ...]
+    setting: Callable[[int], str]
+    meanwhile: dict[str, str]
+    size: str  # column of a row that the cost should be linear in
+
+
+AXES = {
+    "envs": Axis(
+        "teams in the batch", (1, 4, 16, 64, 256, 1024, 2048), lambda v: f"num_envs={v}",
+        {"num_robots": "3"}, "num_envs",
+    ),
+    "robots": Axis(
+        "robots in a team", (2, 4, 8, 16, 32, 64, 128, 300), lambda v: f"num_robots={v}",
+        {"num_envs": "4"}, "num_robots",
+    ),
+    "map": Axis(
+        "free points of the map", (6, 12, 24, 48, 96), lambda v: "scenario=maze_small",
+        {"num_envs": "32", "num_robots": "3"}, "free_points",
+    ),
+    "radar": Axis(
+        "radar range [m]", (5, 10, 20, 40, 80), lambda v: f"radar.range={v}",
+        {"num_envs": "32", "num_robots": "3"}, "radar_range",
+    ),
+}  # fmt: skip
+COLUMNS = ["ms / local step", "x smallest", "size x", "robot-local-steps/s", "MB/env", "build [s]", "start [s]"]
+
+
+def bench_scale(cfg: Any, where: Path, overrides: list[str]) -> None:
+    """Costs along every axis asked for; ``where/bench_scale.json``, a table and a plot for each."""
+    chosen = pick_axes(cfg.axes)
+    plans = {name: plan_axis(AXES[name], cfg, overrides) for name in chosen}
+    rows: dict[str, list[dict]] = {name: [] for name in chosen}
+    with Progress("measuring", sum(map(len, plans.values())), 0) as progress:
+        for name, plan in plans.items():
+            for value, point in plan:
+                rows[name].append(measure_point(name, value, point))
+                progress.show(progress.done + 1, f"{name} {value}")
+    report = {}
+    for name in chosen:
+        report[name] = {"rows": rows[name], "worst_over_linear": worst_over_linear(rows[name], AXES[name].size)}
+        print_axis(name, report[name])
+        draw_axis(AXES[name], rows[name], where / f"scale_{name}.png")
+    write_report(where / "bench_scale.json", "bench_scale", cfg.device, {"tolerance": TOLERANCE, "axes": report})
+
+
+def pick_axes(wanted: Any) -> list[str]:
+    """The axes to go along.
+
+    Raises:
+        UserError: there is no such axis.
+    """
+    names = list(AXES) if wanted is None else [wanted] if isinstance(wanted, str) else list(wanted)
+    for name in names:
+        if name not in AXES:
+            raise UserError(f"axes={name} is unknown: choose some of {','.join(AXES)}.")
+    return names
+
+
+def plan_axis(axis: Axis, cfg: Any, overrides: list[str]) -> list[tuple[int, Any]]:
+    """The values and settings of an axis; what the user set stays, but for the setting that is varied.
+
+    Raises:
+        UserError: a setting was given several values, or no value is left.
+    """
+    if cfg.sweep:
+        raise UserError("maexp bench scale varies one setting after another itself: give every setting one value.")
+    values = [value for value in axis.values if cfg.largest is None or value <= cfg.largest]
+    if not values:
+        raise UserError(f"largest={cfg.largest} leaves no value for {axis.title}: the smallest is {axis.values[0]}.")
+    varied = axis.setting(0).partition("=")[0]
+    kept = without(overrides, varied)
+    given = {word.partition("=")[0] for word in kept}
+    meanwhile = [f"{name}={value}" for name, value in axis.meanwhile.items() if name not in given]
+    points = [compose_config("bench", [*meanwhile, *kept, axis.setting(value)]) for value in values]
+    for point in points:
+        check_counts(point, "num_envs", "num_robots")
+    return list(zip(values, points, strict=True))
+
+
+def measure_point(axis: str, value: int, cfg: Any) -> dict:
+    """Throughput at one point, and what a local step of the batch costs."""
+    maps = [large_maze(value)] if axis == "map" else load_maps(cfg.scenario).train
+    begin = time.perf_counter()
+    env = make_env(cfg, maps, cfg.num_robots)
+    built = time.perf_counter() - begin
+    row = measure_batch(cfg, env)
+    rate = row["robot_local_steps_per_second"]
+    cost = env.num_envs * env.num_robots / rate
+    return {"value": value} | row | {"build_seconds": built, "seconds_per_local_step": cost}
+
+
+def large_maze(cells: int) -> PointCloudMap:
+    """A maze like those of `maze_small`, with so many cells a side."""
+    return build_maze(0, scenario="maze_small", cells=cells, corridor=5, wall=1, resolution=1.0)
+
+
+def worst_over_linear(rows: list[dict], size: str) -> float:
+    """The largest (cost ratio) / (size ratio) of any value over a smaller one: 1 is linear, less is better."""
+    pairs = [(small, large) for k, large in enumerate(rows) for small in rows[:k]]
+    return max((ratio(large, small, "seconds_per_local_step") / ratio(large, small, size) for small, large in pairs),
+               default=1.0)  # fmt: skip
+
+
+def ratio(large: dict, small: dict, name: str) -> float:
+    return large[name] / small[name]
+
+
+def print_axis(name: str, measured: dict) -> None:
+    """The table of an axis, and whether the cost is linear at most."""
+    rows, axis, worst = measured["rows"], AXES[name], measured["worst_over_linear"]
+    cells = [
+        [
+            f"{row[axis.size]:g}",
+            f"{1e3 * row['seconds_per_local_step']:.3f}",
+            f"{ratio(row, rows[0], 'seconds_per_local_step'):.2f}",
+            f"{ratio(row, rows[0], axis.size):.2f}",
+            f"{row['robot_local_steps_per_second']:,.0f}",
+            f"{row['memory_per_env'] / 1e6:.2f}",
+            f"{row['build_seconds']:.1f}",
+            f"{row['first_step_seconds']:.1f}",
+        ]
+        for row in rows
+    ]
+    verdict = "linear at most" if worst <= TOLERANCE else "FASTER THAN LINEAR"
+    title = f"{axis.title}: {verdict} (at worst {worst:.2f} times its share of a smaller one)"
+    print_table(title, [name, *COLUMNS], cells)
+
+
+def draw_axis(axis: Axis, rows: list[dict], path: Path) -> None:
+    """Cost against size, both logarithmic, with a straight line for what grows linearly."""
+    sizes = [row[axis.size] for row in rows]
+    costs = [1e3 * row["seconds_per_local_step"] for row in rows]
+    with rc_context(LOOK):
+        figure = Figure(figsize=(INCHES, 0.8 * INCHES), layout="constrained")
+        axes = figure.add_subplot(xscale="log", yscale="log")
+        axes.set_xlabel(axis.title)
+        axes.set_ylabel("ms per local step of the batch")
+        axes.plot(sizes, [costs[-1] * one / sizes[-1] for one in sizes], "--", color="#808080", label="linear")
+        axes.plot(sizes, costs, "o-", color=COLOURS[0], label="measured")
+        axes.set_title(f"{rows[0]['scenario']}, {rows[0]['planner']}")
+        axes.legend()
+        figure.savefig(path, dpi=150)
