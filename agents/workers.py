@@ -279,6 +279,7 @@ def start_processes(factories: list[WorkerEnv], policy: torch.nn.Module, frames:
         storing_device=device,
         collector_class=WorkerCollector,
         cat_results=0,
+        use_buffers=True,
         num_threads=torch.get_num_threads(),
         num_sub_threads=threads,
         auto_register_policy_transforms=False,
