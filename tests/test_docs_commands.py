@@ -14,7 +14,7 @@ from maexp.envs.importing.export import export_ros_map
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
-PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=2", "device=cpu")
+PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger
     "train": (*PLACES, "total_frames=8", "collector.steps=2", "episodes=2", "model.channels=4"),
