@@ -1,14 +1,17 @@
 """Where the numbers of a run go: metrics.csv always, TensorBoard and Weights & Biases by configuration."""
 
 import csv
+import importlib.util
 import io
+import math
 import os
+import uuid
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
 
-BACKENDS = ("tensorboard", "wandb")
+MODES = ("online", "offline")
 
 
 class MetricsLog:
@@ -18,14 +21,15 @@ class MetricsLog:
         folder: the run's folder
         settings: `logger` of the settings
         kept: iteration to continue after; later rows, written by a run that was killed, are dropped
+        frames: macro steps until then
         config: plain settings, shown by W&B
     """
 
-    def __init__(self, folder: Path, settings: Any, kept: int, config: dict):
+    def __init__(self, folder: Path, settings: Any, kept: int, frames: int, config: dict):
         self.path = folder / "metrics.csv"
         self.columns = _keep_rows(self.path, kept)
         self.file = open(self.path, "a", newline="")
-        self.backends = [_open_backend(name, folder, settings, config) for name in settings.backends]
+        self.backends = [BACKENDS[name](folder, settings, config, frames) for name in settings.backends]
 
     def write(self, row: dict[str, float]) -> None:
         """Add a row; the first row's names are the columns of all."""
@@ -37,9 +41,9 @@ class MetricsLog:
             raise RuntimeError(f"{unknown[0]} was not among the first row's metrics {self.columns}")
         self.file.write(_line([row.get(name, "") for name in self.columns]))
         self.file.flush()
+        known = {name: value for name, value in row.items() if not math.isnan(value)}
         for backend in self.backends:
-            for name, value in row.items():
-                backend.log_scalar(name, value, step=row["frames"])
+            backend.write(known)
 
     def sync(self) -> None:
         """Make sure that what was written survives a power cut."""
@@ -50,8 +54,7 @@ class MetricsLog:
         self.sync()
         self.file.close()
         for backend in self.backends:
-            if hasattr(backend, "experiment") and hasattr(backend.experiment, "close"):
-                backend.experiment.close()
+            backend.close()
 
 
 def _line(values: list) -> str:
@@ -83,20 +86,59 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
         return [{name: float(value or "nan") for name, value in row.items()} for row in csv.DictReader(file)]
 
 
-def _open_backend(name: str, folder: Path, settings: Any, config: dict):
-    if name not in BACKENDS:
-        raise UserError(f"logger.backends={name} is unknown: choose of {', '.join(BACKENDS)}.")
-    try:
-        if name == "tensorboard":
-            from torchrl.record.loggers import TensorboardLogger
+def check_logger(settings: Any) -> None:
+    """Raise UserError for a logger that is unknown or not installed."""
+    for name in settings.backends:
+        if name not in BACKENDS:
+            raise UserError(f"logger.backends={name} is unknown: choose of {', '.join(BACKENDS)}.")
+        if importlib.util.find_spec(name) is None:
+            raise UserError(f"logger={name} is not installed: run pip install 'maexp[{name}]'.")
+    if settings.mode not in MODES:
+        raise UserError(f"logger.mode={settings.mode} is unknown: choose one of {', '.join(MODES)}.")
 
-            return TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
-        from torchrl.record.loggers import WandbLogger
 
-        run = f"{folder.parent.name}/{folder.name}"
-        offline = settings.mode == "offline"
-        return WandbLogger(
-            exp_name=run, project=settings.project, offline=offline, save_dir=str(folder), config=config
-        )
-    except ImportError as error:
-        raise UserError(f"logger={name} is not installed: run pip install 'maexp[{name}]'.") from error
+class TensorBoard:
+    """Event files in `tensorboard/`. Where a killed run had logged beyond its checkpoint, that is struck out."""
+
+    def __init__(self, folder: Path, settings: Any, config: dict, frames: int):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=frames + 1 if frames else None)
+
+    def write(self, row: dict[str, float]) -> None:
+        for name, value in row.items():
+            self.writer.add_scalar(name, value, row["frames"])
+
+    def close(self) -> None:
+        self.writer.close()
+
+
+class WeightsAndBiases:
+    """A run of W&B, the same one when it is resumed. Offline, its files wait in `wandb/` for `wandb sync`."""
+
+    def __init__(self, folder: Path, settings: Any, config: dict, frames: int):
+        import wandb
+
+        identity = folder / "wandb" / "identity"
+        identity.parent.mkdir(exist_ok=True)
+        if not identity.is_file():
+            identity.write_text(uuid.uuid4().hex)
+        try:
+            self.run = wandb.init(
+                project=settings.project, name=f"{folder.parent.name}/{folder.name}", id=identity.read_text(),
+                resume="allow", dir=str(folder), mode=settings.mode, config=config,
+                settings=wandb.Settings(silent=settings.mode == "offline"),
+            )  # fmt: skip
+        except wandb.Error as error:
+            why = str(error).splitlines()[0]
+            advice = "run wandb login, or add logger.mode=offline"
+            raise UserError(f"logger=wandb cannot start ({why}): {advice}.") from error
+
+    def write(self, row: dict[str, float]) -> None:
+        self.run.log(row, step=row["frames"])
+
+    def close(self) -> None:
+        self.run.finish()
+
+
+BACKENDS = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}

@@ -8,6 +8,7 @@ from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError
+from maexp.agents.logs import check_logger
 from maexp.agents.overrides import find_override
 from maexp.agents.run_evaluate import evaluate_all, report
 from maexp.agents.run_folder import check_writable, short
@@ -44,6 +45,7 @@ def check(cfg: Any) -> None:
     check_counts(cfg, "episodes", "evaluate_every", least=0)
     team_sizes(cfg.num_robots)
     check_collector(cfg.collector)
+    check_logger(cfg.logger)
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:

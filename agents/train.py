@@ -34,7 +34,7 @@ def train(run: "TrainingRun") -> None:
     On the CPU a run that is stopped and resumed gives bit for bit what an uninterrupted one gives.
     """
     cfg, learner, experience = run.cfg, run.learner, run.experience
-    log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, config=plain(cfg))
+    log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, frames=run.frames, config=plain(cfg))
     with (
         closing(log),
         ending(experience),
