@@ -1,7 +1,7 @@
 """Where the numbers of a run go: metrics.csv always, TensorBoard and Weights & Biases by configuration."""
 
 import csv
-import importlib.util
+import importlib
 import io
 import math
 import os
@@ -91,8 +91,10 @@ def check_logger(settings: Any) -> None:
     for name in settings.backends:
         if name not in BACKENDS:
             raise UserError(f"logger.backends={name} is unknown: choose of {', '.join(BACKENDS)}.")
-        if importlib.util.find_spec(name) is None:
-            raise UserError(f"logger={name} is not installed: run pip install 'maexp[{name}]'.")
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UserError(f"logger={name} is not installed: run pip install 'maexp[{name}]'.") from error
     if settings.mode not in MODES:
         raise UserError(f"logger.mode={settings.mode} is unknown: choose one of {', '.join(MODES)}.")
 

@@ -3,6 +3,7 @@
 import copy
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -59,6 +60,11 @@ class WorkerEnv:
 
 class WorkerCollector(TeamCollector):
     """A TeamCollector in a process of its own: the random numbers of its policy are part of its state."""
+
+    @property
+    def place(self) -> str:
+        """The process, for messages."""
+        return f"process {os.getpid()} on {socket.gethostname()}"
 
     def state_dict(self) -> dict[str, Any]:
         """Everything the next batch depends on but the policy, on the CPU."""
@@ -231,15 +237,19 @@ class ProcessGroup(WorkerGroup):
 class RayGroup(WorkerGroup):
     """Workers in actors of a Ray cluster."""
 
+    def __init__(self, collector: Any, name: str):
+        super().__init__(collector, name)
+        self.places = collector.get_distant_attr("place")
+
     def find_lost(self, error: BaseException | None = None) -> str | None:
         from ray.exceptions import RayActorError
 
         if not isinstance(error, RayActorError):
             return None
         actors = [one._actor_id.hex() for one in self.collector.remote_collectors]
-        if error.actor_id not in actors:
-            return None
-        return f"{self.name} {actors.index(error.actor_id) + 1} of {len(actors)} (Ray actor {error.actor_id}) has died"
+        k = actors.index(error.actor_id) if error.actor_id in actors else None
+        which = "of them" if k is None else f"{k + 1} of {len(actors)} ({self.places[k]})"
+        return f"{self.name} {which} was lost to Ray"
 
     def leave(self) -> None:
         import ray

@@ -192,3 +192,187 @@ def test_one_batch_ahead_the_policy_is_one_batch_old(make_experience):
         assert not torch.allclose(params["region"]["logits"], batch["agents", "params", "region", "logits"], atol=1e-3)
     experience.load_state_dict(state)
     assert not differing(experience.next(), old)
+
+
+@pytest.mark.slow
+def test_ray_workers_go_on_where_they_were_and_a_killed_one_is_named(make_experience):
+    pytest.importorskip("ray", reason="RAY ABSENT: pip install -c constraints.txt 'maexp[ray]' to test collector=ray")
+    learner, experience = make_experience("collector=ray")
+    _, alone = make_experience()
+    begins = [one.next()[0][:, 0] for one in (experience, alone)]
+    assert torch.equal(*(one["agents", "observation", "map"] for one in begins))
+    assert begins[0].shape == (4,)
+    state = experience.state_dict()
+    first = [one.clone() for one in experience.next()]
+    experience.load_state_dict(state)
+    assert not differing(experience.next(), first)
+    change(learner.policy)
+    experience.load_state_dict(state)
+    assert differing(experience.next(), first)
+    place = experience.groups[0].places[1]
+    os.kill(int(re.search(r"process (\d+)", place)[1]), signal.SIGKILL)
+    with pytest.raises(WorkerLost, match=f"collector worker 2 of 2 .{place}. was lost to Ray"):
+        experience.next()
+    experience.shutdown()
+
+
+# Whole runs
+
+PROGRAM = """
+import sys
+import maexp.agents.run_train as run_train
+run_train.draw_rollout = run_train.draw_curves = lambda *args: None
+from maexp.agents.cli import main
+if __name__ == "__main__":
+    sys.exit(main(["train", *sys.argv[1:]]))
+"""
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch) -> list[str]:
+    """The command `maexp train` without its pictures; a file, for spawned workers import it."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM)
+    return [sys.executable, str(path)]
+
+
+def finish(command: list[str], *words: str) -> subprocess.CompletedProcess:
+    return subprocess.run([*command, *words], capture_output=True, text=True, timeout=600)
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes below this one that run our code (not multiprocessing's own helper)."""
+    found, waiting = [], [pid]
+    while waiting:
+        one = waiting.pop()
+        for task in Path(f"/proc/{one}/task").glob("*/children"):
+            children = [int(word) for word in task.read_text().split()]
+            waiting += children
+            found += [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
+    return found
+
+
+def wait_until(happened, process: subprocess.Popen, seconds: float = 300) -> None:
+    limit = time.monotonic() + seconds
+    while not happened():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < limit, "it took too long"
+        time.sleep(0.02)
+
+
+def rows(folder: str) -> int:
+    path = Path(folder, "metrics.csv")
+    return len(path.read_text().splitlines()) if path.is_file() else 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", ["processes", "two_devices"])
+def test_resumed_with_workers_is_uninterrupted(collector, program):
+    choice = [*TINY, f"collector={collector}"]
+    for folder, count in (("whole", 4), ("parts", 2)):
+        done = finish(program, *choice, f"hydra.run.dir={folder}", f"total_frames={count * BATCH}")
+        assert done.returncode == 0, done.stderr
+    assert "worker" in done.stdout and ("older" in done.stdout) == (collector == "two_devices")
+    done = finish(program, "resume=parts", f"total_frames={4 * BATCH}")
+    assert done.returncode == 0 and "warning" not in done.stderr, done.stderr
+    whole, parts = (find_checkpoint(folder)[1] for folder in ("whole", "parts"))
+    assert whole["iteration"] == parts["iteration"] == 4
+    for name in whole["policy"]:
+        assert torch.equal(whole["policy"][name], parts["policy"][name]), name
+    assert {row["policy_lag"] for row in read_metrics(Path("parts/metrics.csv"))} == {float(collector == "two_devices")}
+    done = finish(program, "resume=parts", "collector=single", f"total_frames={5 * BATCH}")
+    assert done.returncode == 0 and "new episodes begin" in done.stderr, done.stderr
+
+
+@pytest.mark.slow
+def test_a_killed_worker_ends_the_run_by_name_and_a_killed_run_ends_its_workers(program):
+    command = [*program, *TINY, "collector=processes", "total_frames=1000000", "checkpoint_every=1"]
+    process = subprocess.Popen([*command, "hydra.run.dir=run"], stderr=subprocess.PIPE, text=True)
+    wait_until(lambda: rows("run") > 2, process)
+    victim = min(descendants(process.pid))
+    os.kill(victim, signal.SIGKILL)
+    assert process.wait(timeout=60) == 2
+    error = process.stderr.read()
+    assert re.search(rf"collector worker \d of 2 \(process {victim}\) was killed by SIGKILL", error), error
+    assert "last good checkpoint is kept in" in error and "Traceback" not in error
+    done = find_checkpoint("run")[1]["iteration"]
+    assert done >= 1
+
+    process = subprocess.Popen([*program, "resume=run"], stderr=subprocess.PIPE, text=True)
+    wait_until(lambda: rows("run") > done + 2, process)
+    workers = descendants(process.pid)
+    assert len(workers) == 2
+    process.kill()
+    process.wait()
+    limit = time.monotonic() + 60
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+        assert time.monotonic() < limit, "workers of a killed run live on"
+        time.sleep(0.1)
+    assert find_checkpoint("run")[1]["iteration"] > done
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["collector.workers=2"], "collector.workers=2 needs collector=processes or collector=ray"),
+        (["collector.overlap=true"], "collector.overlap=True needs collector=processes"),
+        (["collector=processes", "collector.workers=3"], "num_envs=4 cannot be shared evenly by collector.workers=3"),
+        (["collector=processes", "collector.workers=0"], "collector.workers=0 must be a whole number"),
+        (["collector.backend=threads"], "collector.backend=threads is unknown: choose one of single, processes, ray"),
+        (["collector.sample_device=abacus"], "collector.sample_device=abacus cannot be used here"),
+        (["collector.train_device=abacus"], "collector.train_device=abacus cannot be used here"),
+        (["collector.ray_address=auto"], "collector.ray_address=auto needs collector=ray"),
+        (["logger.backends=[diary]"], "logger.backends=diary is unknown: choose of tensorboard, wandb"),
+        (["logger.mode=dry"], "logger.mode=dry is unknown: choose one of online, offline"),
+    ],
+)
+def test_settings_that_do_not_go_together(words, sentence, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", *TINY, "total_frames=8", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"maexp: {sentence}") and error.count("\n") == 1
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("extra", ["ray", "tensorboard", "wandb"])
+def test_an_extra_that_is_missing_is_named_with_its_command(extra, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, extra, None)
+    choice = "collector=ray" if extra == "ray" else f"logger={extra}"
+    assert main(["train", *TINY, "total_frames=8", choice]) == 2
+    error = capsys.readouterr().err
+    assert f"pip install 'maexp[{extra}]'" in error and error.count("\n") == 1, error
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+# Loggers
+
+
+def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeypatch):
+    absent = [name for name in ("tensorboard", "wandb") if importlib.util.find_spec(name) is None]
+    present = [name for name in ("tensorboard", "wandb") if name not in absent]
+    if not present:
+        pytest.skip("LOGGERS ABSENT: pip install -c constraints.txt 'maexp[tensorboard,wandb]' to test them")
+    monkeypatch.chdir(tmp_path)
+    for place in ("run_train.draw_rollout", "run_train.draw_curves"):
+        monkeypatch.setattr(f"maexp.agents.{place}", lambda *args: None)
+    words = [f"logger.backends=[{','.join(present)}]", "logger.mode=offline"]
+    assert main(["train", *TINY, *words, "hydra.run.dir=run", f"total_frames={2 * BATCH}"]) == 0
+    assert main(["train", "resume=run", f"total_frames={3 * BATCH}"]) == 0
+    written = read_metrics(Path("run/metrics.csv"))
+    if "tensorboard" in present:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        events = EventAccumulator("run/tensorboard").Reload()
+        for name in written[0]:
+            wanted = [(row["frames"], row[name]) for row in written if row[name] == row[name]]
+            found = [(e.step, e.value) for e in events.Scalars(name)] if wanted else []
+            assert [step for step, _ in found] == [step for step, _ in wanted], name
+            assert [value for _, value in found] == pytest.approx([value for _, value in wanted], rel=1e-5), name
+    if "wandb" in present:
+        runs = sorted(Path("run/wandb").glob("offline-run-*"))
+        identity = Path("run/wandb/identity").read_text()
+        assert len(runs) == 2 and all(one.name.endswith(identity) for one in runs), "resumed is the same run"
+    if absent:
+        pytest.skip(f"{absent[0].upper()} ABSENT: the rest passed; pip install -c constraints.txt 'maexp[{absent[0]}]'")
