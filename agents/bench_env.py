@@ -74,20 +74,25 @@ def print_latency(rows: list[dict]) -> None:
 
 
 def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
-    """Throughput of a batch over at least ``cfg.seconds``, compile time apart."""
+    """Throughput of a batch over at least ``cfg.seconds``, compile time apart.
+
+    ``seconds_per_local_step`` of the whole batch is processor time on the CPU, summed over its threads: unlike the
+    rates it does not depend on what else runs on the machine.
+    """
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed)
     state = env.reset()
     actions = [env.rand_action(state.clone())["agents", "action"] for _ in range(8)]
     state = advance(env, state, actions[0])
     first = time.perf_counter() - begin
-    done, seconds, rates = 0, 0.0, []
+    done, seconds, rates, costs = 0, 0.0, [], []
     while seconds < cfg.seconds or len(rates) < LEAST_LAPS:
-        begin = time.perf_counter()
+        begin, used = time.perf_counter(), time.process_time()
         steps, state = advance_counted(env, state, actions[len(rates) % 8])
-        lap = time.perf_counter() - begin
+        lap, used = time.perf_counter() - begin, time.process_time() - used
         done, seconds = done + steps, seconds + lap
         rates.append(steps * env.num_robots / lap)
+        costs.append((used if env.device.type == "cpu" else lap) / max(steps, 1))
     threads = len(env.simulation.shards)
     rate = done * env.num_robots / seconds
     return describe_point(env, cfg) | {
@@ -95,6 +100,7 @@ def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
         "robot_local_steps_per_second": rate,
         "robot_local_steps_per_second_and_thread": rate / threads,
         "median_of_laps": statistics.median(rates),
+        "seconds_per_local_step": statistics.median(costs) * env.num_envs,
         "macro_steps_per_second": env.num_envs * len(rates) / seconds,
         "laps": len(rates),
         "seconds": seconds,

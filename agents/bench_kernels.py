@@ -2,7 +2,8 @@
 
 In place: the launches of a macro step follow each other as in a run, each timed by itself. Alone: one launch
 again and again, its outputs put back in between, so that its data lie as near as they can. Both start from the same
-moment of the same episodes, so that two measurements differ by the machine and the code only.
+moment of the same episodes, so that two measurements differ by the machine and the code only. On the CPU times are
+those of the thread, without waits for other programs; caches that those emptied still show.
 """
 
 import importlib

@@ -103,8 +103,9 @@ def test_scale_goes_along_its_axes(capsys):
     assert [row["num_robots"] for row in axes["robots"]["rows"]] == [2, 4]
     assert all(row["num_envs"] == 2 for row in axes["robots"]["rows"])  # what was set stays
     small, large = axes["envs"]["rows"]
-    costs = [one["num_envs"] / one["robot_local_steps_per_second"] for one in (small, large)]
+    costs = [one["seconds_per_local_step"] for one in (small, large)]
     assert axes["envs"]["worst_over_linear"] == pytest.approx(costs[1] / costs[0] / 4)
+    assert 0 < costs[0] * small["robot_local_steps_per_second"] < 4  # the rate counts waits, the cost does not
     assert Path("out/scale_envs.png").stat().st_size > 5000 and "linear" in capsys.readouterr().out
 
 
