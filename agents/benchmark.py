@@ -236,7 +236,8 @@ def read_plan(place: str | Path) -> dict:
 
 def shared_settings(cfg: Any) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable."""
-    return {name: value for name, value in _flatten(plain(cfg)).items() if not _is_free(name)}
+    whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
+    return {name: value for name, value in _flatten(plain(cfg) | whole).items() if not _is_free(name)}
 
 
 def _is_free(name: str) -> bool:
@@ -248,9 +249,9 @@ def check_unchanged(where: Path, cfg: Any) -> None:
     if not (where / PLAN).is_file() or not any((where / "cells").glob("*/*/*")):
         return
     before, now = read_plan(where)["settings"], json.loads(json.dumps(shared_settings(cfg)))
-    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    names = [name for name in now if name in before and before[name] != now[name]]  # others came or went with the code
     if names:
-        listed = ", ".join(f"{name} (was {before.get(name)}, now {now.get(name)})" for name in names[:4])
+        listed = ", ".join(f"{name} (was {before[name]}, now {now[name]})" for name in names[:4])
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         raise UserError(
             f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were, "

@@ -1,19 +1,22 @@
 """How long a benchmark will take on this machine, measured by a few short steps of what it is made of."""
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
+import torch
+from torchrl.envs.utils import step_mdp
+
 from maexp.agents.benchmark import Cell, cell_config
-from maexp.agents.build import load_maps, make_env
+from maexp.agents.build import load_maps, make_env, make_learner
 from maexp.agents.errors import blame_input
 from maexp.agents.policies import POLICIES
-from maexp.agents.train import TrainingRun
 from maexp.envs.scenarios import find_scenario
 
-STEPS = 2  # macro steps of a measured batch
+FRAMES = 48  # macro steps of teams in a measured batch, at least, where a batch of the training has as many
+QUICK = 2.0  # seconds; a shorter first measurement is taken for the warm-up of a second one
 OVERHEAD = 3.0  # seconds of a cell that are neither training nor episodes: settings, maps, files
 PLAIN = 1.0  # seconds per 1,000 macro steps assumed where nothing was measured
 
@@ -102,29 +105,35 @@ def _measure_env(cfg: Any, cell: Cell) -> tuple[float, float]:
         env = make_env(settings, maps[:1], cfg.num_robots, size)
         build = (time.perf_counter() - begin) * len(maps)
         policy = POLICIES["nearest_frontier"](env)
-    state = env.reset()
-    state = env.step(policy(state))["next"]  # compiles and warms up
-    lap = _time(lambda: env.step(policy(env.reset())))
+    state = step_mdp(env.step(policy(env.reset())))  # compiles and warms up
+    lap = _time(lambda: env.step(policy(state)))
     return lap / size, build
 
 
 def _measure_learner(cfg: Any, cell: Cell) -> tuple[float, float]:
     """(seconds the policy takes for a team, seconds an update takes per macro step of a team)."""
-    settings, words = cell_config(cfg, cell)
+    settings, _ = cell_config(cfg, cell)
     if find_scenario(cell.scenario).build is not None:
         settings.scenario.maps = [0]
         settings.scenario.held_out = [0]
-    settings.collector.steps = min(settings.collector.steps, STEPS)
-    run = TrainingRun.build(settings, Path(), words)
-    frames = run.batch_frames
-    (batch,) = run.experience.next()
-    run.learner.updater.update(batch, progress=0.0)
-    update = _time(lambda: run.learner.updater.update(batch, progress=0.0)) / frames
-    think = _time(lambda: run.learner.policy(batch[:, 0].clone())) / settings.num_envs
+    steps = min(settings.collector.steps, math.ceil(FRAMES / settings.num_envs))
+    with blame_input():
+        env = make_env(settings, load_maps(settings.scenario).train, settings.num_robots)
+        learner = make_learner(settings, env)
+    with torch.no_grad():
+        batch = env.rollout(steps, learner.policy, break_when_any_done=False)
+        think = _time(lambda: learner.policy(batch[:, 0].clone())) / settings.num_envs
+    update = _time(lambda: learner.updater.update(batch.clone(), progress=0.0)) / batch.numel()
     return think, update
 
 
 def _time(do: Callable[[], Any]) -> float:
+    """Seconds that something takes, once warm."""
+    seconds = _time_once(do)
+    return _time_once(do) if seconds < QUICK else seconds
+
+
+def _time_once(do: Callable[[], Any]) -> float:
     begin = time.perf_counter()
     do()
     return time.perf_counter() - begin

@@ -31,6 +31,7 @@ from maexp.agents.run_folder import check_writable, short
 from maexp.agents.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130
+SHOWN = 2  # running cells in the line of progress
 LONG = 24.0  # hours that need confirm=true
 ALSO = {"scenario": "scenarios", "algorithm": "algorithms", "policy": "policies", "seed": "seeds"}
 """Names that the other verbs have for one value."""
@@ -86,21 +87,23 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
 
 def run_locked(cfg: Any, where: Path, overrides: list[str]) -> int:
     """The same, while no one else is at the folder."""
-    suites = [one for one in as_list(cfg.maps)]
+    suites = as_list(cfg.maps)
     cells = list_cells(cfg)
     todo = [one for one in cells if not all(finished(where, one, suite) for suite in suites)]
     report = Report(cfg, where, cells, suites)
+    check_unchanged(where, cfg)
     if cfg.report or not todo:
         return conclude(report, Outcome(done=[]), where, len(todo))
     gpus = count_gpus(cfg.device)
     workers = min(cfg.workers or gpus or len(os.sched_getaffinity(0)), len(todo))
+    announce(cfg, cells, todo, workers)
     expected = estimate_cells(cfg, todo, len(suites), workers)
-    announce(cfg, where, cells, todo, workers, expected)
-    check_unchanged(where, cfg)
+    confirm(cfg, expected)
     kept = without(overrides, "workers", "confirm", "report", "estimate")
     write_plan(where, cfg, kept)
     write_config(cfg, where, "benchmark", overrides)
     pool = WorkerPool(where, kept, suites, workers, gpus)
+    print(f"everything goes to {short(where)}", flush=True)
     with stop_on_signals() as stop, BenchmarkProgress(where, cells, todo, expected) as progress:
         outcome = pool.run(todo, stop, lambda pool: watch(pool, progress, report))
     return conclude(report, outcome, where, len(todo) - len(outcome.done))
@@ -115,21 +118,26 @@ def count_gpus(device: str) -> int:
     return torch.cuda.device_count()
 
 
-def announce(cfg: Any, where: Path, cells: list[Cell], todo: list[Cell], workers: int, expected: Estimate) -> None:
-    """Say what is about to happen and how long it may take; refuse what nobody may have meant."""
+def announce(cfg: Any, cells: list[Cell], todo: list[Cell], workers: int) -> None:
+    """Say what is about to happen."""
     done = len(cells) - len(todo)
     print(f"preset {cfg.preset}: {len(cells)} cells ({len(set(c.policy for c in cells))} policies, "
           f"{len(as_list(cfg.scenarios))} scenarios, seeds {', '.join(map(str, as_list(cfg.seeds)))}, {cfg.episodes} "
           f"episodes each){f', {done} of them done before' if done else ''}; {workers} at once")  # fmt: skip
     if cfg.preset == "smoke":
         print(SMOKE)
+    if cfg.estimate:
+        print("measuring a few steps to say how long it will take", flush=True)
+
+
+def confirm(cfg: Any, expected: Estimate) -> None:
+    """Say how long it will take; refuse what nobody may have meant."""
     print(expected.text, flush=True)
     if expected.hours > LONG and not cfg.confirm:
         raise UserError(
             f"This would take about {expected.describe()}: add confirm=true to run it all the same (it can be stopped "
             "and resumed at any time), or lower total_frames, seeds, scenarios or algorithms."
         )
-    print(f"Everything goes to {short(where)}", flush=True)
 
 
 def watch(pool: WorkerPool, progress: "BenchmarkProgress", report: Report) -> None:
@@ -171,7 +179,8 @@ class BenchmarkProgress(Progress):
         weight = self.expected.weight
         self.spent_weight = sum(weight(one) for one in ended)
         self.spent_weight += sum(weight(cell) * share for cell, (share, _) in shares.items())
-        note = ", ".join(f"{cell.name} {text}" for cell, (_, text) in shares.items())
+        notes = [f"{cell.name} {text}" for cell, (_, text) in shares.items()]
+        note = ", ".join(notes[:SHOWN]) + (f" and {len(notes) - SHOWN} more" if len(notes) > SHOWN else "")
         self.show(self.first + len(ended), note)
 
     def describe(self, note: str = "") -> str:

@@ -394,7 +394,11 @@ def test_the_papers_numbers_are_the_papers():
 def paper_best(scenario: str, metric: str) -> set[str]:
     k, better = COLUMNS.index(metric), 1 if metric == "exploration_ratio" else -1
     means = {name: better * row[k][0] for name, row in PAPER[scenario].items() if row[k] is not None}
-    return {name for name, mean in means.items() if mean == max(means.values())}
+    return {name for name, mean in means.items() if mean == max(means.values(), default=0)}
+
+
+def paper_page() -> str:
+    return (Path(__file__).resolve().parents[1] / "docs" / "paper.md").read_text()
 
 
 def test_the_slips_that_the_page_lists_are_the_papers_bold_against_its_numbers():
@@ -405,10 +409,25 @@ def test_the_slips_that_the_page_lists_are_the_papers_bold_against_its_numbers()
             marked = {name for name in PAPER[scenario] if bold[scenario, name, metric]}
             if marked != paper_best(scenario, metric):
                 wrong.add((scenario, metric))
-    assert wrong == {
-        ("maze", "exploration_ratio"), ("maze", "mutual_overlap_95"), ("indoor_small", "exploration_ratio"),
-        ("indoor_medium", "coverage_step_95"), ("random_obstacles", "reward_variance"),
-    }  # fmt: skip
-    page = (Path(__file__).resolve().parents[1] / "docs" / "paper.md").read_text()
+    page = paper_page()
     slips = page[page.index("## Slips") :]
-    assert len(re.findall(r"^\| (?:maze|indoor|random).*\|$", slips, re.MULTILINE)) == len(wrong)
+    rows = re.findall(r"^\| ((?:maze|indoor|random)[^,|]*), ([^|]*) \|", slips, re.MULTILINE)
+    short = dict(zip(("ER", "85 % CS", "95 % CS", "85 % MO", "95 % MO", "RV"), COLUMNS, strict=True))
+    assert {(place.replace(" ", "_"), short[metric]) for place, metric in rows} == wrong
+
+
+def test_the_pages_tables_are_the_papers_numbers_with_computed_bold():
+    page = paper_page()
+    blocks = re.findall(r"^\| \| random.*?\n\n|^\| \| maze.*?\n\n", page, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == len(COLUMNS)
+    for metric, block in zip(COLUMNS, blocks, strict=True):
+        head, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in block.strip().splitlines()]
+        places = [name.replace(" ", "_") for name in head[1:]]
+        have = [one for one in SCENARIOS if any(row[COLUMNS.index(metric)] for row in PAPER[one].values())]
+        assert places == have and len(rows) == 6
+        for name, *cells in rows:
+            for place, cell in zip(places, cells, strict=True):
+                value = PAPER[place][name.lower()][COLUMNS.index(metric)]
+                assert (cell.startswith("**")) == (name.lower() in paper_best(place, metric)), (metric, place, name)
+                found = tuple(float(one) for one in re.findall(r"[\d.]+", cell)) or None
+                assert found == value, (metric, place, name)
