@@ -1,5 +1,6 @@
 """`maexp maps`: list scenarios, make and import maps, check, repair and draw them."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,12 +68,13 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
 
 def write_files(cfg: Any, where: Path, world: PointCloudMap) -> list[Path]:
     """The map (unless it was only looked at) and its picture, in the run's folder or where `out` says."""
-    out = Path(cfg.out) if cfg.out else where / (f"{world.name}.png" if cfg.action == "show" else f"{world.name}.npz")
+    name = re.sub(r"[^\w .()=+-]", "_", world.name)[:100].lstrip(".") or "map"  # a file may name its map ../../x
+    out = Path(cfg.out) if cfg.out else where / (f"{name}.png" if cfg.action == "show" else f"{name}.npz")
     written = []
     if cfg.action in ("make", "import") or cfg.repair:
         world.save(out)
         written.append(out)
-    picture = out if cfg.action == "show" else where / f"{world.name}.png"
+    picture = out if cfg.action == "show" else where / f"{name}.png"
     written.append(draw_map(world, picture))
     return written
 

@@ -13,7 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 BOUNDARY_REACH = 1.5  # an obstacle point bounds free space within this many spacings of a free point
-MAX_POINTS = 20_000_000  # per cloud; a file that promises more is refused before anything is allocated
+MAX_POINTS = 20_000_000  # of a scan; a file that promises more is refused before anything is allocated
+MAX_MAP_POINTS = 4_000_000  # of a map, per cloud
+MAX_SPACING_RATIO = 64.0  # largest over smallest spacing of a map
+MISJUDGED = 8.0  # the resolution may differ from the free points' usual distance by this factor
 MAX_FILE_BYTES = 2 * 1024**3  # of a map file, packed or unpacked
 _FORMAT = "maexp-map-1"
 _CLOUDS = ("free", "obstacles", "boundary")
@@ -43,8 +46,8 @@ class PointCloudMap:
     Exact duplicates are removed; otherwise points keep the order given. Arrays are float32.
 
     Raises:
-        MapError: empty free space, wrong shapes, NaN or infinite values, resolution <= 0, or coordinates too
-            large for float32.
+        MapError: empty free space, wrong shapes, NaN or infinite values, resolution <= 0 or far from the points'
+            distances, spacings that differ too much, or coordinates too large for float32.
     """
 
     free: np.ndarray
@@ -80,6 +83,7 @@ class PointCloudMap:
             raise MapError("free has 0 points; a map needs at least one free point to explore")
         free_spacing = _check_spacing("free_spacing", free_spacing, free_kept, resolution)
         obstacle_spacing = _check_spacing("obstacle_spacing", obstacle_spacing, obstacles_kept, resolution)
+        _check_distances(free, resolution)
         if boundary is None:
             touching = find_boundary(free, obstacles, np.maximum(obstacle_spacing, resolution))
             boundary, boundary_spacing = obstacles[touching], obstacle_spacing[touching]
@@ -237,14 +241,20 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo)
         count = 1
         for length in shape:  # Python integers: a product of crafted lengths must not wrap around
             count *= length
-        if dtype.hasobject or count * dtype.itemsize > member.file_size:
-            found = f"array {member.filename} promises {shape} {dtype}"
+        found = f"array {member.filename} promises {shape} {dtype}"
+        if dtype.hasobject:
+            raise MapError(f"{path}: {found}, which are pickled and never loaded; save numbers")
+        if count * dtype.itemsize > member.file_size:
             raise MapError(f"{path}: {found}, which the file does not hold; save it again")
+        if count > 3 * MAX_MAP_POINTS:
+            raise MapError(f"{path}: {found}; a map has at most {MAX_MAP_POINTS} points, thin it")
 
 
 def _as_text(path, name: str, array: np.ndarray) -> str:
     if array.dtype.kind != "U" or array.shape != () or len(str(array)) > 1000:
         raise MapError(f"{path}: {name} must be one short text, found {array.dtype} {array.shape}")
+    if not str(array).isprintable():
+        raise MapError(f"{path}: {name} holds control characters: {str(array)[:40]!r}")
     return str(array)
 
 
@@ -270,8 +280,8 @@ def _check_cloud(name: str, points, resolution: float) -> tuple[np.ndarray, np.n
         return np.zeros((0, 3), dtype=np.float32), _Kept(0, None)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise MapError(f"{name} has shape {points.shape}; give an array of shape (n, 3) in metres")
-    if len(points) > MAX_POINTS:
-        raise MapError(f"{name} has {len(points)} points; thin it (a larger resolution) to {MAX_POINTS}")
+    if len(points) > MAX_MAP_POINTS:
+        raise MapError(f"{name} has {len(points)} points; thin it (a larger resolution) to {MAX_MAP_POINTS}")
     bad = int((~np.isfinite(points)).any(axis=1).sum())
     if bad:
         raise MapError(f"{name} has {bad} points that are NaN or infinite; remove them")
@@ -321,7 +331,23 @@ def _check_spacing(name: str, values, kept: _Kept, resolution: float) -> np.ndar
     spacing = _check_per_point(name, values, kept)
     if len(spacing) and spacing.min() <= 0:
         raise MapError(f"{name} has values down to {spacing.min():g}; a spacing must be greater than 0 m")
+    low, high = min(spacing.min(initial=resolution), resolution), max(spacing.max(initial=resolution), resolution)
+    if high > MAX_SPACING_RATIO * low:
+        found = f"{name} and resolution range from {low:g} to {high:g} m"
+        raise MapError(f"{found}, more than {MAX_SPACING_RATIO:g} to 1; bring them closer together")
     return spacing
+
+
+def _check_distances(free: np.ndarray, resolution: float) -> None:
+    """The resolution must be about how far the free points lie from one another, lest everything or nothing touches."""
+    if len(free) < 20:
+        return
+    away, _ = cKDTree(free).query(free[:: max(1, len(free) // 200)], k=[2])
+    usual = float(np.median(away))
+    if not resolution / MISJUDGED <= usual <= resolution * MISJUDGED:
+        raise MapError(
+            f"resolution={resolution:g} m, but free points lie {usual:g} m apart: give the spacing of the points"
+        )
 
 
 def _spacing_of_nearest(points, obstacles, spacing, resolution) -> np.ndarray:

@@ -10,9 +10,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
+from maexp.envs.map import BOUNDARY_REACH, MapError, PointCloudMap
 
 MAX_RASTER_CELLS = 30_000_000
+MAX_PAIRS = 100_000_000  # of points that touch; 16 bytes each
 ROOM_LIMIT = 64  # teams larger than this are not counted out
 
 
@@ -22,7 +23,11 @@ def label_components(points: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     Two points [m] touch within 1.5 times the larger of their spacings [m].
     """
     planar = points[:, :2].astype(np.float64)
-    pairs = cKDTree(planar).query_pairs(BOUNDARY_REACH * float(spacing.max()) * (1 + 1e-6), output_type="ndarray")
+    tree, reach = cKDTree(planar), BOUNDARY_REACH * float(spacing.max()) * (1 + 1e-6)
+    count = tree.count_neighbors(tree, reach)
+    if count > MAX_PAIRS:
+        raise MapError(f"{count:,} pairs of free points lie within {reach:g} m: thin them, or correct the spacing")
+    pairs = tree.query_pairs(reach, output_type="ndarray")
     if len(pairs) and spacing.min() < spacing.max():
         reach = BOUNDARY_REACH * np.maximum(spacing[pairs[:, 0]], spacing[pairs[:, 1]]) * (1 + 1e-6)
         pairs = pairs[np.linalg.norm(planar[pairs[:, 0]] - planar[pairs[:, 1]], axis=1) <= reach]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import MapError, PointCloudMap, check_file, read_npz
+from maexp.envs.scenarios import find_scenario
 
 from .options import ImportOptions
 from .report import ImportReport
@@ -24,6 +25,10 @@ def read_npz_map(path: Path, options: ImportOptions, report: ImportReport) -> Po
     arrays = read_npz(path)
     if "format" in arrays:
         world = PointCloudMap.load(path)
+        try:
+            find_scenario(world.scenario)
+        except ValueError as error:
+            raise MapError(f"{path}: {error}") from error
         report.add("read", f"{path.name}: a saved map", after=len(world.free) + len(world.obstacles))
         return world
     found = {kind: next((n for n in names if n in arrays), None) for kind, names in KINDS.items()}
@@ -53,6 +58,9 @@ def read_npy_triple(path: Path, options: ImportOptions, report: ImportReport) ->
 
 def _read_npy(path: Path) -> np.ndarray:
     check_file(path)
+    with path.open("rb") as file:
+        if file.read(6) != b"\x93NUMPY":
+            raise MapError(f"{path} is no .npy file: it does not begin with NumPy's mark; save it again")
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")  # a header cannot promise more than the file holds
         return np.array(array)
