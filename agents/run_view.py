@@ -60,12 +60,26 @@ def check(cfg: Any) -> None:
         raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
     if cfg.renderer not in show.RENDERERS:
         raise UserError(f"renderer={cfg.renderer} is unknown: choose one of {', '.join(show.RENDERERS)}.")
+    if not 64 <= cfg.size <= 8192:
+        raise UserError(f"size={cfg.size} must be a width from 64 to 8192 pixels.")
+    if not abs(cfg.azimuth) <= 360:
+        raise UserError(f"azimuth={cfg.azimuth:g} must lie between -360 and 360 degrees.")
     if not 1 <= cfg.elevation <= 89:
         raise UserError(f"elevation={cfg.elevation:g} must lie between 1 and 89 degrees.")
     if cfg.cut is not None and not 0 < cfg.cut < float("inf"):
         raise UserError(f"cut={cfg.cut:g} must be a height above 0 m.")
     if cfg.out is not None:
         check_out(Path(cfg.out))
+    if wants_page(cfg):
+        from maexp.envs.viewing.page import import_viser
+
+        with blame_input():
+            import_viser()
+
+
+def wants_page(cfg: Any) -> bool:
+    """Whether a page is asked for, in the browser or as a file."""
+    return cfg.browser or str(cfg.out).endswith(".html")
 
 
 def check_out(out: Path) -> None:
@@ -85,7 +99,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         check_seen_by(cfg.seen_by, episodes)
         for episode in episodes:
             print(describe(episode))
-        if cfg.browser or str(cfg.out).endswith(".html"):
+        if wants_page(cfg):
             status = show_page(cfg, episodes, world)
         else:
             status = show_scene(cfg, episodes, world, where)

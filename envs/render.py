@@ -3,9 +3,11 @@
 A frame shows what the team has done so far: unexplored free space pale yellow, explored space green, space
 that two or more robots have seen blue, walls dark once discovered and light before. Each robot is a rectangle
 with a light front in its own colour, with its trail (fading), its radar range (circle), what it sees now (the
-points lit up) and its goal (cross). Robots smaller than a few pixels are drawn larger than they are.
+points lit up) and its goal (cross). Robots smaller than a few pixels are drawn larger than they are. Teams of more
+than eight have numbers beside their robots, since colours alone do not tell so many apart.
 """
 
+import colorsys
 from functools import lru_cache
 
 import numpy as np
@@ -50,13 +52,27 @@ ROBOT_COLOURS = (
 LIGHT = 0.45  # share of white in what a robot sees now; a tint in its colour would blur the classes
 TRAIL_STEPS = 200  # local steps until a trail has faded away
 _TRAIL_BANDS = 20
-SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture
+SMALLEST_ROBOT = 1 / 30  # length of a drawn robot, at least this share of the picture; less in a large team
+_ROOMY = 12  # robots that fit a picture at that size
+_MOST_CIRCLES, _MOST_NUMBERS = 40, 100  # larger teams are drawn without these, which would hide the map
 _AA = 2  # overlays are drawn this many times larger, then averaged
 
 
-def robot_colour(index: int, count: int = 1) -> tuple[int, int, int]:
-    """Colour of robot ``index`` of ``count``; colours repeat after eight robots."""
-    return ROBOT_COLOURS[index % len(ROBOT_COLOURS)]
+def robot_colour(index: int) -> tuple[int, int, int]:
+    """Colour of robot ``index``: the eight of ROBOT_COLOURS, then dark to middling ones in steps of the golden angle.
+
+    More than eight cannot be told apart by colour alone, so pictures number the robots of larger teams.
+    """
+    if index < len(ROBOT_COLOURS):
+        return ROBOT_COLOURS[index]
+    step = index - len(ROBOT_COLOURS)
+    shade = colorsys.hls_to_rgb((0.12 + step * 0.618034) % 1.0, (0.26, 0.35, 0.44)[step % 3], 0.75)
+    return tuple(round(255 * one) for one in shade)
+
+
+def smallest_robot(count: int) -> float:
+    """Least length of a drawn robot in a team of ``count``, as a share of the picture."""
+    return SMALLEST_ROBOT * min(1.0, (_ROOMY / max(count, 1)) ** 0.5)
 
 
 def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
@@ -204,18 +220,22 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
     for i, (x, y) in enumerate(centers):
         radius = float(snapshot["radar_range"][i]) * raster.scale * _AA
         box = (x - radius, y - radius, x + radius, y + radius)
+        if len(centers) > _MOST_CIRCLES:
+            break
         draw.ellipse(box, outline=(*robot_colour(i), 150), width=max(1, round(1.5 * unit)))
-    corners = np.array(large.size)
+    corners, part = np.array(large.size), max(smallest_robot(len(centers)) / SMALLEST_ROBOT, 0.35)
     for i, goal in enumerate(raster.to_pixels(snapshot["goal"]) * _AA):
         if np.isfinite(goal).all():
-            _draw_goal(draw, np.clip(goal, 8 * unit, corners - 8 * unit), robot_colour(i), unit)
-    least = SMALLEST_ROBOT * max(large.size)
+            _draw_goal(draw, np.clip(goal, 8 * unit, corners - 8 * unit), robot_colour(i), part * unit)
+    least = smallest_robot(len(centers)) * max(large.size)
     for i, center in enumerate(centers):
         length, width = np.asarray(snapshot["body"][i], dtype=float) * raster.scale * _AA
         grow = max(1.0, least / length)
         body = (length * grow, max(width * grow, 0.55 * least))
         heading = float(snapshot["pose"][i][3])
         _draw_robot(draw, center, heading, body, robot_colour(i), unit, bool(snapshot["collided"][i]))
+    if len(ROBOT_COLOURS) < len(centers) <= _MOST_NUMBERS:
+        _draw_numbers(draw, centers, 0.7 * least, unit)
     return large.reduce(_AA)
 
 
@@ -266,6 +286,14 @@ def _draw_robot(draw, center, heading: float, body, colour, unit: float, collide
         draw.polygon(nose, fill=white)
 
 
+def _draw_numbers(draw: ImageDraw.ImageDraw, centers: np.ndarray, aside: float, unit: float) -> None:
+    """Each robot's number, counted from 0, to the upper right of it."""
+    font, rim = _font(max(12, round(11 * unit))), max(1, round(1.2 * unit))
+    for i, (x, y) in enumerate(centers):
+        at = (x + 0.6 * aside, y - 0.6 * aside)
+        draw.text(at, str(i), (*INK, 255), font, "ls", stroke_width=rim, stroke_fill=(255, 255, 255, 255))
+
+
 def _draw_goal(draw: ImageDraw.ImageDraw, goal, colour, unit: float) -> None:
     _draw_cross(draw, goal, 6.5 * unit, (255, 255, 255, 255), round(5 * unit))
     _draw_cross(draw, goal, 5.5 * unit, (*colour, 255), round(2.5 * unit))
@@ -300,7 +328,7 @@ def draw_caption(snapshot: dict, width: int, scale: float | None = None, text: i
     team = f"{robots} robot{'s' * (robots != 1)}" + (f", {collided} collided" if collided else "")
     clock = f"{seconds:.1f} s, step {int(snapshot['local_step'])}"
     names = [name for name in (snapshot["map"].name, snapshot.get("policy"), team) if name]
-    title = _fit(" · ".join(names), _font(text), 0.66 * width)
+    title = _fit(" · ".join(names), _font(text), width - 3 * pad - _font(text).getlength(clock))
     draw.text((pad, pad + row // 2), title, INK, _font(text), "lm")
     draw.text((right, pad + row // 2), clock, INK, _font(text), "rm")
     bar = (pad, pad + row, right, pad + 2 * row - pad // 2)

@@ -47,8 +47,8 @@ class Tab:
 
     def press(self, label: str) -> None:
         """Click the button with this label."""
-        script = f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)})?.click()"
-        self.run(script)
+        named = f"b => b.innerText.trim() == {json.dumps(label)}"
+        assert self.run(f"[...document.querySelectorAll('button')].filter({named}).map(b => b.click()).length") == 1
 
     def wait_for(self, text: str, seconds: float = 60) -> None:
         """Until the page shows a text."""

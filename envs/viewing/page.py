@@ -18,7 +18,10 @@ from maexp.envs.viewing.scene import Scene, Stage
 HOST = "127.0.0.1"  # this machine only: the page has no password
 RATE = 20.0  # pictures per second, at most
 SPEEDS = ("0.5x", "1x", "2x", "4x", "8x", "16x")
-AMBIENT, SUN = 2.0, 1.33  # together about pi on level ground, which shows colours as they are
+AMBIENT, SUN = 4.0, 2.65  # intensities; together LIGHT * pi on level ground
+LIGHT = 2.0  # how bright a white surface is, before the browser's tone mapping darkens it to nearly white
+_ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.076, 0.90834, 0.01566], [0.0284, 0.13383, 0.83777]])
+_ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 TEAM = "the team"
 MOST_LABELS = 40  # robots with a number over them
 LEGEND = (("unexplored", UNEXPLORED), ("explored", EXPLORED), ("explored by two or more", OVERLAP),
@@ -55,12 +58,13 @@ def start_server(viser, port: int):
 class Actors:
     """The nodes of a scene on a viser server, moved from scene to scene."""
 
-    def __init__(self, server, scene: Scene, labels: bool = True):
+    def __init__(self, server, scene: Scene):
         self.server, self.labels = server, []
         add, scale = server.scene, np.asarray(scene.ground_size, dtype=np.float32)
         self.ground = add.add_batched_meshes_simple(
             "/ground", _TILE, _TILE_FACES, _turns(np.zeros(len(scale))), _floats(scene.ground), batched_scales=scale,
-            batched_colors=scene.ground_colour, side="double", lod="off", cast_shadow=False, receive_shadow=False,
+            batched_colors=_paint(scene.ground_colour), side="double", lod="off", cast_shadow=False,
+            receive_shadow=False,
         )  # fmt: skip
         self.walls = None
         if len(scene.walls):
@@ -81,22 +85,22 @@ class Actors:
             self.moving[name] = add.add_line_segments(
                 f"/{name}", lines, colours, thickness=width, thickness_units="screen"
             )
-        if labels and len(scene.robots) <= MOST_LABELS:
+        if len(scene.robots) <= MOST_LABELS:
             self.labels = [add.add_label(f"/number/{i}", str(i)) for i in range(len(scene.robots))]
         self.show(scene)
 
     def _boxes(self, name: str, feet, sizes, colours):
         return self.server.scene.add_batched_meshes_simple(
             name, _BOX, _BOX_FACES, _turns(np.zeros(len(feet))), _floats(feet), batched_scales=_floats(sizes),
-            batched_colors=np.asarray(colours, dtype=np.uint8), flat_shading=True, lod="off", cast_shadow=False,
+            batched_colors=_paint(colours), flat_shading=True, lod="off", cast_shadow=False,
             receive_shadow=False,
         )  # fmt: skip
 
     def show(self, scene: Scene, radar: bool = True) -> None:
         """Move everything to where it is in `scene`."""
-        _change(self.ground, "batched_colors", scene.ground_colour)
+        _change(self.ground, "batched_colors", _paint(scene.ground_colour))
         if self.walls is not None:
-            _change(self.walls, "batched_colors", scene.wall_colour)
+            _change(self.walls, "batched_colors", _paint(scene.wall_colour))
         if not self.moving:
             return
         turns = _turns(scene.heading)
@@ -104,7 +108,7 @@ class Actors:
         for name in ("robots", "arrows"):
             _change(self.moving[name], "batched_positions", _floats(scene.robots))
             _change(self.moving[name], "batched_wxyzs", turns)
-        _change(self.moving["robots"], "batched_colors", colours)
+        _change(self.moving["robots"], "batched_colors", _paint(colours))
         side = 0.35 * scene.body[:, :1]
         goals = np.nan_to_num(scene.goals) - [0, 0, 1e3] * ~np.isfinite(scene.goals).all(axis=1, keepdims=True)
         _change(self.moving["goals"], "batched_positions", _floats(goals))
@@ -112,14 +116,14 @@ class Actors:
         points, tints = trail_lines(scene)
         self._draw("trails", points, tints, True)
         self._draw("radar", *radar_lines(scene), radar)
-        for label, at in zip(self.labels, scene.robots + [0, 0, 1.6] * scene.body, strict=True):
+        for label, at in zip(self.labels, scene.robots + 1.3 * scene.body[:, :1] * [0, 0, 1], strict=True):
             label.position = tuple(at.tolist())
 
     def _draw(self, name: str, points: np.ndarray, colours: np.ndarray, visible: bool) -> None:
         node = self.moving[name]
         node.visible = visible and len(points) > 0
         if node.visible:
-            node.points, node.colors = _floats(points), colours
+            node.points, node.colors = _floats(points), _linear(colours)
 
 
 def trail_lines(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -176,7 +180,8 @@ class Page:
 
     def _add_controls(self, seen_by: int | None) -> None:
         gui = self.server.gui
-        gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False)
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         self.status = gui.add_markdown("")
         if not self.episodes:
             return
@@ -314,6 +319,7 @@ def legend_html() -> str:
         f'border:1px solid #333;background:rgb{colour}"></span>{name}</div>'
         for name, colour in LEGEND
     ]
+    rows.append("<div>robot: box with its number and trail; goal: column</div>")
     return f'<div style="font-size:0.85em;padding:0.5em 0.75em">{"".join(rows)}</div>'
 
 
@@ -345,6 +351,29 @@ def _change(node, name: str, value: np.ndarray) -> None:
     """Set what differs: each assignment is sent to every browser."""
     if not np.array_equal(getattr(node, name), value):
         setattr(node, name, value)
+
+
+def _linear(colours) -> np.ndarray:
+    """Colours for viser's lines: intensities, where pictures hold sRGB; uint8."""
+    return np.rint(255 * _intensity(colours)).astype(np.uint8)
+
+
+def _intensity(colours) -> np.ndarray:
+    """Intensities in [0, 1] of sRGB colours, uint8."""
+    share = np.asarray(colours) / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def _paint(colours) -> np.ndarray:
+    """Colours for viser's meshes, such that level ones look as in our pictures; uint8.
+
+    The browser (three.js) shows lit surfaces through the ACES film curve, which pales them: this is its inverse,
+    of the fit by S. Hill that three.js uses (its exposure is 1 / 0.6).
+    """
+    y = np.clip(_intensity(colours) @ np.linalg.inv(_ACES_OUT).T, 0.0, 0.99)
+    a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -0.000090537 - 0.238081 * y  # y = fit(x), solved for x
+    x = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
+    return np.rint(255 * np.clip(0.6 * x @ np.linalg.inv(_ACES_IN).T / LIGHT, 0, 1)).astype(np.uint8)
 
 
 def _floats(values) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import PointCloudMap
-from maexp.envs.render import SMALLEST_ROBOT, TRAIL_STEPS, point_colours, robot_colour, smooth_trail
+from maexp.envs.render import TRAIL_STEPS, point_colours, robot_colour, smallest_robot, smooth_trail
 
 WALL_SHARE = 0.03  # height of walls where the map keeps none, as a share of its longer side
 GROUND = (226, 230, 236)  # of a map without a team
@@ -116,13 +116,13 @@ class Stage:
         """The fields of a scene that change as robots drive, without the colours of points."""
         count = len(snapshot["pose"])
         length, width = np.asarray(snapshot["body"], dtype=np.float64).T
-        grow = np.maximum(1.0, SMALLEST_ROBOT * self.side / length)
+        grow = np.maximum(1.0, smallest_robot(count) * self.side / length)
         body = np.column_stack([length, np.maximum(width, 0.5 * length), 0.5 * length]) * grow[:, None]
         return {
             "robots": self.on_ground(snapshot["center"]),
             "heading": np.asarray(snapshot["pose"], dtype=np.float64)[:, 3],
             "body": body,
-            "robot_colour": np.array([robot_colour(i, count) for i in range(count)], dtype=np.uint8).reshape(-1, 3),
+            "robot_colour": np.array([robot_colour(i) for i in range(count)], dtype=np.uint8).reshape(-1, 3),
             "collided": np.asarray(snapshot["collided"], dtype=bool),
             "trails": self.on_ground(smooth_trail(snapshot["trail"], snapshot["center"])[-TRAIL_STEPS - 1 :]),
             "goals": self.on_ground(snapshot["goal"]),
