@@ -248,10 +248,11 @@ def describe_teams(cfg: Any) -> str:
 
 def describe_workers(cfg: Any) -> str:
     """Which processes simulate, for messages and to tell whether a checkpoint's state fits."""
-    if cfg.collector.backend == "single":
+    workers, backend = cfg.collector.workers, cfg.collector.backend
+    if backend == "single":
         return "one process"
-    late = ", one batch behind" if cfg.collector.overlap else ""
-    return f"{cfg.collector.workers} workers ({cfg.collector.backend}{late})"
+    one, several = {"processes": ("worker process", "worker processes"), "ray": ("Ray worker", "Ray workers")}[backend]
+    return f"{workers} {one if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"
 
 
 def check_action(saved: dict, cfg: Any) -> None:

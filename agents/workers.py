@@ -2,12 +2,15 @@
 
 import copy
 import os
+import pickle
 import signal
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,14 +36,14 @@ class WorkerEnv:
 
     Attributes:
         settings: those of the run, as YAML
-        maps: trained on
+        maps: trained on, or the file that holds them
         teams: of this worker; the number of the first keys its random numbers
         device: of the simulation and the policy
         num_threads: CPU threads of its simulation
     """
 
     settings: str
-    maps: list[PointCloudMap]
+    maps: list[PointCloudMap] | Path
     teams: Teams
     device: torch.device
     num_threads: int
@@ -50,10 +53,11 @@ class WorkerEnv:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that trains; it ends the workers
         keep_freed_memory()
         cfg = OmegaConf.create(self.settings)
+        maps = pickle.loads(self.maps.read_bytes()) if isinstance(self.maps, Path) else self.maps
         key = np.random.SeedSequence([cfg.seed % 2**32, self.teams.first_env]).generate_state(1)
         torch.manual_seed(int(key[0]))
         return make_env(
-            cfg, self.maps, self.teams.num_robots, self.teams.num_envs, device=self.device,
+            cfg, maps, self.teams.num_robots, self.teams.num_envs, device=self.device,
             first_env=self.teams.first_env, num_threads=self.num_threads,
         )  # fmt: skip
 
@@ -266,34 +270,49 @@ def make_workers(cfg: Any, maps: list[PointCloudMap], teams: list[Teams], policy
     threads = cfg.num_threads or (1 if settings.backend == "ray" else max(1, share))
     if settings.backend == "ray":
         connect_ray(settings, threads * settings.workers * len(teams))
-    start = start_actors if settings.backend == "ray" else start_processes
-    groups = []
-    for one in teams:
-        shares = one.split(settings.workers)
-        factories = [WorkerEnv(OmegaConf.to_yaml(cfg), maps, part, device, threads) for part in shares]
-        name = "collector worker" if len(teams) == 1 else f"for teams of {one.num_robots}: collector worker"
-        groups.append(start(factories, policy_there, one.num_envs * settings.steps, name))
+    with tempfile.TemporaryDirectory() as folder:
+        start, given = start_actors, maps
+        if settings.backend == "processes":
+            start, given = start_processes, Path(folder, "maps")
+            given.write_bytes(pickle.dumps(maps))
+        groups = []
+        for one in teams:
+            shares = one.split(settings.workers)
+            factories = [WorkerEnv(OmegaConf.to_yaml(cfg), given, part, device, threads) for part in shares]
+            name = "collector worker" if len(teams) == 1 else f"for teams of {one.num_robots}: collector worker"
+            groups.append(start(factories, policy_there, one.num_envs * settings.steps, name))
     return WorkerExperience(groups, policy, settings.overlap)
 
 
 def start_processes(factories: list[WorkerEnv], policy: torch.nn.Module, frames: int, name: str) -> ProcessGroup:
-    """Worker processes on this machine that together gather `frames` macro steps a batch."""
+    """Worker processes on this machine that together gather `frames` macro steps a batch.
+
+    What is handed to a process as it starts must stay below 64 KiB: Python writes it into a pipe and would wait for
+    ever on a process that ended before it had read all. Hence the file of maps.
+
+    Raises:
+        UserError: a worker ended before it could begin.
+    """
     device, threads = factories[0].device, factories[0].num_threads
-    collector = MultiSyncCollector(
-        factories,
-        policy,
-        frames_per_batch=frames,
-        total_frames=-1,
-        env_device=device,
-        policy_device=device,
-        storing_device=device,
-        collector_class=WorkerCollector,
-        cat_results=0,
-        use_buffers=True,
-        num_threads=torch.get_num_threads(),
-        num_sub_threads=threads,
-        auto_register_policy_transforms=False,
-    )
+    try:
+        collector = MultiSyncCollector(
+            factories,
+            policy,
+            frames_per_batch=frames,
+            total_frames=-1,
+            env_device=device,
+            policy_device=device,
+            storing_device=device,
+            collector_class=WorkerCollector,
+            cat_results=0,
+            use_buffers=True,
+            num_threads=torch.get_num_threads(),
+            num_sub_threads=threads,
+            auto_register_policy_transforms=False,
+        )
+    except (RuntimeError, EOFError, ConnectionError) as error:
+        why = str(error).splitlines()[0]
+        raise UserError(f"a {name} ended while it started ({why}): see its own message above.") from error
     return ProcessGroup(collector, name)
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import reduction
 from pathlib import Path
 
 import pytest
@@ -137,8 +138,22 @@ def change(policy) -> None:
             p.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
 
 
-def test_two_workers_gather_what_their_teams_see_and_a_killed_one_is_named(make_experience):
+@pytest.fixture
+def handed_over(monkeypatch) -> list[int]:
+    """Sizes [bytes] of what is written to worker processes as they start."""
+    sizes, dump = [], reduction.dump
+
+    def record(thing, file, *rest):
+        dump(thing, file, *rest)
+        sizes.append(file.tell())
+
+    monkeypatch.setattr(reduction, "dump", record)
+    return sizes
+
+
+def test_two_workers_gather_what_their_teams_see_and_a_killed_one_is_named(make_experience, handed_over):
     learner, experience = make_experience("collector=processes")
+    assert 0 < max(handed_over) < 2**16, "more would wait for ever on a worker that ends as it starts"
     _, alone = make_experience()
     begins = [one.next()[0][:, 0] for one in (experience, alone)]
     for key in (("agents", "observation", "map"), ("agents", "observation", "pose"), ("info", "coverage")):
@@ -214,6 +229,12 @@ def test_ray_workers_go_on_where_they_were_and_a_killed_one_is_named(make_experi
     with pytest.raises(WorkerLost, match=f"collector worker 2 of 2 .{place}. was lost to Ray"):
         experience.next()
     experience.shutdown()
+
+
+def test_a_worker_that_cannot_start_is_reported(make_experience, monkeypatch):
+    monkeypatch.setattr("multiprocessing.spawn._python_exe", b"/bin/false")
+    with pytest.raises(UserError, match="a collector worker ended while it started"):
+        make_experience("collector=processes")
 
 
 # Whole runs
