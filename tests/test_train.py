@@ -153,10 +153,12 @@ def test_a_checkpoint_of_another_network_is_refused(capsys):
 
 def test_evaluate_goes_by_the_runs_own_settings():
     folder = run("run", 1, "radar.range=6")
-    assert main(["evaluate", f"checkpoint={folder}", "episodes=2", "num_robots=1,3", "hydra.run.dir=e"]) == 0
+    assert main(["evaluate", f"checkpoint={folder}", "episodes=2", "num_robots=1,2,6,8", "hydra.run.dir=e"]) == 0
     config = Path("e/config.yaml").read_text()
     assert "range: 6.0" in config and "macro_steps: 3" in config
-    assert set(json.loads(Path("e/results.json").read_text())) == {"trained N=1", "trained N=3", "run"}
+    results = json.loads(Path("e/results.json").read_text())
+    assert set(results) == {"run", *(f"trained N={size}" for size in (1, 2, 6, 8))}
+    assert all(results[name]["exploration_ratio"]["n"] == 2 for name in results if name != "run")
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_is_named(monkeypatch, capsys):
