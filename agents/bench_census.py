@@ -82,7 +82,8 @@ def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, 
     s = env.simulation.tensors
     names = (
         "active driving rows plan_rows free_near free_in undecided pair_tests visible occluder_near occluders "
-        "bins_touched outline_points boundary_near boundary_new boundary_in neighbours plan_near plan_known hit_near"
+        "bins_touched outline_points boundary_near boundary_new boundary_in neighbours plan_near plan_known mates "
+        "hit_near"
     )
     counts = dict.fromkeys(names.split(), 0.0)
     if not active:
@@ -184,7 +185,7 @@ def count_boundary(env: ExplorationEnv, cloud: Cloud, e: int, i: int, at: np.nda
 
 
 def count_plan(env: ExplorationEnv, cloud: Cloud, e: int, i: int, at: np.ndarray) -> dict[str, float]:
-    """Boundary points that DWA looks at, and known ones that it lists."""
+    """Boundary points that DWA looks at, known ones that it must avoid, and other robots that it must."""
     s, robot, settings = env.simulation.tensors, env.robot_configs[i], env.simulation.settings
     if settings.planner == "direct" or bool(s["collided"][e, i]):
         return {}
@@ -196,7 +197,10 @@ def count_plan(env: ExplorationEnv, cloud: Cloud, e: int, i: int, at: np.ndarray
     points, index = cloud.near("boundary", at, reach)
     known = (s["seen_boundary"][e].cpu().numpy()[:, index] != 0).any(0)
     inside = np.linalg.norm(points - at, axis=1) <= reach
+    gaps = np.linalg.norm(s["center"][e].double().cpu().numpy() - at, axis=1)
+    bodies = np.array([one.length + one.width for one in env.robot_configs])
     return {
+        "mates": float((gaps <= np.minimum(reach + bodies, env.radar_configs[i].range)).sum() - 1),
         "plan_rows": float(len(cloud.rows(at, reach))),
         "plan_near": float(len(index)),
         "plan_known": float((known & inside).sum()),
