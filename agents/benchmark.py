@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -135,14 +136,18 @@ def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
     """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
     words = [f"scenario={cell.scenario}", f"seed={cell.seed}"]
     words += [f"algorithm={cell.policy}"] if cell.trains else []
-    usual, ours = (
-        _flatten({name: node[name] for name in SECTIONS}) for node in (plain(compose_settings("train", [])), plain(cfg))
-    )
+    usual, ours = (_flatten({name: node[name] for name in SECTIONS}) for node in (_train_defaults(), plain(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
-    changed |= _maps_of(cfg, cell) | _length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
+    changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
     if not cell.trains:
         changed = {name: value for name, value in changed.items() if not name.startswith("algorithm.")}
     return words + [f"{name}={render(value)}" for name, value in changed.items()]
+
+
+@cache
+def _train_defaults() -> dict:
+    """The settings of maexp train without overrides."""
+    return plain(compose_settings("train", []))
 
 
 def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
@@ -160,7 +165,7 @@ def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     return chosen
 
 
-def _length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
+def length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     """For `iterations`: each collects one whole episode of every team."""
     if cfg.iterations is None:
         return {}

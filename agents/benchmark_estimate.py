@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.benchmark import Cell, cell_config
+from maexp.agents.benchmark import Cell, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner
 from maexp.agents.errors import blame_input
 from maexp.agents.policies import POLICIES
@@ -17,6 +17,7 @@ from maexp.envs.scenarios import find_scenario
 
 FRAMES = 48  # macro steps of teams in a measured batch, at least, where a batch of the training has as many
 QUICK = 2.0  # seconds; a shorter first measurement is taken for the warm-up of a second one
+UNKNOWN_LENGTH = 60  # macro steps of an episode on a map of the user's own, which the map decides
 OVERHEAD = 3.0  # seconds of a cell that are neither training nor episodes: settings, maps, files
 PLAIN = 1.0  # seconds per 1,000 macro steps assumed where nothing was measured
 
@@ -86,9 +87,9 @@ def estimate_cells(cfg: Any, cells: list[Cell], suites: int, workers: int) -> Es
 
 def _frames(cfg: Any, cell: Cell, suites: int) -> tuple[int, int]:
     """(macro steps of teams trained, at most played)."""
-    settings, _ = cell_config(cfg, cell)
-    length = settings.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or 60
-    return (settings.total_frames if cell.trains else 0), cfg.episodes * suites * length
+    length = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or UNKNOWN_LENGTH
+    frames = length_of(cfg, cell).get("total_frames", cfg.total_frames)
+    return (frames if cell.trains else 0), cfg.episodes * suites * length
 
 
 def _volume(cfg: Any, cell: Cell, suites: int) -> float:

@@ -179,8 +179,7 @@ class BenchmarkProgress(Progress):
         weight = self.expected.weight
         self.spent_weight = sum(weight(one) for one in ended)
         self.spent_weight += sum(weight(cell) * share for cell, (share, _) in shares.items())
-        notes = [f"{cell.name} {text}" for cell, (_, text) in shares.items()]
-        note = ", ".join(notes[:SHOWN]) + (f" and {len(notes) - SHOWN} more" if len(notes) > SHOWN else "")
+        note = describe_running([(cell.scenario, cell.policy, text) for cell, (_, text) in shares.items()])
         self.show(self.first + len(ended), note)
 
     def describe(self, note: str = "") -> str:
@@ -191,13 +190,22 @@ class BenchmarkProgress(Progress):
         return "  ".join(part for part in (f"{self.done}/{self.total} cells", f"{duration(left)} left", note) if part)
 
 
+def describe_running(running: list[tuple[str, str, str]]) -> str:
+    """maze: mappo 40%, ippo starts; short, for it shares its line with the bar."""
+    parts, place = [], None
+    for scenario, policy, text in running[:SHOWN]:
+        parts.append(f"{policy} {text}" if scenario == place else f"{scenario}: {policy} {text}")
+        place = scenario
+    return ", ".join(parts) + (f" +{len(running) - SHOWN}" if len(running) > SHOWN else "")
+
+
 def read_share(log: Path) -> tuple[float, str]:
-    """(share done in [0, 1], "training 40 %") from the last line of a log that a Progress wrote."""
+    """(share done in [0, 1], in words) from the last line of a log that a Progress wrote."""
     for line in reversed(last_lines(log, 3)):
         title, _, rest = line.partition(": ")
         done, _, total = rest.split("  ")[0].replace(",", "").partition("/")
         if done.isdigit() and total.isdigit() and int(total):
             part = int(done) / int(total)
             training = title == "training"
-            return (0.9 * part if training else 0.9 + 0.1 * part), f"{title.split()[0]} {part:.0%}"
-    return 0.0, "starting"
+            return (0.9 * part if training else 0.9 + 0.1 * part), f"{part:.0%}" if training else "plays"
+    return 0.0, "starts"
