@@ -9,6 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -178,12 +179,11 @@ class WorkerExperience(Experience):
 
     def shutdown(self) -> None:
         """End the workers."""
-        try:
+        with suppress(Exception):  # a worker was lost: the others have nobody to work for
             self._wait(self.pending)
-        except Exception:  # a worker was lost: the others have nobody to work for
-            pass
         for group in self.groups:
-            group.collector.shutdown()
+            with suppress(Exception):  # what cannot be ended any more must not hide why the run ended
+                group.collector.shutdown()
         self.groups[0].leave()
 
 

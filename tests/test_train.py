@@ -217,11 +217,12 @@ def test_ctrl_c_ends_with_a_checkpoint():
 @pytest.mark.slow
 def test_killed_at_random_moments_and_resumed(tmp_path):
     """kill -9 while the run trains, logs or saves; after each, resume; at the end the bits of one go."""
-    iterations, rng, kills = 30, random.Random(os.environ.get("MAEXP_KILL_SEED", 0)), 0
+    attempts = int(os.environ.get("MAEXP_KILLS", 4))
+    iterations, rng, kills = 8 * attempts, random.Random(os.environ.get("MAEXP_KILL_SEED", 0)), 0
     whole = run("whole", iterations, "checkpoint_every=1")
     words = [*TINY, "hydra.run.dir=killed", f"total_frames={iterations * BATCH}", "checkpoint_every=1"]
     folder = tmp_path / "killed"
-    for attempt in range(int(os.environ.get("MAEXP_KILLS", 4))):
+    for attempt in range(attempts):
         process = start(*words) if attempt == 0 else start(f"resume={folder}")
         done = find_checkpoint(folder)[1]["iteration"] if attempt else 0
         wait_for_rows(folder, min(done + 2, iterations - 1), process)
@@ -229,6 +230,7 @@ def test_killed_at_random_moments_and_resumed(tmp_path):
         kills += process.poll() is None
         process.kill()
         process.wait()
-    assert kills >= 2
+    print(f"killed {kills} times")
+    assert kills >= attempts // 2
     resume(folder, iterations)
     assert_same_runs(whole, folder)
