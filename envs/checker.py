@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.map import BOUNDARY_REACH, MapError, PointCloudMap, find_boundary
 from maexp.envs.reach import (
     ROOM_LIMIT,
     Raster,
@@ -23,6 +23,7 @@ from maexp.envs.scenarios import find_scenario
 START_CLEARANCE = 3.0  # starts keep this many collision thresholds from walls and each other (design 4.3)
 SEAL_ROUNDS = 4
 VISIBLE_SHARE = 0.95  # below it no episode can reach the coverage that ends it
+BOUNDARY_SHARE = 0.95  # of the obstacle points that touch free space must be boundary points
 PICTURE_PIXELS = 125 * 125  # of the observation (design 4.2)
 
 
@@ -182,6 +183,8 @@ def _judge(report: MapReport, world: PointCloudMap) -> None:
             f"there is room for {report.room} of num_robots={report.num_robots} robots, {report.start_clearance:g} m "
             "from walls and each other: use fewer or smaller robots, or a finer resolution"
         )
+    if not _boundary_fits(world):
+        errors.append("the boundary points are not the obstacle points that touch free space: repair the map")
     both = int(np.isin(_as_rows(world.free), _as_rows(world.obstacles)).sum())
     if both:
         errors.append(f"{both:,} points are free and obstacle at once: repair the map")
@@ -214,6 +217,9 @@ def repair_map(
     threshold = scenario.collision_threshold if threshold is None else threshold
     start_clearance = START_CLEARANCE * threshold if start_clearance is None else start_clearance
     steps = []
+    if not _boundary_fits(world):
+        world = _replace(world)
+        steps.append("found the boundary points anew")
     both = np.isin(_as_rows(world.free), _as_rows(world.obstacles))
     if both.any():
         world = _replace(world, free_kept=~both)
@@ -257,6 +263,20 @@ def find_seal(world: PointCloudMap) -> np.ndarray:
     near = round(0.7 * unit / leaks.raster.step) + 1
     way_out = ndimage.binary_dilation(leaks.mouths, np.ones((2 * near + 1, 2 * near + 1)))
     return ring[way_out[leaks.raster.nearest(ring)]]
+
+
+def _boundary_fits(world: PointCloudMap) -> bool:
+    """Whether the boundary points are about the obstacle points that touch free space: 95 % of them near one another.
+
+    Robots collide with boundary points only, and radars end there.
+    """
+    touching = find_boundary(world.free, world.obstacles, np.maximum(world.obstacle_spacing, world.resolution))
+    wanted = world.obstacles[touching]
+    if not len(wanted) or not len(world.boundary):
+        return len(wanted) == len(world.boundary)
+    missed = cKDTree(world.boundary).query(wanted)[0] > 1e-3 * world.resolution
+    odd = cKDTree(wanted).query(world.boundary)[0] > BOUNDARY_REACH * world.resolution
+    return missed.mean() <= 1 - BOUNDARY_SHARE and odd.mean() <= 1 - BOUNDARY_SHARE
 
 
 def _find_cut_off(world: PointCloudMap, threshold: float, start_clearance: float) -> np.ndarray:

@@ -294,6 +294,9 @@ def _check_cloud(name: str, points, resolution: float) -> tuple[np.ndarray, np.n
     cloud = np.zeros((len(points), 3), dtype=np.float32)
     cloud[:, : points.shape[1]] = points
     cloud += 0.0  # -0.0 and 0.0 are one place
+    if cloud[:, 2].any():
+        highest = float(np.abs(cloud[:, 2]).max())
+        raise MapError(f"{name} has z up to {highest:g} m; maps are planar: set z = 0 and give heights apart")
     kept = _first_occurrences(cloud)
     return (cloud if kept is None else cloud[kept]), _Kept(len(points), kept)
 

@@ -73,6 +73,7 @@ def _make_map(path, name, clouds: dict, options: ImportOptions, report: ImportRe
         raise MapError(f"{path} holds no free and obstacle points (names: freespace, obstacles, boundary)")
     scenario = "pointcloud" if options.scenario == "auto" else options.scenario
     resolution = options.resolution or _typical_spacing(path, clouds["free"])
+    clouds, heights = _flatten(clouds)
     try:
         world = PointCloudMap(
             clouds["free"],
@@ -81,6 +82,7 @@ def _make_map(path, name, clouds: dict, options: ImportOptions, report: ImportRe
             name=options.name or name,
             scenario=scenario,
             boundary=clouds.get("boundary"),
+            **heights,
         )
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
@@ -88,6 +90,18 @@ def _make_map(path, name, clouds: dict, options: ImportOptions, report: ImportRe
     kept = len(world.free) + len(world.obstacles) + (len(world.boundary) if "boundary" in clouds else 0)
     report.add("read", f"{', '.join(clouds)}; duplicates dropped; {resolution:g} m between points", given, kept)
     return world
+
+
+def _flatten(clouds: dict) -> tuple[dict, dict]:
+    """Clouds with z = 0, and the heights of free and obstacle points where they have any."""
+    heights, flat = {}, dict(clouds)
+    names = {"free": "free_height", "obstacles": "obstacle_height"}
+    for kind, cloud in clouds.items():
+        if cloud.ndim == 2 and cloud.shape[1] == 3 and cloud.dtype.kind in "fiu" and cloud[:, 2].any():
+            flat[kind] = cloud[:, :2]
+            if kind in names:
+                heights[names[kind]] = cloud[:, 2]
+    return flat, heights
 
 
 def _typical_spacing(path, free: np.ndarray) -> float:

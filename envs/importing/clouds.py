@@ -69,8 +69,12 @@ def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportR
             raise MapError(f"{path} has {bad} points that are NaN or infinite; remove them, or set drop_invalid=true")
         points = points[good]
         report.add("invalid", "NaN and infinite points dropped", len(good), len(points))
+    alike = _repeats(points)
+    if alike.any():  # a search tree over thousands of points in one place never ends
+        report.add("duplicates", "points that are there twice dropped", len(points), int((~alike).sum()))
+        points = points[~alike]
     if len(points) < LEAST_POINTS:
-        raise MapError(f"{path} holds {len(points)} points; give a cloud with at least a few hundred")
+        raise MapError(f"{path} holds {len(points)} different points; give a cloud with at least a few hundred")
     scale, why = options.metres_per_unit, "as set"
     if scale is None:
         scale, why = (cloud.metres_per_unit, "by the file") if cloud.metres_per_unit else (1.0, "assumed")
@@ -80,6 +84,14 @@ def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportR
     size = " x ".join(f"{span:.1f}" for span in np.ptp(points, axis=0))
     report.add("read", f"{path.name}: {size} m, {scale:g} m a unit ({why})", len(cloud.points), len(points))
     return points
+
+
+def _repeats(points: np.ndarray) -> np.ndarray:
+    """Points that another one before them equals; bool [count]."""
+    order = np.lexsort(points.T)
+    result = np.zeros(len(points), dtype=bool)
+    result[order[1:]] = (points[order[1:]] == points[order[:-1]]).all(axis=1)
+    return result
 
 
 def _set_upright(points, cloud: Cloud, options: ImportOptions, report: ImportReport) -> tuple[np.ndarray, str]:
