@@ -11,7 +11,7 @@ from typing import Any
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
 
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ VERBS = {
     ),
     "evaluate": Verb(
         "plays held-out episodes with a trained team or a classical policy",
-        ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate policy=nearest_frontier scenario=maze"),
+        ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate checkpoint=RUN render=true render_envs=4",
+         "maexp evaluate policy=nearest_frontier scenario=maze"),
         "run_evaluate",
     ),
     "benchmark": Verb(
@@ -84,6 +85,9 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("maexp: interrupted.", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:  # `maexp train --help | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return PIPE_CLOSED
 
 
 def _run(words: list[str]) -> int:

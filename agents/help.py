@@ -13,11 +13,11 @@ def verb_help(name: str, verb: Any) -> str:
     lines = [f"maexp {name}: {verb.summary}", ""]
     lines += [f"  {example}" for example in verb.examples]
     lines += ["", "Settings (name=value)"]
-    lines += [f"  {_assign(setting, default):<24} {text}" for setting, default, text in describe(kind)]
+    lines += [f"  {_assign(setting, default):<26}{text}" for setting, default, text in describe(kind)]
     for group in groups():
         if group in kind.__dataclass_fields__:
             lines += ["", f"{group}=CHOICE, and {group}.NAME=VALUE for one value of it"]
-            lines += [f"  {choice:<24} {text}" for choice, text in group_choices(group).items()]
+            lines += [f"  {choice:<26}{text}" for choice, text in group_choices(group).items()]
     lines += ["", f"maexp {name} --cfg job ... prints all settings; hydra.run.dir=FOLDER moves the output."]
     if name == "train":
         lines += ["maexp train -m name=a,b runs a sweep: every combination, one after another."]
@@ -25,4 +25,6 @@ def verb_help(name: str, verb: Any) -> str:
 
 
 def _assign(name: str, default: Any) -> str:
+    if isinstance(default, bool):
+        default = str(default).lower()
     return f"{name}={'' if default is None else default}"

@@ -57,7 +57,8 @@ class Progress:
         spent = time.monotonic() - self.begin
         rate = (self.done - self.first) / spent if spent > 0 else 0.0
         left = (self.total - self.done) / rate if rate > 0 else float("inf")
-        parts = [f"{self.done:,}/{self.total:,}", f"{rate:,.0f}/s", f"{duration(left)} left", note]
+        speed = f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.2g}/s"
+        parts = [f"{self.done:,}/{self.total:,}", speed, f"{duration(left)} left", note]
         return "  ".join(part for part in parts if part)
 
 

@@ -12,6 +12,7 @@ from typing import IO, Any
 from omegaconf import OmegaConf
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from maexp.agents.evaluate import EvaluationResult
@@ -106,7 +107,7 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("policy", no_wrap=True)
     for column in COLUMNS.values():
-        table.add_column(column, justify="right", no_wrap=True)
+        table.add_column(escape(column), justify="right", no_wrap=True)  # [m] is no style of rich's
     for name, result in zip(result_names(results), results, strict=True):
         summary = result.summary()
         total = summary["exploration_ratio"]["n"]

@@ -15,6 +15,7 @@ from omegaconf import MISSING
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.model import ModelConfig
+from maexp.agents.policies import POLICIES
 from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
 from maexp.envs.importing.options import ImportOptions
 
@@ -55,7 +56,7 @@ def setting(default: Any, text: str) -> Any:
 
 
 def describe(cls: type) -> list[tuple[str, Any, str]]:
-    """(name, default, line of help) of the top-level settings of a verb."""
+    """(name, default, line of help) of the top-level settings of a verb, its own before those it shares."""
     documented = [one for one in fields(cls) if "help" in one.metadata]
     return [(one.name, None if one.default is NO_DEFAULT else one.default, one.metadata["help"]) for one in documented]
 
@@ -155,7 +156,7 @@ class EvaluateSettings(LearnerSettings):
     """`maexp evaluate`."""
 
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
-    policy: Any = setting(None, "random or nearest_frontier; several as policy=random,nearest_frontier")
+    policy: Any = setting(None, f"{', '.join(POLICIES)}; several as policy=random,voronoi")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
 
@@ -169,7 +170,7 @@ class ViewSettings(LearnerSettings):
 
     place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
     index: int = setting(0, "which map of the scenario")
-    policy: str | None = setting(None, "a classical policy to watch, on the place's map or a held-out one")
+    policy: str | None = setting(None, "a classical policy to watch, on the map given or a held-out one")
     checkpoint: str | None = None  # what `place` becomes where it is a run
     num_robots: int = setting(3, "robots in a team")
     num_envs: int = setting(1, "teams to watch, each in a held-out episode of its own")

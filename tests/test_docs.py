@@ -66,6 +66,13 @@ def test_own_training_loop():
     assert moved and all(state["step"] == 2 for state in moved.values())
 
 
+def test_episode_files_and_recorders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run_block("\n".join(blocks("docs/viewing.md", "python")), "docs/viewing.md")
+    assert names["picture"].shape[1:] == (512, 3) and (tmp_path / "episode.npz").is_file()
+    assert (tmp_path / "logs" / "films" / "videos" / "film_0.pt").is_file()
+
+
 def test_own_scenario():
     names = run_block(blocks("docs/extending.md", "python")[0], "docs/extending.md")
     assert names["env"].maps[0].name == "ring_3"
