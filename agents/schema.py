@@ -58,6 +58,7 @@ def setting(default: Any, text: str) -> Any:
 def describe(cls: type) -> list[tuple[str, Any, str]]:
     """(name, default, line of help) of the top-level settings of a verb, its own before those it shares."""
     documented = [one for one in fields(cls) if "help" in one.metadata]
+    documented.sort(key=lambda one: one.name not in vars(cls)["__annotations__"])
     return [(one.name, None if one.default is NO_DEFAULT else one.default, one.metadata["help"]) for one in documented]
 
 
