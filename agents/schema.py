@@ -160,10 +160,10 @@ class EvaluateSettings(LearnerSettings):
     policy: Any = setting(None, f"{', '.join(POLICIES)}; several as policy=random,voronoi")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
-
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
     render_envs: int = setting(1, "teams in a film, side by side, each in a held-out episode of its own")
     render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")
+
 
 @dataclass
 class ViewSettings(LearnerSettings):
@@ -186,7 +186,6 @@ class ViewSettings(LearnerSettings):
     azimuth: float = setting(-60.0, "where the camera stands, counter-clockwise from x [degrees]")
     elevation: float = setting(50.0, "of the camera over the ground [degrees]")
     cut: float | None = setting(None, "highest walls drawn [m]; default: as scanned, with a team 6 % of the map's side")
-
 
 
 @dataclass
@@ -247,8 +246,8 @@ class BenchmarkSettings(LearnerSettings):
 
 SCHEMAS = {
     "train": TrainSettings,
-    "view": ViewSettings,
     "evaluate": EvaluateSettings,
+    "view": ViewSettings,
     "maps": MapsSettings,
     "bench": BenchSettings,
     "benchmark": BenchmarkSettings,
