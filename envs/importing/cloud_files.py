@@ -62,15 +62,11 @@ def read_pcd(path: Path) -> Cloud:
     elif kind not in ("ascii", "binary"):
         raise MapError(f"{path}: PCD data is {kind!r}; ascii, binary and binary_compressed are read")
     _check_promise(path, promised, 2 * sum(counts) if kind == "ascii" else stride, rest, kind == "binary_compressed")
-    if kind == "ascii":  # Open3D takes missing and unreadable numbers for zeros
+    if kind == "ascii":
         starts = np.cumsum([0, *counts])
-        with path.open("rb") as file:
-            file.seek(start)
-            text = file.read().decode("ascii", errors="replace")
-        points = _parse_numbers(path, text, [int(starts[fields.index(axis)]) for axis in "xyz"])
-        if len(points) != promised:
-            raise MapError(f"{path} promises {promised} points and holds {len(points)}; save it again")
-        return Cloud(points)
+        return Cloud(_read_rows(path, start, promised, [int(starts[fields.index(axis)]) for axis in "xyz"]))
+    if kind == "binary":
+        _check_rest(path, start + promised * stride, stride)
     return Cloud(_read_with_open3d(path, promised))
 
 
@@ -108,6 +104,13 @@ def read_ply(path: Path) -> Cloud | None:
     if elements.get("face", [0])[0] > 0:
         _check_promise(path, elements["face"][0], 1, path.stat().st_size - start, False)
         return None
+    alone = promised if len(elements) == 1 and None not in (size for _, size in properties) else 0
+    if alone and kind == "ascii":
+        names = [name for name, _ in properties]
+        return Cloud(_read_rows(path, start, promised, [names.index(axis) for axis in "xyz"]))
+    if alone:
+        stride = sum(size for _, size in properties)
+        _check_rest(path, start + promised * stride, stride)
     return Cloud(_read_with_open3d(path, promised))
 
 
@@ -121,6 +124,26 @@ def read_xyz(path: Path) -> Cloud:
     if len(points) == 0:
         raise MapError(f"{path} holds 0 points; give a cloud with at least a few hundred")
     return Cloud(points)
+
+
+def _read_rows(path: Path, start: int, promised: int, columns: list[int]) -> np.ndarray:
+    """Three columns of the rows of text from byte `start` on; Open3D takes missing and unreadable numbers for zeros."""
+    with path.open("rb") as file:
+        file.seek(start)
+        text = file.read().decode("ascii", errors="replace")
+    points = _parse_numbers(path, text, columns)
+    if len(points) != promised:
+        raise MapError(f"{path} promises {promised} points and holds {len(points)}; save it again")
+    return points
+
+
+def _check_rest(path: Path, end: int, stride: int) -> None:
+    """After the points that the header promises there must be no further ones; zeros and a few bytes are padding."""
+    with path.open("rb") as file:
+        file.seek(end)
+        rest = file.read()
+    if len(rest) >= stride and any(rest):
+        raise MapError(f"{path} holds {len(rest)} bytes more than the points it promises; save it again")
 
 
 def _parse_numbers(path: Path, text: str, columns: list[int]) -> np.ndarray:

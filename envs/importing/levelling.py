@@ -7,7 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from maexp.envs.map import MapError
+
 MAX_TILT = np.deg2rad(15)
+STEEP = np.deg2rad(60)  # steeper large planes are walls
+STEEP_SHARE = 0.15  # of the points in a plane between the two: the cloud does not stand upright
 HYPOTHESES = 4000
 PLANE_THICKNESS = 0.05  # [m]; points nearer than this lie in the plane
 SLAB = 0.05  # [m]; height of the layers a floor is looked for in
@@ -98,7 +102,10 @@ def _slabs(heights: np.ndarray) -> np.ndarray:
 
 
 def _best_normal(points: np.ndarray) -> np.ndarray | None:
-    """Upward normal of the nearly level plane that most points lie in; None where there is none."""
+    """Upward normal of the nearly level plane that most points lie in; None where there is none.
+
+    Raises MapError where far more points lie in a plane that is neither level nor a wall.
+    """
     random = np.random.default_rng(0)
     some = points if len(points) <= 3000 else points[random.choice(len(points), 3000, replace=False)]
     corners = some[random.integers(len(some), size=(HYPOTHESES, 3))]
@@ -107,15 +114,21 @@ def _best_normal(points: np.ndarray) -> np.ndarray | None:
     good = length > 1e-6
     normals = normals[good] / length[good, None]
     normals *= np.where(normals[:, 2] < 0, -1.0, 1.0)[:, None]
-    level = normals[:, 2] > np.cos(MAX_TILT)
-    normals, anchors = normals[level], corners[good][level, 0]
-    if not len(normals):
-        return None
+    floors = normals[:, 2] > np.cos(STEEP)
+    normals, anchors = normals[floors], corners[good][floors, 0]
     offsets = (normals * anchors).sum(axis=1)
-    support = [(np.abs(some @ n - d) < PLANE_THICKNESS).sum() for n, d in zip(normals, offsets, strict=True)]
-    best = int(np.argmax(support))
-    if support[best] < 0.05 * len(some):
+    support = np.array([(np.abs(some @ n - d) < PLANE_THICKNESS).sum() for n, d in zip(normals, offsets, strict=True)])
+    level = normals[:, 2] > np.cos(MAX_TILT)
+    steep, usual = (support[kind].max(initial=0) for kind in (~level, level))
+    if steep > max(2 * usual, STEEP_SHARE * len(some)):
+        tilt = np.rad2deg(np.arccos(normals[~level][support[~level].argmax(), 2]))
+        raise MapError(
+            f"the largest plane of the cloud is tilted by {tilt:.0f} degrees, more than {np.rad2deg(MAX_TILT):.0f}: "
+            "turn it upright, set up, or set level=false to take it as it stands"
+        )
+    if usual < 0.05 * len(some):
         return None
+    best = int(np.where(level, support, 0).argmax())
     normal, offset = normals[best], offsets[best]
     for _ in range(3):  # refine on all points
         inside = points[np.abs(points @ normal - offset) < PLANE_THICKNESS]

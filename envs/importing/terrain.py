@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from maexp.envs.map import MapError
+
 from .grid import FREE, OBSTACLE, UNKNOWN, Grid
 from .sources import cell_index, count_points, fill_holes, grid_shape
 
 GROUND_CELL = 2.0  # [m]; cells of the ground model
 WINDOWS = (3, 5, 9, 17, 33, 65)  # cells; the widest is wider than a city block is deep
 SLOPE = 0.12  # terrain steeper than this over a window is taken for a building
+GROUND_CELLS = 8_000_000  # of the ground model
+SPARSE = 50  # cells of the ground model a point, on average; the ground between is made up
 PIT = 2.0  # [m]; lone cells this much lower than those around them are false returns
 
 
@@ -84,6 +88,10 @@ def _ground_below(points: np.ndarray) -> np.ndarray:
     places = points[:, :2]
     start = places.min(axis=0)
     shape = grid_shape(start, places.max(axis=0), GROUND_CELL)
+    cells = shape[0] * shape[1]
+    if cells > GROUND_CELLS or cells > SPARSE * len(points):
+        found = f"{len(points):,} points lie on {shape[0] * GROUND_CELL:,.0f} x {shape[1] * GROUND_CELL:,.0f} m"
+        raise MapError(f"{found}, too wide or too sparse for a terrain: check units, or cut the file")
     index = cell_index(places, start, GROUND_CELL, shape)
     surface = np.full(shape, np.inf)
     np.minimum.at(surface, index, points[:, 2])
