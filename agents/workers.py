@@ -29,6 +29,7 @@ from maexp.envs import PointCloudMap
 
 LOOK_EVERY = 0.2  # seconds between two looks whether the workers are alive
 ENDLESS = 2**62
+GRACE = 1.0  # seconds for the workers to end by themselves; they have nothing to save
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ class WorkerExperience(Experience):
             self._wait(self.pending)
         for group in self.groups:
             with suppress(Exception):  # what cannot be ended any more must not hide why the run ended
-                group.collector.shutdown()
+                group.collector.shutdown(timeout=GRACE)
         self.groups[0].leave()
 
 
