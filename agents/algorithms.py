@@ -118,11 +118,19 @@ class TrustRegionSettings(Settings):
 class ActorCriticSettings(Settings):
     """Settings of advantage actor-critic: one pass, for its gradient is that of the acting policy.
 
+    Nothing bounds a step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
+
+    Nothing bounds a step, so the rate must fall: at a constant one steps grow as the policy narrows.
+
     Attributes:
         epochs: passes over each batch
         mixer: how the robots' values make the team's, vdn or qmix
     """
 
+    lmbda: float = number(0.8, high=1.0)
+    lr: float = number(2e-3, open_ends=True)
+    final_lr_share: float = number(0.1, high=1.0)
+    entropy_coeff: float = number(5e-4)
     epochs: int = whole(1)
     mixer: str = choice("qmix", "vdn")
 
@@ -182,7 +190,7 @@ class Algorithm:
 
 def _reference(settings: Settings, **others) -> Settings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
-    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False)
+    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
     return replace(settings, **shared, **others)
 
 
