@@ -120,8 +120,6 @@ class ActorCriticSettings(Settings):
 
     Nothing bounds a step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
 
-    Nothing bounds a step, so the rate must fall: at a constant one steps grow as the policy narrows.
-
     Attributes:
         epochs: passes over each batch
         mixer: how the robots' values make the team's, vdn or qmix
