@@ -1,5 +1,6 @@
 """`maexp evaluate`: held-out episodes with a trained team or classical policies, for one team size or several."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     write_config(cfg, where, "evaluate", overrides)
     results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
     report(cfg, results, maps, where / "results.json")
-    draw_ends(cfg, maps, next(iter(policies.values())), where / "picture.png")
+    draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
     written = ["results.json", "picture.png", "config.yaml"]
     if cfg.render:
         written += [film.name for env in envs for film in film_all(cfg, env, maps, policies, where)] + [f"{EPISODES}/"]
@@ -119,10 +120,9 @@ def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Pa
     env = make_env(cfg, maps, env.num_robots, cfg.render_envs)
     for name, policy in policies.items():
         name = name if len(team_sizes(cfg.num_robots)) == 1 else f"{name}_N{env.num_robots}"
-        with Progress(f"filming {name}", 1) as progress:
-            episodes = play_teams(env, bind(policy, env), name, seed=cfg.seed)
-            films.append(write_film(episodes, where, name, cfg.render_format)[0])
-            progress.advance(1)
+        print(f"filming {name}", file=sys.stderr, flush=True)
+        episodes = play_teams(env, bind(policy, env), name, seed=cfg.seed)
+        films.append(write_film(episodes, where, name, cfg.render_format)[0])
     return films
 
 
@@ -133,15 +133,14 @@ def report(cfg: Any, results: list[EvaluationResult], maps: list, path: Path, **
     print_results(results, f"{cfg.scenario.name}: {cfg.episodes} held-out episodes")
 
 
-def draw_ends(cfg: Any, maps: list, policy: Any, path: Path) -> None:
-    """The last moment of the first few episodes, side by side."""
-    from PIL import Image
-
-    from maexp.envs.render import draw_frame, draw_grid
+def draw_ends(cfg: Any, maps: list, name: str, policy: Any, path: Path) -> None:
+    """The last moment of the first few episodes of a policy, side by side."""
+    from maexp.envs.render import draw_teams
+    from maexp.envs.viewing.show import write_picture
 
     count = min(PICTURES, cfg.episodes)
     env = make_env(cfg, maps, team_sizes(cfg.num_robots)[0], count)
     with torch.random.fork_rng([]):
         torch.manual_seed(cfg.seed)
         play(bind(policy, env), env, torch.arange(count, device=env.device))
-    Image.fromarray(draw_grid([draw_frame(env.snapshot(index)) for index in range(count)])).save(path)
+    write_picture(draw_teams([env.snapshot(index) | {"policy": name} for index in range(count)]), path)
