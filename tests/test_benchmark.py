@@ -59,6 +59,8 @@ def copy(whole, tmp_path) -> Path:
 
 def test_seeds_are_outermost_and_classical_policies_first():
     assert list_cells(settings(*TINY)) == CELLS
+    two = [f"{one.seed} {one.scenario}" for one in list_cells(settings(*TINY, "scenarios=maze,outdoor"))]
+    assert list(dict.fromkeys(two)) == ["0 maze", "0 outdoor", "1 maze", "1 outdoor"]
 
 
 def test_the_papers_preset_has_its_288_runs():
@@ -230,7 +232,7 @@ def test_killed_and_resumed_is_uninterrupted(whole, tmp_path, capsys):
     process.kill()
     process.wait()
     time.sleep(1.0)
-    left = len(log.read_text().splitlines())
+    left, first = len(log.read_text().splitlines()), log.read_text().splitlines()[1]
     time.sleep(1.0)
     assert len(log.read_text().splitlines()) == left < 5  # its worker went with it
     process = start(folder, f"resume={folder}")
@@ -240,6 +242,7 @@ def test_killed_and_resumed_is_uninterrupted(whole, tmp_path, capsys):
     assert process.returncode == 130 and "maexp benchmark resume=" in out and "Traceback" not in err
     assert "maze_small: 6 episodes" in out  # what was done is in the table already
     assert main(["benchmark", f"resume={folder}"]) == 0
+    assert log.read_text().splitlines()[1] == first  # clocks and all: it went on, it did not start again
     assert_same_cells(whole, folder)
 
 
