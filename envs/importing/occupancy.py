@@ -151,6 +151,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             with Image.open(path, formats=FORMATS) as image:
                 if image.width * image.height > MAX_CELLS:
                     raise MapError(f"{path} has {image.width} x {image.height} pixels; at most {MAX_CELLS} are read")
+                _check_rows(path, image)
                 alpha = np.asarray(image.convert("RGBA"))[..., 3] if "A" in image.getbands() else None
                 deep = image.mode.startswith("I") or image.mode == "F"
                 values = np.asarray(image if deep else image.convert("L"), dtype=np.float32)
@@ -161,6 +162,17 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     if deep:
         values = values * (255 / 65535)
     return values, None if alpha is None else alpha > 0
+
+
+def _check_rows(path: Path, image: Image.Image) -> None:
+    """A binary pgm must not hold more rows than its header promises."""
+    with path.open("rb") as file:
+        if file.read(2) != b"P5" or not image.tile:
+            return
+    row = image.width * (1 if image.mode == "L" else 2)
+    rest = path.stat().st_size - image.tile[0][2] - row * image.height
+    if rest >= row:
+        raise MapError(f"{path} holds {rest // row} rows more than the {image.height} it promises; save it again")
 
 
 def _label(values: np.ndarray, opaque, sheet: Sheet, options: ImportOptions, report: ImportReport) -> np.ndarray:
