@@ -245,16 +245,17 @@ class RayGroup(WorkerGroup):
     def __init__(self, collector: Any, name: str):
         super().__init__(collector, name)
         self.places = collector.get_distant_attr("place")
+        self.actors = [one._actor_id.hex() for one in collector.remote_collectors]
 
     def find_lost(self, error: BaseException | None = None) -> str | None:
         from ray.exceptions import RayActorError
 
         if not isinstance(error, RayActorError):
             return None
-        actors = [one._actor_id.hex() for one in self.collector.remote_collectors]
-        k = actors.index(error.actor_id) if error.actor_id in actors else None
-        which = "of them" if k is None else f"{k + 1} of {len(actors)} ({self.places[k]})"
-        return f"{self.name} {which} was lost to Ray"
+        if error.actor_id not in self.actors:
+            return f"a {self.name} was lost to Ray"
+        k = self.actors.index(error.actor_id)
+        return f"{self.name} {k + 1} of {len(self.actors)} ({self.places[k]}) was lost to Ray"
 
     def leave(self) -> None:
         import ray
