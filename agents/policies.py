@@ -22,10 +22,12 @@ from maexp.envs import ExplorationEnv
 from maexp.envs.navigation import Navigation
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
 
-DWELL = 3  # decisions beside a target that does not go away before it is given up
+DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
+STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
+ONWARD = 1.5  # goals lie at most so many times as far beyond a target as the middle of what is to be seen there
 REGION_COUNT = 64
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.5  # targets with a smaller share of unknown cells around them wait until no others are left
+LEAST_GAIN = 0.2  # targets with less to see, as a share of the radar's disc, wait until no others are left
 RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
@@ -40,7 +42,7 @@ class Scene:
         travel: float32 [E, N, K], way from robot to target [m].
         points: float32 [E, N, K, 2], where the targets are [m].
         size: float32 [E, N, K], frontier cells behind each.
-        gain: float32 [E, N, K], share of unknown cells within radar range of each, in [0, 1].
+        gain: float32 [E, N, K], unknown cells in radar range and sight of each, as a share of the radar's disc.
         alive: bool [E, N], robots that still move.
         nav: the env's grids.
     """
@@ -156,8 +158,10 @@ class FrontierPlanner:
             ahead = min(0.5 * accel * (0.1 * env.local_steps) ** 2 + threshold, self.nav.radar_range)
         shape = (env.num_envs, env.num_robots)
         self.reach = torch.full(shape, float(ahead), device=env.device)
-        blocks = (env.num_envs, self.nav.rows, self.nav.num_blocks)
-        self.dwell = torch.zeros(blocks, dtype=torch.int32, device=env.device)
+        self.drive = 0.1 * env.local_steps * min(r.max_speed for r in env.robot_configs)
+        self.dwell = torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=env.device)
+        self.chosen = torch.full((*shape, 1), -1, device=env.device)
+        self.stood = torch.zeros((*shape, 2), device=env.device)
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -167,7 +171,7 @@ class FrontierPlanner:
         cells = nav.target.expand(-1, self.env.num_robots, -1)
         points = nav.points(cells.clamp_min(0))
         travel = self._give_up(nav.travel(), points)
-        gain = self._gain()
+        gain, middle = self._look_around()
         travel = _prefer(travel, gain >= LEAST_GAIN)
         scene = Scene(
             travel=travel,
@@ -178,29 +182,49 @@ class FrontierPlanner:
             nav=nav,
         )
         chosen = self.choose(scene).unsqueeze(-1)
-        found = travel.gather(2, chosen).squeeze(-1).isfinite()
+        way = travel.gather(2, chosen)
+        found = way.squeeze(-1).isfinite()
+        self.chosen = torch.where(found.unsqueeze(-1), chosen, -1)
+        self.stood = nav.centers().clone()
         goal_cell = torch.where(found, cells.gather(2, chosen).squeeze(-1), -1)
         elsewhere = self._roam()
         if self.env.planner_config.name == "wavefront":
-            goal = torch.where(found.unsqueeze(-1), nav.points(goal_cell.clamp_min(0)), elsewhere)
+            goal = nav.points(goal_cell.clamp_min(0)) + self._go_on(way, middle, chosen)
+            goal = torch.where(found.unsqueeze(-1), goal, elsewhere)
         else:
             goal = nav.waypoints(goal_cell, elsewhere, self.reach)
         return nav.to_action(goal)
 
-    def _gain(self) -> torch.Tensor:
-        """Share of unknown cells in radar range of every target: float32 [E, N, K]."""
-        nav = self.nav
+    def _look_around(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """What is to be seen from every target, as a share of the radar's disc, float32 [E, N, K], and the middle of
+        it, from the target [m], float32 [E, N, K, 2]."""
+        nav, robots = self.nav, self.env.num_robots
         disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        gain = nav.count_unknown(nav.radar_range) / disc.view(-1, 1, 1)
-        return gain.expand(-1, self.env.num_robots, -1)
+        area, middle = nav.look_around(nav.radar_range)
+        return (area / disc.view(-1, 1, 1)).expand(-1, robots, -1), middle.expand(-1, robots, -1, -1)
+
+    def _go_on(self, way: torch.Tensor, middle: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
+        """How far beyond the chosen target the goal lies [m], float32 [E, N, 2].
+
+        Towards what is to be seen there, as far as a robot still gets in the macro step: one that stopped at the
+        frontier would stand there until the next decision.
+        """
+        onward = middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
+        left = (self.drive - way).clamp_min(0.0) / onward.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return onward * left.clamp(max=ONWARD)
 
     def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Drop targets that robots stood beside in vain: what is unknown there cannot be seen from there."""
+        """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
+        each robot those that it got stuck on the way to."""
         nav = self.nav
         near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
-        self.dwell[nav.state["macro_step"] == 0] = 0
+        fresh = nav.state["macro_step"] == 0
+        self.dwell[fresh], self.chosen[fresh] = 0, -1
         beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near)
         self.dwell += beside.any(1, keepdim=True) if nav.rows == 1 else beside
+        stuck = (nav.centers() - self.stood).norm(dim=-1, keepdim=True) < STUCK * nav.clearance
+        stuck = stuck & (self.chosen >= 0) & nav.alive().unsqueeze(-1)
+        self.dwell.scatter_add_(2, self.chosen.clamp_min(0), stuck.to(torch.int32))
         kept = travel.masked_fill(self.dwell >= DWELL, torch.inf)
         # Nothing else left: try them all once more.
         again = ~kept.isfinite().flatten(1).any(1)

@@ -114,16 +114,22 @@ class Navigation:
         self.target = self._target.view(self.num_envs, self.rows, -1).long()
         self.size = self._size.view(self.num_envs, self.rows, -1)
 
-    def count_unknown(self, radius: float) -> torch.Tensor:
-        """Unknown cells within ``radius`` [m] of every target: int32 [E, R, K]."""
-        count = torch.empty_like(self._target)
+    def look_around(self, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """What could be seen for the first time from every target, within ``radius`` [m] and in front of known walls.
+
+        Returns:
+            float32 [E, R, K], unknown cells; float32 [E, R, K, 2], their middle, from the target [m].
+        """
+        area = torch.empty(self._target.shape, device=self.device)
+        middle = torch.empty((*self._target.shape, 2), device=self.device)
         self.launch(
-            targets._count_unknown, tuple(count.shape),
+            targets._look_around, tuple(area.shape),
             inputs=[self.grids, self.known_grids.grid_of_row, self.known_grids.known,
                     wp.from_torch(self._target), float(radius)],
-            outputs=[wp.from_torch(count)],
+            outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
         )  # fmt: skip
-        return count.view(self.num_envs, self.rows, -1)
+        shape = (self.num_envs, self.rows, -1)
+        return area.view(shape), middle.view(*shape, 2)
 
     def grow_trees(self, samples: int, branch: float) -> torch.Tensor:
         """Targets that random trees of the robots came upon: bool [E, R, K].

@@ -82,9 +82,10 @@ class Shard:
         if cfg.planner == "direct":
             launch(planner._plan_direct, self.shape, [self.robots, s.active, s.command], [s.control])
             return
+        robots = self.wavefront.narrowed if self.wavefront is not None else self.robots
         launch(
             planner._plan_dwa, self.shape,
-            [maps, s.map_id, self.robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
+            [maps, s.map_id, robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
              int(cfg.footprint), int(cfg.comm_limited), cfg.dt,
              s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby],
             [s.control, s.error],

@@ -4,14 +4,21 @@ Rows are those of `KnownGrids`: one per env where the team shares what it knows,
 numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the env's map.
 """
 
+import math
+
 import warp as wp
 
-from maexp.kernels.frontier import UNKNOWN
+from maexp.kernels.frontier import OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
 from maexp.kernels.known_grid import NavGrids, nav_cell
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import nearest_passable, step_back
 
+RAYS = 48  # rays that look around from a target
+
+wp_rays = wp.constant(RAYS)
+wp_ray_angle = wp.constant(2.0 * math.pi / RAYS)
+wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
 wp_unknown = wp.constant(wp.uint8(UNKNOWN))
 wp_unreached = wp.constant(wp.int32(UNREACHED))
 
@@ -113,8 +120,15 @@ def _list_targets(
                 target[row, k] = y * w + x
 
 
+@wp.func
+def cell_ahead(x: int, y: int, ux: float, uy: float, steps: int) -> wp.vec2i:
+    """The cell `steps` cells from (x, y) along a unit vector."""
+    t = float(steps)
+    return wp.vec2i(x + int(wp.floor(t * ux + 0.5)), y + int(wp.floor(t * uy + 0.5)))
+
+
 @wp.kernel(enable_backward=False)
-def _count_unknown(
+def _look_around(
     # Map:
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
@@ -123,25 +137,48 @@ def _count_unknown(
     target: wp.array2d(dtype=wp.int32),  # [row, block]
     radius: float,  # [m]
     # Out:
-    unknown: wp.array2d(dtype=wp.int32),  # [row, block], unknown cells within the radius of the target
+    area: wp.array2d(dtype=wp.float32),  # [row, block], unknown cells in sight of the target
+    middle: wp.array2d(dtype=wp.vec2),  # [row, block], the middle of those, from the target [m]
 ):
+    """What a robot at each target might see for the first time: known walls hide what is behind them.
+
+    `RAYS` rays go out cell by cell, as far as the radius or a known obstacle; a cell of a ray stands for the share
+    of its circle that falls to one ray.
+    """
     row, k = wp.tid()
     m = grid_of_row[row]
     cell = target[row, k]
-    count = wp.int32(0)
+    total = wp.float32(0.0)
+    moment = wp.vec2(0.0, 0.0)
     if cell >= 0:
         w = grids.width[m]
         h = grids.height[m]
-        r = radius / grids.cell[m]
-        reach = int(r)
+        reach = int(radius / grids.cell[m])
         x = cell % w
         y = cell / w
-        for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-            for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-                gap = float((v - y) * (v - y) + (u - x) * (u - x))
-                if gap <= r * r and known[row, v * w + u] == wp_unknown:
-                    count += 1
-    unknown[row, k] = count
+        for ray in range(wp_rays):
+            ux = wp.cos((float(ray) + 0.5) * wp_ray_angle)
+            uy = wp.sin((float(ray) + 0.5) * wp_ray_angle)
+            before = wp.vec2i(x, y)
+            blocked = wp.bool(False)
+            for step in range(1, reach + 1):
+                if not blocked:
+                    at = cell_ahead(x, y, ux, uy, step)
+                    if at[0] < 0 or at[0] >= w or at[1] < 0 or at[1] >= h:
+                        blocked = True
+                    else:
+                        state = known[row, at[1] * w + at[0]]
+                        # Not between two walls that touch at a corner either.
+                        beside = known[row, at[1] * w + before[0]] == wp_obstacle
+                        beside = beside and known[row, before[1] * w + at[0]] == wp_obstacle
+                        blocked = beside or state == wp_obstacle
+                        if not blocked and state == wp_unknown:
+                            part = float(step) * wp_ray_angle
+                            total += part
+                            moment += wp.vec2(ux, uy) * (part * float(step))
+                        before = at
+    area[row, k] = total
+    middle[row, k] = moment * (grids.cell[m] / wp.max(total, 1.0e-6))
 
 
 @wp.kernel(enable_backward=False)

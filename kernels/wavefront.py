@@ -14,32 +14,26 @@ held never outlives a macro step: a new goal always searches anew.
 import numpy as np
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE
 from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids, nav_cell, nav_center
-from maexp.kernels.types import Robots, point_xy
-from maexp.kernels.ways import in_sight, is_passable, nearest_passable, step_back
+from maexp.kernels.pace import _fit_clearance, _hold_back
+from maexp.kernels.state import robots_struct
+from maexp.kernels.types import point_xy
+from maexp.kernels.ways import (
+    PATH_CELLS,
+    in_sight,
+    is_passable,
+    nearest_passable,
+    path_slot,
+    step_back,
+    wp_path_cells,
+)
 
-PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
-CREEP = 0.5  # least distance of a waypoint that is not the end, in clearances of the robot
 COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
-HEADROOM = 2.0  # speed is held to what brakes within so many times the gap to the nearest obstacle
-LOOK_CELLS = 5  # how far that obstacle is looked for, in cells
 
-wp_headroom = wp.constant(HEADROOM)
-wp_look_cells = wp.constant(LOOK_CELLS)
-wp_creep = wp.constant(CREEP)
-wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
-wp_path_cells = wp.constant(PATH_CELLS)
 wp_unreached = wp.constant(wp.int32(UNREACHED))
 wp_skip = wp.constant(wp.int32(SKIP))
-
-
-@wp.func
-def path_slot(j: int, total: int) -> int:
-    """Where the j-th cell of a path, counted from the robot, is stored (the path is written from its end)."""
-    return (total - 1 - j) % wp_path_cells
 
 
 @wp.kernel(enable_backward=False)
@@ -141,83 +135,6 @@ def _trace_path(
         cell = step_back(passable, row_of_item[item], distance, item, cell, w, h)
     path_total[item] = total
     path_used[item] = 0
-
-
-@wp.func
-def clear_ahead(
-    e: int,
-    i: int,
-    way: wp.vec2,
-    keep: float,
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-) -> float:
-    """Room to brake on the straight `way` [m]: its length, or half the gap to a robot that may come closer."""
-    room = wp.length(way)
-    at = point_xy(center[e, i])
-    for other in range(center.shape[1]):
-        gap = point_xy(center[e, other]) - at
-        if other != i and wp.dot(gap, way) > 0.0:
-            free = wp.length(gap) - keep
-            if collided[e, other] == 0:
-                free = 0.5 * free
-            room = wp.min(room, free)
-    return wp.max(room, 0.0)
-
-
-@wp.func
-def nearest_obstacle(grids: NavGrids, m: int, known: wp.array2d(dtype=wp.uint8), row: int, at: wp.vec2) -> float:
-    """Distance to the nearest known obstacle cell [m], `LOOK_CELLS` cells at most."""
-    w = grids.width[m]
-    h = grids.height[m]
-    p = (at - grids.origin[m]) / grids.cell[m]
-    x = int(wp.floor(p[0]))
-    y = int(wp.floor(p[1]))
-    nearest = float(wp_look_cells)
-    for v in range(wp.max(y - wp_look_cells, 0), wp.min(y + wp_look_cells, h - 1) + 1):
-        for u in range(wp.max(x - wp_look_cells, 0), wp.min(x + wp_look_cells, w - 1) + 1):
-            if known[row, v * w + u] == wp_obstacle:
-                nearest = wp.min(nearest, wp.length(wp.vec2(float(u) + 0.5, float(v) + 0.5) - p))
-    return nearest * grids.cell[m]
-
-
-@wp.kernel(enable_backward=False)
-def _hold_back(
-    # Map:
-    grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
-    rows_per_env: int,
-    # Robots:
-    robots: Robots,
-    lead_time: float,
-    # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-    # State out:
-    target: wp.array2d(dtype=wp.vec2),
-):
-    """Draws waypoints nearer, so that robots drive no faster than they can brake before the waypoint.
-
-    DWA brakes only for a target that it would pass in its `lead_time` [s], three steps: a target at
-    lead_time * v holds it at about the speed v. At least `CREEP` clearances, or it would not get going.
-    """
-    e, i = wp.tid()
-    if active[e] == 0 or collided[e, i] != 0:
-        return
-    at = point_xy(center[e, i])
-    way = target[e, i] - at
-    keep = 2.0 * robots.clearance[e, i]
-    room = clear_ahead(e, i, way, keep, collided, center)
-    m = map_id[e]
-    row = e * rows_per_env + i % rows_per_env
-    gap = nearest_obstacle(grids, m, known, row, at) - robots.threshold[e, i]
-    room = wp.clamp(room, 0.0, wp.max(wp_headroom * gap, 0.0))
-    length = lead_time * wp.sqrt(2.0 * robots.max_accel[e, i] * room) + wp_creep * robots.clearance[e, i]
-    full = wp.length(way)
-    if full > length:
-        target[e, i] = at + way * (length / full)
 
 
 @wp.kernel(enable_backward=False)
@@ -354,6 +271,7 @@ class Wavefront:
     """The planner over one shard of a simulation: recorded launches.
 
     Attributes:
+        narrowed: the robots with the clearance that DWA is to keep now.
         field_launches: bring maps and paths up to date; every `replan_steps` local steps.
         waypoint_launches: bring `target` up to date; every local step.
     """
@@ -371,6 +289,8 @@ class Wavefront:
         )  # fmt: skip
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)
+        self.narrowed = robots_struct(sim.robot_tensors, shard.first, shard.last)
+        self.narrowed.clearance = wp.clone(self.robots.clearance)
         self.field_launches = shard.record(self.find_paths)
         self.waypoint_launches = shard.record(self.pick_waypoints)
 
@@ -383,8 +303,15 @@ class Wavefront:
     def pick_waypoints(self, launch) -> None:
         s = self.view
         self.paths.pick(launch, s.active, s.collided, s.center, s.goal, self.robots.radar_range, s.target)
+        known = [self.known.grids, s.map_id, self.known.known, self.known.rows_per_env]
+        launch(
+            _fit_clearance, self.paths.shape,
+            [*known, self.robots, s.active, s.collided, s.center, self.paths.path, self.paths.path_total,
+             self.paths.path_used],
+            [self.narrowed.clearance],
+        )  # fmt: skip
         launch(
             _hold_back, self.paths.shape,
-            [self.known.grids, s.map_id, self.known.known, self.known.rows_per_env,
-             self.robots, self.lead_time, s.active, s.collided, s.center], [s.target],
+            [*known, self.robots, self.lead_time, s.active, s.collided, s.pose, s.slip, s.center, s.goal],
+            [s.target],
         )  # fmt: skip

@@ -4,10 +4,18 @@ import warp as wp
 
 from maexp.kernels.geodesic import UNREACHED, wp_diagonal, wp_straight, wp_tight, wp_tight_factor
 
+PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
 SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells
 
+wp_path_cells = wp.constant(PATH_CELLS)
 wp_snap_cells = wp.constant(SNAP_CELLS)
 wp_unreached = wp.constant(wp.int32(UNREACHED))
+
+
+@wp.func
+def path_slot(j: int, total: int) -> int:
+    """Where the j-th cell of a path, counted from the robot, is stored (the path is written from its end)."""
+    return (total - 1 - j) % wp_path_cells
 
 
 @wp.func

@@ -12,9 +12,9 @@ from maexp.envs.map import PointCloudMap
 from maexp.envs.nav_grid import build_nav_grid, stack_nav_grids
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids
-from maexp.kernels.types import Maps, Robots
-from maexp.kernels.wavefront import CREEP, HEADROOM, PATH_CELLS, PathSearch, _hold_back, distinct_masks
-from maexp.kernels.ways import SNAP_CELLS, in_sight
+from maexp.kernels.types import Maps
+from maexp.kernels.wavefront import PathSearch, distinct_masks
+from maexp.kernels.ways import PATH_CELLS, SNAP_CELLS, in_sight
 
 pytestmark = pytest.mark.kernels
 
@@ -321,37 +321,6 @@ def test_following_waypoints_arrives():
         x, y = at[0, 0].astype(int)
         assert passable[y, x]
     np.testing.assert_allclose(at, goal, atol=1e-3)
-
-
-def test_waypoints_leave_room_to_brake():
-    """Drawn to lead_time * the speed that stops at the waypoint, or half-way to a robot ahead, plus a creep."""
-    scene = open_scene(7, 250)
-    robots = Robots()
-    robots.max_accel = array([[2.0] * 6], wp.float32)
-    robots.clearance = array([[1.0] * 6], wp.float32)
-    robots.threshold = array([[0.7] * 6], wp.float32)
-    # 0 and 1 drive at each other, 2 behind 1, 3 far off and almost there, 4 stands on its target, 5 beside a wall.
-    x = np.array([2.0, 8.0, 32.0, 102.0, 202.0, 230.5])
-    ahead = np.array([20.0, -6.0, 18.0, 0.4, 0.0, 15.0])
-    known = scene.known.known.numpy()
-    known[0, 1 * 250 + 231] = OBSTACLE  # its centre 1 right of robot 5 and 2 below
-    known[0, 6 * 250 + 60] = OBSTACLE  # too far from anybody
-    center = np.stack([x, 0 * x + 3.0, 0 * x], axis=-1)[None]
-    for stopped, room_0 in ((0, 0.5 * (6.0 - 2.0)), (1, 6.0 - 2.0)):
-        collided = array([[0, stopped, 0, 0, 0, 0]], wp.int32)
-        target = array(np.stack([x + ahead, 0 * x + 3.0], axis=-1)[None], wp.vec2)
-        launch(
-            _hold_back, (1, 6),
-            [scene.grids, array([0], wp.int32), array(known, wp.uint8), 1, robots, 0.3, array([1], wp.int32),
-             collided, array(center, wp.vec3)], [target],
-        )  # fmt: skip
-        got = target.numpy()[0, :, 0] - x
-        most = HEADROOM * (5.0 - 0.7)  # nothing within five cells
-        beside = HEADROOM * (np.hypot(231.0 - x[5], 1.0 - 3.0) - 0.7)
-        want = [0.3 * np.sqrt(2 * 2.0 * min(room, most)) + CREEP for room in (room_0, 2.0, 18.0, beside)]
-        np.testing.assert_allclose(got[0], want[0], rtol=1e-4)
-        np.testing.assert_allclose(got[1], -6.0 if stopped else -want[1], rtol=1e-4)
-        np.testing.assert_allclose(got[2:], [want[2], 0.4, 0.0, want[3]], rtol=1e-3, atol=1e-4)
 
 
 def test_tight_cells_lie_between_the_two_radii_and_are_avoided():

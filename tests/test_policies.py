@@ -260,6 +260,34 @@ def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_le
     assert planner._give_up(travel, points)[0, 0, 0] == 0.5
 
 
+def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
+    env = make_env(1, num_robots=2)
+    env.reset()
+    planner = FrontierPlanner(env, choose_nearest)
+    planner.nav.update()
+    travel = torch.full((1, 2, planner.nav.num_blocks), INF)
+    travel[..., :2] = torch.tensor([9.0, 20.0])
+    points = torch.full((*travel.shape, 2), 1000.0)
+    env.simulation.tensors["macro_step"].fill_(1)
+    for _ in range(3):
+        planner.chosen, planner.stood = torch.zeros((1, 2, 1), dtype=torch.long), planner.nav.centers().clone()
+        planner.stood[0, 1, 0] -= 1.0  # the second robot has moved
+        kept = planner._give_up(travel, points)
+    assert kept[0, :, :2].tolist() == [[INF, 20.0], [9.0, 20.0]]
+    env.simulation.tensors["macro_step"].fill_(0)
+    assert planner._give_up(travel, points)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
+
+
+def test_goals_lie_beyond_the_frontier_as_far_as_a_robot_gets():
+    planner = FrontierPlanner(make_env(1), choose_nearest)
+    planner.drive = 16.0
+    middle = torch.zeros(1, 3, 4, 2)
+    middle[..., 0] = 6.0
+    way = torch.tensor([[[2.0], [13.0], [30.0]]])
+    onward = planner._go_on(way, middle, torch.zeros((1, 3, 1), dtype=torch.long))
+    assert onward.tolist() == [[[9.0, 0.0], [3.0, 0.0], [0.0, 0.0]]]  # 1.5 times the middle; what is left; nothing
+
+
 def test_wavefront_holds_nothing_that_a_saved_state_lacks():
     """Paths live in scratch: an env that takes up a saved state drives on bit for bit, as under plain DWA."""
     env, other = make_env(3), make_env(3)

@@ -1,0 +1,171 @@
+"""Waypoints drawn nearer, clearances fitted to the path, and what is to be seen from a target, against plain loops."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import warp as wp
+from oracle import pace as oracle
+
+from maexp.kernels import pace, targets
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.types import Robots
+from maexp.kernels.ways import PATH_CELLS
+
+pytestmark = pytest.mark.kernels
+
+launch = partial(wp.launch, device="cpu")
+SIZES = ((13, 20), (17, 9))  # height, width of the two maps
+CELL = np.array([0.5, 2.0])
+ORIGIN = np.array([[-3.0, 4.0], [1.0, -9.0]])
+MAP_OF_ENV = [1, 0, 1]
+ROBOTS = 4
+LEAD = 0.3
+
+
+def array(values, dtype):
+    return wp.array(np.asarray(values), dtype=dtype, device="cpu")
+
+
+def nav_grids() -> NavGrids:
+    grids = NavGrids()
+    grids.origin, grids.cell = array(ORIGIN, wp.vec2), array(CELL, wp.float32)
+    grids.height, grids.width = (array([size[k] for size in SIZES], wp.int32) for k in (0, 1))
+    return grids
+
+
+class World:
+    """Random known grids and teams on them; lengths in cells, turned to metres for the kernels."""
+
+    def __init__(self, seed: int, obstacles: float):
+        rng = self.rng = np.random.default_rng(seed)
+        shares = [0.3, 0.7 - obstacles, obstacles]
+        self.known = [rng.choice([UNKNOWN, FREE, OBSTACLE], SIZES[m], p=shares) for m in MAP_OF_ENV]
+        self.rows = np.zeros((3, max(h * w for h, w in SIZES)), np.uint8)
+        for row, known in zip(self.rows, self.known, strict=True):
+            row[: known.size] = known.ravel()
+        self.cell = CELL[MAP_OF_ENV][:, None]
+        sides = np.array([SIZES[m][::-1] for m in MAP_OF_ENV])[:, None]
+        self.at = rng.uniform(0.2, 0.8, (3, ROBOTS, 2)) * sides
+        self.target = rng.uniform(0.0, 1.0, (3, ROBOTS, 2)) * sides
+        self.goal = np.where(rng.random((3, ROBOTS, 1)) < 0.5, self.target, self.target + 1.0)
+        self.speed, self.heading = rng.uniform(-3, 3, (3, ROBOTS)), rng.uniform(-3, 3, (3, ROBOTS))
+        self.slip = np.where(rng.random((3, ROBOTS)) < 0.5, 0.0, rng.uniform(-1, 1, (3, ROBOTS)))
+        self.collided = (rng.random((3, ROBOTS)) < 0.3).astype(int)
+        self.active = np.array([1, 1, 0])
+        self.accel, self.threshold, self.clearance = (rng.uniform(a, b, (3, ROBOTS)) for a, b in
+                                                      ((1, 3), (0.3, 0.8), (0.9, 2.0)))  # fmt: skip
+
+    def metres(self, places) -> np.ndarray:
+        return places * self.cell[..., None] + ORIGIN[MAP_OF_ENV][:, None]
+
+    def robots(self) -> Robots:
+        robots = Robots()
+        for name, field in (("max_accel", self.accel), ("threshold", self.threshold), ("clearance", self.clearance)):
+            setattr(robots, name, array(field * self.cell, wp.float32))
+        return robots
+
+    def state(self) -> list:
+        center = np.concatenate([self.metres(self.at), np.zeros((3, ROBOTS, 1))], axis=-1)
+        return [array(self.active, wp.int32), array(self.collided, wp.int32), array(center, wp.vec3)]
+
+    def constants(self, e: int, i: int) -> dict:
+        names = ("creep", "headroom", "brake", "slack", "slack_gap", "slack_time", "samples", "ahead", "fit", "least")
+        return {name: getattr(pace, name.upper()) for name in names} | {
+            "look": pace.LOOK_CELLS, "lead": LEAD,
+            "accel": self.accel[e, i], "threshold": self.threshold[e, i], "clearance": self.clearance[e, i],
+        }  # fmt: skip
+
+    def moves(self, e: int, i: int) -> bool:
+        return bool(self.active[e] and not self.collided[e, i])
+
+
+def test_waypoints_leave_room_to_brake():
+    drawn = 0
+    for seed in range(6):
+        world = World(seed, obstacles=(0.0, 0.02, 0.1)[seed % 3])
+        pose = np.zeros((3, ROBOTS, 4))
+        pose[..., 2], pose[..., 3] = world.speed * world.cell, world.heading
+        active, collided, center = world.state()
+        target = array(world.metres(world.target), wp.vec2)
+        goal = np.where((world.goal == world.target)[..., :1], target.numpy()[..., :2], world.metres(world.goal))
+        launch(
+            pace._hold_back, (3, ROBOTS),
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), 1, world.robots(), LEAD,
+             active, collided, array(pose, wp.vec4), array(world.slip * world.cell, wp.float32), center,
+             array(goal, wp.vec2)],
+            [target],
+        )  # fmt: skip
+        c, s = np.cos(world.heading), np.sin(world.heading)
+        vx, vy = world.speed * c - world.slip * s, world.speed * s + world.slip * c
+        for e in range(3):
+            team = [
+                {"x": world.at[e, i, 0], "y": world.at[e, i, 1], "vx": vx[e, i], "vy": vy[e, i],
+                 "stopped": world.collided[e, i], "target": world.target[e, i], "goal": world.goal[e, i]}
+                for i in range(ROBOTS)
+            ]  # fmt: skip
+            for i in range(ROBOTS):
+                want = world.target[e, i]
+                if world.moves(e, i):
+                    want = oracle.held_back(world.known[e], team, i, world.constants(e, i))
+                    drawn += not np.allclose(want, world.target[e, i])
+                got = (target.numpy()[e, i] - ORIGIN[MAP_OF_ENV[e]]) / world.cell[e]
+                np.testing.assert_allclose(got, want, atol=2e-3)
+    assert drawn > 10
+
+
+def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
+    seen = set()
+    for seed in range(6):
+        world = World(seed, obstacles=(0.0, 0.02, 0.25)[seed % 3])
+        items = 3 * ROBOTS
+        path = np.full((items, PATH_CELLS), -1)
+        total, used = world.rng.integers(0, PATH_CELLS + 9, items), np.zeros(items, int)
+        for item in range(items):
+            size = world.known[item // ROBOTS].size
+            path[item] = world.rng.integers(0, size, PATH_CELLS)
+            used[item] = world.rng.integers(-1, min(total[item], PATH_CELLS)) if total[item] else -1
+        active, collided, center = world.state()
+        clearance = array(np.full((3, ROBOTS), -1.0), wp.float32)
+        launch(
+            pace._fit_clearance, (3, ROBOTS),
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), 1, world.robots(),
+             active, collided, center, array(path, wp.int32), array(total, wp.int32), array(used, wp.int32)],
+            [clearance],
+        )  # fmt: skip
+        for e, i in np.ndindex(3, ROBOTS):
+            item, width = e * ROBOTS + i, SIZES[MAP_OF_ENV[e]][1]
+            # The path is stored from its end: cell j, counted from the robot, was the (total - 1 - j)-th written.
+            cells = [path[item, (total[item] - 1 - j) % PATH_CELLS] for j in range(used[item] + 1)]
+            p = world.constants(e, i)
+            want = oracle.fitted_clearance(world.known[e], *world.at[e, i], [(c % width, c // width) for c in cells], p)
+            got = clearance.numpy()[e, i]
+            if not world.moves(e, i):
+                assert got == -1.0
+                continue
+            assert got / world.cell[e, 0] == pytest.approx(want, abs=1e-3)
+            seen.add(int(want > p["least"] * p["threshold"]) + int(want == p["clearance"]))
+    assert seen == {0, 1, 2}
+
+
+def test_what_is_to_be_seen_from_a_target_ends_at_walls():
+    for seed in range(3):
+        world = World(seed, obstacles=0.06)
+        blocks = 7
+        target = np.stack([world.rng.integers(-1, known.size, blocks) for known in world.known])
+        area, middle = wp.zeros((3, blocks), dtype=float), wp.zeros((3, blocks), dtype=wp.vec2)
+        radius = 6.1
+        launch(
+            targets._look_around, (3, blocks),
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), array(target, wp.int32), radius],
+            [area, middle],
+        )  # fmt: skip
+        for e, k in np.ndindex(3, blocks):
+            cell, width = CELL[MAP_OF_ENV[e]], SIZES[MAP_OF_ENV[e]][1]
+            want = (0.0, 0.0, 0.0)
+            if target[e, k] >= 0:
+                place = target[e, k] % width, target[e, k] // width
+                want = oracle.look_around(world.known[e], *place, int(radius / cell), targets.RAYS)
+            got = area.numpy()[e, k], *(middle.numpy()[e, k] / cell)
+            np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-3)
