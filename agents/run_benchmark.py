@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.benchmark import (
+from maexp.agents.benchmark.cell import finished
+from maexp.agents.benchmark.estimate import Estimate, estimate_cells
+from maexp.agents.benchmark.plan import (
     PLAN,
     Cell,
     as_list,
@@ -18,10 +20,8 @@ from maexp.agents.benchmark import (
     read_plan,
     write_plan,
 )
-from maexp.agents.benchmark_cell import finished
-from maexp.agents.benchmark_estimate import Estimate, estimate_cells
-from maexp.agents.benchmark_pool import Outcome, WorkerPool, last_lines
-from maexp.agents.benchmark_report import SMOKE, Report
+from maexp.agents.benchmark.pool import Outcome, WorkerPool, last_lines
+from maexp.agents.benchmark.report import SMOKE, Report
 from maexp.agents.build import pick_device
 from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError

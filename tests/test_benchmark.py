@@ -18,15 +18,15 @@ import pytest
 from rich.console import Console
 from scipy.stats import mannwhitneyu
 
-from maexp.agents.benchmark import Cell, cell_config, cell_folder, compose_settings, list_cells
-from maexp.agents.benchmark_cell import read_result
-from maexp.agents.benchmark_compare import compare_all, improvement, win_shares
-from maexp.agents.benchmark_pool import WorkerPool
-from maexp.agents.benchmark_table import ROWS, best, pool_column, print_tables, table_csv, table_latex, table_markdown
+from maexp.agents.benchmark.cell import read_result
+from maexp.agents.benchmark.compare import compare_all, improvement, win_shares
+from maexp.agents.benchmark.paper_results import COLUMNS, PAPER
+from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, compose_settings, list_cells
+from maexp.agents.benchmark.pool import WorkerPool
+from maexp.agents.benchmark.table import ROWS, best, pool_column, print_tables, table_csv, table_latex, table_markdown
 from maexp.agents.cli import main
 from maexp.agents.logs import read_metrics
 from maexp.agents.overrides import make_overrides
-from maexp.agents.paper_results import COLUMNS, PAPER
 from maexp.agents.run_benchmark import prepare
 
 TINY = [

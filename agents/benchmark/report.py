@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.agents.benchmark import SUITES, Cell, as_list
-from maexp.agents.benchmark_cell import CellResult, finished, read_result
-from maexp.agents.benchmark_table import (
+from maexp.agents.benchmark.cell import CellResult, finished, read_result
+from maexp.agents.benchmark.paper_results import paper_value
+from maexp.agents.benchmark.plan import SUITES, Cell, as_list
+from maexp.agents.benchmark.table import (
     Column,
     pool_column,
     print_tables,
@@ -17,7 +18,6 @@ from maexp.agents.benchmark_table import (
     table_latex,
     table_markdown,
 )
-from maexp.agents.paper_results import paper_value
 from maexp.agents.results import PACKAGES, find_commit, write_json, write_text
 from maexp.agents.run_folder import short
 
@@ -154,8 +154,8 @@ class Report:
 
     def _draw_suite(self, suite: str, played: dict[str, list[Column]]) -> list[str]:
         """Those of one set of maps; the training maps have a mark in the file's name."""
-        from maexp.agents.benchmark_compare import compare_all, pairs_csv
-        from maexp.agents.plots_benchmark import draw_coverage_panels, draw_improvement, draw_overview
+        from maexp.agents.benchmark.compare import compare_all, pairs_csv
+        from maexp.agents.benchmark.pictures import draw_coverage_panels, draw_improvement, draw_overview
 
         mark, paths = "" if suite == "held_out" else f"_{suite}", []
         for scenario, columns in played.items():

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.benchmark import Cell, cell_config, cell_folder
+from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.errors import blame_input

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.benchmark import Cell, cell_config, length_of
+from maexp.agents.benchmark.plan import Cell, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner
 from maexp.agents.errors import blame_input
 from maexp.agents.policies import POLICIES

@@ -1,6 +1,6 @@
 """A worker of a benchmark: a process that runs one cell after another, told which through its standard input.
 
-`python -m maexp.agents.benchmark_worker FOLDER`. Answers are JSON lines on what was standard output; everything else
+`python -m maexp.agents.benchmark.worker FOLDER`. Answers are JSON lines on what was standard output; everything else
 that is printed goes to `log.txt` of the cell. It ends with the process that started it, however that ended.
 """
 
@@ -28,7 +28,7 @@ def main(where: Path) -> int:
     import torch
 
     from maexp.agents import progress
-    from maexp.agents.benchmark_cell import EnvShelf
+    from maexp.agents.benchmark.cell import EnvShelf
     from maexp.agents.memory import keep_freed_memory
 
     torch.set_num_threads(1)
@@ -46,8 +46,8 @@ def main(where: Path) -> int:
 
 def work(where: Path, order: dict, shelf) -> tuple[str, str]:
     """(done, stopped or failed, what went wrong) of one cell."""
-    from maexp.agents.benchmark import Cell, cell_folder, compose_settings
-    from maexp.agents.benchmark_cell import run_cell
+    from maexp.agents.benchmark.cell import run_cell
+    from maexp.agents.benchmark.plan import Cell, cell_folder, compose_settings
     from maexp.agents.errors import UserError
 
     warnings.filterwarnings("ignore", category=FutureWarning)  # of libraries, for their authors

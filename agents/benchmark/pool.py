@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from maexp.agents.benchmark import Cell, cell_folder
+from maexp.agents.benchmark.plan import Cell, cell_folder
 
 POLL = 0.5  # seconds between two looks
 GRACE = 120.0  # seconds that a training iteration has to end in after Ctrl-C
@@ -104,7 +104,7 @@ class WorkerPool:
             shown = os.environ.get("CUDA_VISIBLE_DEVICES")
             env["CUDA_VISIBLE_DEVICES"] = shown.split(",")[gpu] if shown else str(gpu)
         process = subprocess.Popen(
-            [sys.executable, "-m", "maexp.agents.benchmark_worker", str(self.where)],
+            [sys.executable, "-m", "maexp.agents.benchmark.worker", str(self.where)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=env,
             start_new_session=True,  # Ctrl-C reaches this process alone, which tells the workers
         )  # fmt: skip

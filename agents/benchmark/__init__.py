@@ -1,0 +1,1 @@
+"""`maexp benchmark`: policies on scenarios over seeds, cell by cell in worker processes, then tables and pictures."""
