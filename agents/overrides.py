@@ -9,7 +9,9 @@ from hydra.errors import HydraException, OverrideParseException
 from maexp.agents.errors import UserError
 from maexp.agents.schema import schema
 
-PATHS = ("scenario.path", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir")
+PATHS = (
+    "scenario.path", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir"
+)  # fmt: skip
 LISTS = {
     "train": ("num_robots",),
     "evaluate": ("num_robots", "policy"),

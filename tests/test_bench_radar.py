@@ -17,7 +17,7 @@ def test_the_dense_filter_gives_the_same_verdicts():
 
 
 def test_the_ratio_to_the_dense_filter_holds():
-    """Both run in turns and count processor time, so a noisy machine hardly matters; a change of more than 2 x fails."""
+    """Both run in turns and count processor time, so noise hardly matters; a change of more than 2 x fails."""
     ratios = []
     for _ in range(ATTEMPTS):
         ratios.append(measure_ratio())
