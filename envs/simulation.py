@@ -9,7 +9,7 @@ from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.state import axis_sizes, grid_memory_per_env, memory_per_env
 from maexp.kernels.step import Settings, Simulation
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PIXELS
 
 KINDS = {
     "ackermann": int(ACKERMANN),
@@ -131,7 +131,8 @@ def check_memory(env) -> None:
     Raises:
         ValueError: says how much is needed and free, and what to lower.
     """
-    pictures = 2 * env.num_robots * 4 * 125 * 125  # one observation and the next
+    # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
+    pictures = 4 * (4 * env.num_robots + 3) * int(PIXELS) ** 2
     per_env = bytes_per_env(env) + pictures
     if env.device.type == "cuda":
         free = torch.cuda.mem_get_info(env.device)[0]

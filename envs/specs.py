@@ -35,7 +35,8 @@ def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
     pixels, regions = int(PIXELS), int(REGIONS)
 
     def picture(*shape):
-        return Bounded(0, 255, shape=(*shape, pixels, pixels), dtype=torch.uint8, device=device)
+        # Unbounded is all of uint8, 0 to 255; `Bounded` would compare its bounds in float64, pixel by pixel.
+        return Unbounded(shape=(*shape, pixels, pixels), dtype=torch.uint8, device=device)
 
     def real(*shape):
         return Unbounded(shape=shape, dtype=torch.float32, device=device)
