@@ -125,7 +125,7 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
         for item in range(items):
             size = world.known[item // ROBOTS].size
             path[item] = world.rng.integers(0, size, PATH_CELLS)
-            used[item] = world.rng.integers(-1, min(total[item], PATH_CELLS)) if total[item] else -1
+            used[item] = min(world.rng.choice([-1, 0, 1, 9, PATH_CELLS - 1]), min(total[item], PATH_CELLS) - 1)
         active, collided, center = world.state()
         clearance = array(np.full((3, ROBOTS), -1.0), wp.float32)
         launch(
