@@ -14,6 +14,7 @@ from maexp.agents.errors import UserError
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
+KINDS = {"overrides": list, "iteration": int, "policy": dict}  # what every reader of a checkpoint relies on
 
 
 def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: bool = False) -> Path:
@@ -38,11 +39,19 @@ def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: 
 def _write_atomically(path: Path, state: dict) -> None:
     """A kill at any moment leaves the old file or the new one: write aside, sync, rename, sync the folder."""
     aside = path.with_suffix(".tmp")
-    with open(aside, "wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
+    try:
+        with open(aside, "wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    except (OSError, RuntimeError) as error:  # torch raises the latter when a write fails
+        aside.unlink(missing_ok=True)
+        reason = getattr(error, "strerror", None) or "the disk is full or the file too large"
+        raise UserError(
+            f"The checkpoint {path} could not be written ({reason}): the ones before are whole; free some space and go "
+            f"on with maexp train resume={path.parent.parent}."
+        ) from error
     handle = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -68,9 +77,17 @@ def load_checkpoint(path: Path) -> dict:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file fails anywhere inside zip and pickle
         raise UserError(f"{path} is not a whole checkpoint: it is damaged or something else.") from error
-    if not isinstance(state, dict) or "overrides" not in state:
+    if not _is_ours(state):
         raise UserError(f"{path} is not a checkpoint of MAexp.")
     return state
+
+
+def _is_ours(state: Any) -> bool:
+    """Whether a file holds the kinds of values that `maexp train` puts there."""
+    if not isinstance(state, dict) or any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
+        return False
+    words, weights = state["overrides"], state["policy"].values()
+    return all(isinstance(word, str) for word in words) and all(torch.is_tensor(weight) for weight in weights)
 
 
 def find_checkpoint(place: str | Path) -> tuple[Path, dict]:

@@ -1,5 +1,6 @@
 """The command `maexp`: a verb, then Hydra overrides."""
 
+import errno
 import importlib
 import os
 import sys
@@ -12,6 +13,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
 
 BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,13 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # `maexp train --help | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        where = f" of {error.filename}" if error.filename else ""
+        told = f"Writing{where} failed ({error.strerror}): free some space; files that were there before are whole."
+        print(f"maexp: {told}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _run(words: list[str]) -> int:

@@ -99,8 +99,12 @@ def find_override(overrides: list[str], name: str) -> str | None:
 
 
 def without(overrides: list[str], *names: str) -> list[str]:
-    """`overrides` less those of the settings or groups called `names`."""
-    parsed = OverridesParser.create().parse_overrides(overrides)
+    """`overrides` less those of the settings or groups called `names`; UserError where they are none (from a file)."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except HydraException as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"The checkpoint holds settings that cannot be read ({reason}): give another one.") from error
     roots = [one.key_or_group.split(".")[0] for one in parsed]
     keys = [one.key_or_group for one in parsed]
     rows = zip(overrides, roots, keys, strict=True)

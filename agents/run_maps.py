@@ -31,6 +31,8 @@ def check(cfg: Any) -> None:
     """Raise UserError for what is missing or out of range, before a folder is made."""
     check_counts(cfg, "num_robots")
     check_counts(cfg, "index", least=0)
+    if cfg.action == "list" and cfg.file:
+        raise UserError(f"maexp maps list lists all scenarios and takes no file: leave {cfg.file} out.")
     if cfg.action != "list" and not cfg.file:
         raise UserError(f"maexp maps {cfg.action} needs a {'scenario' if cfg.action == 'make' else 'file'} after it.")
     if cfg.action == "make" and cfg.file not in SCENARIOS:

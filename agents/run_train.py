@@ -9,12 +9,13 @@ from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError
 from maexp.agents.logs import check_logger
-from maexp.agents.overrides import find_override
+from maexp.agents.overrides import find_override, without
 from maexp.agents.run_evaluate import evaluate_all, report
 from maexp.agents.run_folder import check_writable, short
 from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130
+NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
 
 def prepare(overrides: list[str]) -> list[str]:
@@ -24,7 +25,16 @@ def prepare(overrides: list[str]) -> list[str]:
         return overrides
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
-    return find_checkpoint(place)[1]["overrides"] + overrides
+    return without(_resumable(place)["overrides"], "hydra") + overrides
+
+
+def _resumable(place: str) -> dict:
+    """The state to go on with; UserError where something a run needs is missing."""
+    path, saved = find_checkpoint(place)
+    missing = [name for name in NEEDED if name not in saved]
+    if missing:
+        raise UserError(f"{path} holds no {missing[0]}: no run can go on from it, maexp evaluate may play its policy.")
+    return saved
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
@@ -50,7 +60,7 @@ def check(cfg: Any) -> None:
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
-    saved = find_checkpoint(cfg.resume)[1] if cfg.resume else None
+    saved = _resumable(cfg.resume) if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(cfg, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "

@@ -108,7 +108,7 @@ class ExplorationEnv(EnvBase):
                 "use fewer robots or a larger map"
             )
         scenario = find_scenario(maps[0].scenario)
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        super().__init__(device=_device(device), batch_size=torch.Size([num_envs]))
         self.num_envs, self.num_robots = num_envs, num_robots
         self.scenario = scenario
         self.local_steps = _count("local_steps", scenario.local_steps if local_steps is None else local_steps)
@@ -375,6 +375,20 @@ def check_room(m: PointCloudMap, thresholds: list[float]) -> None:
             f"map {m.name} has room for {room} of num_robots={len(thresholds)} robots with {need:g} m of clearance: "
             "use fewer robots, a smaller robot.collision_threshold or a larger map"
         )
+
+
+def _device(device) -> torch.device:
+    """The device, if there is one of that name."""
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        found = None
+    if found is None or found.type not in ("cpu", "cuda"):
+        raise ValueError(f"device={str(device)!r} is unknown: choose cpu or cuda")
+    count = torch.cuda.device_count()
+    if found.type == "cuda" and (found.index or 0) >= count:
+        raise ValueError(f"device={str(device)!r} is not there: torch sees {count} CUDA devices; choose device=cpu")
+    return found
 
 
 def _count(name: str, value) -> int:

@@ -125,16 +125,32 @@ class PointCloudMap:
         )
 
     def save(self, path: str | os.PathLike) -> Path:
-        """Writes the map as .npz (no pickle); the file appears whole or not at all."""
-        return write_npz(path, self.to_arrays())
+        """Writes the map as .npz (no pickle); the file appears whole or not at all.
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of a map file, to write them beside others."""
+        Raises MapError where it cannot be written: no such folder, a full disk.
+        """
+        path = Path(path)
+        if not path.parent.is_dir():
+            raise MapError(f"{path} lies in no folder: make {path.parent} first")
         arrays = {name: getattr(self, name) for name in _CLOUDS + _PER_POINT}
         arrays = {name: array for name, array in arrays.items() if array is not None}
         texts = {"format": _FORMAT, "name": self.name, "scenario": self.scenario}
         arrays |= {name: np.array(text, dtype=np.str_) for name, text in texts.items()}
-        return arrays | {"resolution": np.float64(self.resolution)}
+        arrays["resolution"] = np.float64(self.resolution)
+        part = None
+        try:
+            handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+            with os.fdopen(handle, "wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
+            os.chmod(part, 0o666 & ~_umask())
+            os.replace(part, path)
+        except BaseException as error:
+            if part is not None:
+                os.unlink(part)
+            if isinstance(error, OSError):
+                raise MapError(f"{path} could not be written ({error.strerror}): choose another place") from error
+            raise
+        return path
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> PointCloudMap:

@@ -13,7 +13,7 @@ from maexp.agents.errors import UserError
 
 
 def state(number: int) -> dict:
-    return {"overrides": ["seed=1"], "iteration": number, "weights": torch.full((5,), float(number))}
+    return {"overrides": ["seed=1"], "iteration": number, "policy": {"weights": torch.full((5,), float(number))}}
 
 
 @pytest.fixture
