@@ -1,0 +1,56 @@
+"""The same seeds and actions on a GPU and on the CPU: the same episodes within float tolerance."""
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs.utils import step_mdp
+from worlds import room
+
+import maexp.kernels as mk
+from maexp.envs import ExplorationEnv, PlannerConfig
+
+gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
+DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
+"""The CPU against itself shows that the comparison itself works where there is no GPU."""
+
+
+def play(device: str, planner: str) -> TensorDictBase:
+    """Six macro steps of five teams of three, with fixed actions, on `device`."""
+    env = ExplorationEnv(
+        [room(30, 22), room(26, 19, "rotated")], num_envs=5, num_robots=3, device=device, seed=3,
+        local_steps=5, planner=PlannerConfig(name=planner),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    state, seen = env.reset(), []
+    for _ in range(6):
+        region = torch.randint(64, (5, 3), generator=generator)
+        offset = torch.rand(5, 3, 2, generator=generator) * 2 - 1
+        state["agents", "action", "region"] = region.to(env.device)
+        state["agents", "action", "offset"] = offset.to(env.device)
+        stepped = env.step(state)
+        seen.append(stepped["next"].select("agents", "team", "info", "done").cpu())
+        state = step_mdp(stepped)
+    return torch.stack(seen)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("planner", ["dwa", "wavefront"])
+def test_episodes_agree(device, planner):
+    here, there = play("cpu", planner), play(device, planner)
+    for key in (("agents", "observation", "pose"), ("agents", "reward"), ("info", "coverage")):
+        torch.testing.assert_close(there[key], here[key], rtol=1e-3, atol=2e-3)
+    assert here["info", "coverage"].max() > 0.2 and torch.equal(there["done"], here["done"])
+    pictures = [one["agents", "observation", "map"].int() for one in (here, there)]
+    assert ((pictures[0] - pictures[1]).abs() > 2).float().mean() < 1e-3
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_radar_agrees(device):
+    world = room(30, 22, "jittered")
+    free, obstacles = (torch.as_tensor(one) for one in (world.free, world.obstacles))
+    for origin in free[:: len(free) // 7]:
+        arguments = dict(radar_range=9.0, obstacle_radius=0.7)
+        here = mk.visible_points(free, obstacles, origin, **arguments)
+        there = mk.visible_points(*(one.to(device) for one in (free, obstacles, origin)), **arguments)
+        assert there.device.type == device and 0 < here.sum() < len(free)
+        assert (there.cpu() != here).sum() <= 1  # a point within 1e-6 of a threshold may fall either way
