@@ -169,6 +169,13 @@ def per_robot(what: str, config, kind: type, count: int) -> list:
     raise ValueError(f"{what}={size}: give one {kind.__name__} or a list of num_robots={count} of them")
 
 
+def one_config(what: str, config, kind: type):
+    """The config given, or one of defaults."""
+    if config is not None and not isinstance(config, kind):
+        raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
+    return config or kind()
+
+
 def _check_choice(name: str, value, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")

@@ -23,6 +23,7 @@ from maexp.envs.config import (
     complete_planner,
     complete_radar,
     complete_robot,
+    one_config,
     per_robot,
 )
 from maexp.envs.map import MapError, PointCloudMap
@@ -122,12 +123,12 @@ class ExplorationEnv(EnvBase):
         self.collision, self.success_coverage = collision, float(success_coverage)
         self.robot_configs = [complete_robot(r, scenario) for r in per_robot("robot", robot, RobotConfig, num_robots)]
         self.radar_configs = [complete_radar(r, scenario) for r in per_robot("radar", radar, RadarConfig, num_robots)]
-        self.planner_config = complete_planner(planner or PlannerConfig(), scenario)
-        self.reward_config = check_reward(reward or RewardConfig())
-        self.observation_config = observation or ObservationConfig()
+        self.planner_config = complete_planner(one_config("planner", planner, PlannerConfig), scenario)
+        self.reward_config = check_reward(one_config("reward", reward, RewardConfig))
+        self.observation_config = one_config("observation", observation, ObservationConfig)
         if self.observation_config.map not in ("seen", "known"):
             raise ValueError(f"observation.map={self.observation_config.map!r} is unknown: choose seen or known")
-        self.comm_config = check_comm(comm or CommConfig())
+        self.comm_config = check_comm(one_config("comm", comm, CommConfig))
         for m in maps:
             check_room(m, [r.collision_threshold for r in self.robot_configs])
         self.bank = build_bank(maps, self.radar_configs)

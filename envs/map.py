@@ -148,7 +148,8 @@ class PointCloudMap:
             if part is not None:
                 os.unlink(part)
             if isinstance(error, OSError):
-                raise MapError(f"{path} could not be written ({error.strerror}): choose another place") from error
+                why = error.strerror or error
+                raise MapError(f"{path} could not be written ({why}): choose another place") from error
             raise
         return path
 

@@ -261,6 +261,7 @@ def test_bad_actions(maps):
         (dict(radar=RadarConfig(range=-1.0)), "radar.range=-1.0"),
         (dict(robot=RobotConfig(kind="tank")), "robot.kind='tank'"),
         (dict(robot=[RobotConfig()] * 2), "num_robots=3"),
+        (dict(planner="dwa"), "planner=.dwa.: give a PlannerConfig"),
         (dict(planner=PlannerConfig(name="teleport")), "planner.name='teleport'"),
         (dict(reward=RewardConfig(success=float("nan"))), "reward.success=nan"),
         (dict(observation=ObservationConfig(map="all")), "observation.map='all'"),
