@@ -129,29 +129,15 @@ class PointCloudMap:
 
         Raises MapError where it cannot be written: no such folder, a full disk.
         """
-        path = Path(path)
-        if not path.parent.is_dir():
-            raise MapError(f"{path} lies in no folder: make {path.parent} first")
+        return write_npz(path, self.to_arrays())
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of a map file, to write them beside others."""
         arrays = {name: getattr(self, name) for name in _CLOUDS + _PER_POINT}
         arrays = {name: array for name, array in arrays.items() if array is not None}
         texts = {"format": _FORMAT, "name": self.name, "scenario": self.scenario}
         arrays |= {name: np.array(text, dtype=np.str_) for name, text in texts.items()}
-        arrays["resolution"] = np.float64(self.resolution)
-        part = None
-        try:
-            handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
-            os.chmod(part, 0o666 & ~_umask())
-            os.replace(part, path)
-        except BaseException as error:
-            if part is not None:
-                os.unlink(part)
-            if isinstance(error, OSError):
-                why = error.strerror or error
-                raise MapError(f"{path} could not be written ({why}): choose another place") from error
-            raise
-        return path
+        return arrays | {"resolution": np.float64(self.resolution)}
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> PointCloudMap:
@@ -194,16 +180,25 @@ def find_boundary(free: np.ndarray, obstacles: np.ndarray, spacing: np.ndarray) 
 
 
 def write_npz(path: str | os.PathLike, arrays: dict[str, np.ndarray]) -> Path:
-    """Writes arrays as .npz (no pickle); the file appears whole or not at all."""
+    """Writes arrays as .npz (no pickle); the file appears whole or not at all.
+
+    Raises MapError where it cannot be written: no such folder, a full disk.
+    """
     path = Path(path)
-    handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    if not path.parent.is_dir():
+        raise MapError(f"{path} lies in no folder: make {path.parent} first")
+    part = None
     try:
+        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         with os.fdopen(handle, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         os.chmod(part, 0o666 & ~_umask())
         os.replace(part, path)
-    except BaseException:
-        os.unlink(part)
+    except BaseException as error:
+        if part is not None:
+            os.unlink(part)
+        if isinstance(error, OSError):
+            raise MapError(f"{path} could not be written ({error.strerror}): choose another place") from error
         raise
     return path
 

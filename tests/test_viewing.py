@@ -193,12 +193,12 @@ def test_view_of_an_episode_writes_a_picture(episode, tmp_path, capsys, monkeypa
         assert not np.array_equal(np.asarray(picture), last)
 
 
-@pytest.mark.parametrize("words", [["maze_small", "index=3"], ["scenario=maze_small", "index=3"], ["map.npz"]])
+@pytest.mark.parametrize("words", [["indoor_small", "index=3"], ["scenario=indoor_small", "index=3"], ["map.npz"]])
 def test_view_of_a_map(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    make_map("maze_small", 3).save("map.npz")
+    make_map("indoor_small", 3).save("map.npz")
     view(capsys, *words, "out=a.png", "size=300")
-    scene = Stage(make_map("maze_small", 3)).empty()
+    scene = Stage(make_map("indoor_small", 3)).empty()
     with Image.open("a.png") as picture:
         assert np.array_equal(np.asarray(picture), show.draw_scene(scene, 300, "painter")[0])
 

@@ -55,6 +55,12 @@ def start_server(viser, port: int):
         return viser.ViserServer(host=HOST, port=port, label="MAexp", verbose=False)
 
 
+def stop_server(server) -> None:
+    """End a server, quietly."""
+    with contextlib.redirect_stdout(None):
+        server.stop()
+
+
 class Actors:
     """The nodes of a scene on a viser server, moved from scene to scene."""
 
@@ -277,8 +283,7 @@ class Page:
 
     def stop(self) -> None:
         """Close the server."""
-        with contextlib.redirect_stdout(None):
-            self.server.stop()
+        stop_server(self.server)
 
 
 def prepare_scene(server, stage: Stage) -> None:
@@ -341,7 +346,7 @@ def write_page(stage: Stage, episode: Episode | None, path: Path, seen_by: int |
         recording.insert_sleep(1.0 if episode is not None else 0.0)
         html = recording.as_html()
     finally:
-        server.stop()
+        stop_server(server)
     with whole_file(path) as part:
         Path(part).write_text(html, encoding="utf-8")
     return path
