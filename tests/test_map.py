@@ -106,7 +106,7 @@ def test_a_failed_save_leaves_the_old_file(small_map, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(np, "savez_compressed", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(MapError, match="x.npz could not be written .disk full"):
         small_map.save(path)
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
