@@ -10,6 +10,7 @@ from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
+from maexp.agents.overrides import split_paths
 from maexp.agents.schema import given
 from maexp.agents.updaters import Updater
 from maexp.envs import (
@@ -66,7 +67,7 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     """
     row = find_scenario(scenario.name)
     if row.build is None:
-        maps = [import_file(scenario)]
+        maps = import_files(scenario)
         return MapSuite(maps, maps)
     if scenario.path is not None:
         raise UserError(
@@ -79,13 +80,17 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     return MapSuite(build, [make_map(scenario.name, index) for index in others])
 
 
-def import_file(scenario: Any) -> PointCloudMap:
-    """The map of scenario=pointcloud."""
+def import_files(scenario: Any) -> list[PointCloudMap]:
+    """The maps of scenario=pointcloud: `scenario.path` names a file, or several with commas between them."""
     from maexp.envs.importing import import_map
 
     if not scenario.path:
         raise UserError("scenario=pointcloud needs a map: add scenario.path=FILE.")
-    return import_map(scenario.path, **given(scenario.importing))
+    maps = [import_map(path, **given(scenario.importing)) for path in split_paths(scenario.path)]
+    names = [one.name for one in maps]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
+    return maps
 
 
 def _indices(name: str, value: Any, default: range) -> list[int]:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
@@ -30,6 +31,12 @@ class EvaluationResult:
     def summary(self) -> dict[str, dict]:
         """{metric: {mean, std, ci95: [lo, hi], n}}."""
         return {name: summarise(values) for name, values in self.episodes.items()}
+
+
+def pool(name: str, parts: list[EvaluationResult]) -> EvaluationResult:
+    """The episodes of several results of one policy as one result."""
+    together = {metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes}
+    return EvaluationResult(name, parts[0].num_robots, together, sum(one.seconds for one in parts))
 
 
 @torch.no_grad()

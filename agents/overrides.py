@@ -67,7 +67,7 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         if multirun and "," in value and not Path(value).exists():
             return f"{name}={value}"
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
-            value = str(Path(value).expanduser().absolute())
+            value = ",".join(str(Path(one).expanduser().absolute()) for one in split_paths(value))
         return f"{name}={quote(value)}"
     if not multirun and name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
@@ -78,6 +78,18 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         except (OverrideParseException, HydraException):
             continue
     raise UserError(f"{name}={value} cannot be read as a setting: write name=value (see maexp {verb} --help).")
+
+
+def split_paths(text: str) -> list[str]:
+    """The files that `text` names: one, or several as a.yaml,b.pcd or [a.yaml,b.pcd].
+
+    A comma separates nothing in the name of a file that is there, nor where what it parts has no ending.
+    """
+    if text.startswith("[") and text.endswith("]"):
+        text = text[1:-1]
+    parts = [one.strip() for one in text.split(",") if one.strip()]
+    single = Path(text).expanduser().exists() or not all(Path(one).suffix for one in parts)
+    return [text] if single else parts
 
 
 def quote(text: str) -> str:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluate import EvaluationResult, evaluate, play
+from maexp.agents.evaluate import EvaluationResult, evaluate, play, pool
 from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.overrides import find_override, without
 from maexp.agents.policies import POLICIES
@@ -73,15 +74,18 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with blame_input():
         maps = load_maps(cfg.scenario, train=False).held_out
-        envs = [make_env(cfg, maps, size, min(cfg.num_envs, cfg.episodes)) for size in team_sizes(cfg.num_robots)]
-        policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0])}
+        places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
+        count = min(cfg.num_envs, cfg.episodes)
+        envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
+        policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0][0])}
     write_config(cfg, where, "evaluate", overrides)
-    results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
+    results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
     report(cfg, results, maps, where / "results.json")
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
     written = ["results.json", "picture.png", "config.yaml"]
     if cfg.render:
-        written += [film.name for env in envs for film in film_all(cfg, env, maps, policies, where)] + [f"{EPISODES}/"]
+        films = [film for team in envs for film in film_all(cfg, team[0], maps, policies, where)]
+        written += [film.name for film in films] + [f"{EPISODES}/"]
     print(f"Written to {short(where)}: {', '.join(written)}")
     if cfg.render:
         print(f"Next: maexp view {short(where)} browser=true")
@@ -111,6 +115,17 @@ def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[Evaluatio
             results.append(
                 evaluate(bound, env, cfg.episodes, name=name, seed=cfg.seed, advance=progress.advance)
             )
+    return results
+
+
+def evaluate_places(cfg: Any, envs: list, policies: dict[str, Any]) -> list[EvaluationResult]:
+    """Each policy on the same episodes in each of several places, and in all of them together."""
+    parts = [evaluate_all(cfg, env, policies) for env in envs]
+    if len(envs) == 1:
+        return parts[0]
+    results = [pool(name, list(those)) for name, those in zip(policies, zip(*parts, strict=True), strict=True)]
+    for env, those in zip(envs, parts, strict=True):
+        results += [replace(one, policy=f"{one.policy} on {env.maps[0].name}") for one in those]
     return results
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.build import import_file, load_maps, make_env
+from maexp.agents.build import import_files, load_maps, make_env
 from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
@@ -152,7 +152,7 @@ def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
     if place is not None:
         return import_map(str(place), **given(cfg.scenario.importing))
     if SCENARIOS[cfg.scenario.name].build is None:
-        return import_file(cfg.scenario)
+        return import_files(cfg.scenario)[0]
     return make_map(cfg.scenario.name, cfg.index)
 
 

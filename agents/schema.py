@@ -80,7 +80,7 @@ class ScenarioSettings:
     """Where the team explores. Null: what the table of scenarios says."""
 
     name: str = MISSING
-    path: str | None = None  # the map of scenario=pointcloud
+    path: str | None = None  # the map of scenario=pointcloud, or several: a.yaml,b.pcd
     maps: Any = None  # indices trained on; null: all but the last fifth of the table's count
     held_out: Any = None  # indices evaluated; null: the last fifth
     local_steps: int | None = None  # control steps in one decision

@@ -1,12 +1,21 @@
 """Evaluation: the same episodes for everyone, every one to its end, and no trace in the random numbers."""
 
+import json
+
 import pytest
 import torch
 
 from maexp.agents import make_policy
+from maexp.agents.build import import_files
+from maexp.agents.cli import main
+from maexp.agents.compose import compose_config
+from maexp.agents.errors import UserError
 from maexp.agents.evaluate import evaluate, play
+from maexp.agents.overrides import make_overrides, split_paths
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, make_map
+
+POINTCLOUD = ("scenario=pointcloud", "policy=random")
 
 
 def build(num_envs=3, num_robots=2, seed=0, macro_steps=3):
@@ -76,3 +85,38 @@ def test_one_policy_for_every_team_size(env):
     policy = make_policy(env)
     for size in (1, 4):
         assert evaluate(policy, build(2, size), 2).num_robots == size
+
+
+def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatch):
+    """Each policy plays the same number of episodes on every map, as it would alone."""
+    for index in (70, 71):
+        make_map("maze_small", index).save(tmp_path / f"floor{index}.npz")
+    monkeypatch.chdir(tmp_path)
+    words = ["evaluate", "policy=random,nearest_frontier", "scenario=pointcloud", "episodes=2", "num_envs=2",
+             "scenario.macro_steps=2", "scenario.local_steps=5", "num_robots=2", "device=cpu"]  # fmt: skip
+    main([*words, "scenario.path=floor70.npz,floor71.npz", "hydra.run.dir=both"])
+    main([*words, f"scenario.path={tmp_path}/floor71.npz", "hydra.run.dir=alone"])
+    both, alone = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("both", "alone"))
+    assert both["run"]["maps"] == ["maze_small_70", "maze_small_71"] and set(alone) == {"random", "nearest_frontier", "run"}
+    for policy in ("random", "nearest_frontier"):
+        first, second = (both[f"{policy} on maze_small_{index}"]["exploration_ratio"] for index in (70, 71))
+        assert second == alone[policy]["exploration_ratio"] and first["n"] == second["n"] == 2
+        together = both[policy]["exploration_ratio"]
+        assert together["n"] == 4 and together["mean"] == pytest.approx((first["mean"] + second["mean"]) / 2)
+
+
+def test_paths_of_several_maps():
+    assert split_paths("a.yaml") == ["a.yaml"]
+    assert split_paths("[a.yaml, b c.pcd]") == split_paths("a.yaml,b c.pcd,") == ["a.yaml", "b c.pcd"]
+
+
+def test_a_comma_in_a_files_name_and_two_maps_of_one_name(tmp_path):
+    (tmp_path / "far").mkdir()
+    for path in ("a,b.npz", "a.npz", "far/a.npz"):
+        make_map("maze_small", 70).save(tmp_path / path)
+    one = compose_config("evaluate", make_overrides("evaluate", [f"scenario.path={tmp_path}/a,b.npz", *POINTCLOUD]))
+    assert [m.name for m in import_files(one.scenario)] == ["maze_small_70"]
+    words = [f"scenario.path={tmp_path}/a.npz,{tmp_path}/far/a.npz", *POINTCLOUD]
+    two = compose_config("evaluate", make_overrides("evaluate", words))
+    with pytest.raises(UserError, match="two maps called"):
+        import_files(two.scenario)
