@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from multiprocessing import reduction
+from multiprocessing import active_children, reduction
 from pathlib import Path
 
 import pytest
@@ -182,8 +182,9 @@ def test_two_workers_gather_what_their_teams_see_and_a_killed_one_is_named(make_
     with pytest.raises(WorkerLost, match=rf"collector worker 2 of 2 \(process {victim}\) was killed by SIGKILL"):
         experience.update_policy_weights_()
     experience.shutdown()
-    assert time.monotonic() - begin < 30
-    assert not any(Path(f"/proc/{pid}").exists() for pid in experience.groups[0].pids)
+    while active_children():
+        assert time.monotonic() - begin < 30, "a worker lives on"
+        time.sleep(0.1)
 
 
 @pytest.mark.slow
