@@ -198,7 +198,7 @@ def write_npz(path: str | os.PathLike, arrays: dict[str, np.ndarray]) -> Path:
         if part is not None:
             os.unlink(part)
         if isinstance(error, OSError):
-            raise MapError(f"{path} could not be written ({error.strerror}): choose another place") from error
+            raise MapError(f"{path} could not be written ({error.strerror or error}): choose another place") from error
         raise
     return path
 
