@@ -1,14 +1,18 @@
 """The recorded episodes of tests/golden, played again.
 
 On one machine the bits are the same; other processors and compilers round differently, so positions may differ by 5 mm,
-coverage by half a percent, a reward term by 0.02. Poses diverge over time, hence the few steps.
+coverage by half a percent, what exploring and overlap earn by 0.02, the other terms by 0.001. Poses diverge over time,
+hence the few steps.
 """
 
 import numpy as np
 import pytest
 from golden.record import CASES, FOLDER, play
 
-TOLERANCE = {"pose": 5e-3, "path_length": 5e-3, "coverage": 5e-3, "terms": 2e-2, "pictures": 0.3, "team": 0.3}
+TOLERANCE = {
+    "pose": 5e-3, "path_length": 5e-3, "coverage": 5e-3, "terms": [2e-2, 2e-2, 1e-3, 1e-3, 1e-3],
+    "pictures": 0.3, "team": 0.3,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -18,9 +22,8 @@ def test_an_episode_is_as_it_was(case):
     now, advice = play(case), "if that is meant, run python -m tests.golden.record and say why in the commit"
     assert golden.keys() == now.keys()
     for name, values in golden.items():
-        np.testing.assert_allclose(
-            now[name], values, rtol=1e-3, atol=TOLERANCE[name], err_msg=f"{case}: {name} changed; {advice}"
-        )
+        off = np.abs(now[name] - values) > TOLERANCE[name] + 1e-3 * np.abs(values)
+        assert not off.any(), f"{case}: {name} changed in {off.sum()} of {off.size} values; {advice}"
 
 
 def test_the_records_are_small_and_none_is_left_over():
