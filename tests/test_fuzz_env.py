@@ -227,3 +227,15 @@ def test_invariants(case):
     for one, other in zip(first, play(few, case, STEPS), strict=True):
         assert one[: few.num_envs] == other, "the bits depend on the run, the number of envs or of threads"
     assert_nan_is_refused(env)
+
+
+def test_the_scan_at_reset_earns_nothing_even_where_it_sees_all():
+    """Design 4.5: it counts in coverage; such an episode ends as a success after one local step, unpaid."""
+    place = room(9, 7)
+    open_place = type(place)(place.free, place.obstacles[:0], 1.0, name="open", scenario="maze_small")
+    env = ExplorationEnv(open_place, num_envs=2, num_robots=1, radar=RadarConfig(range=50.0), local_steps=5)
+    after = env.step(env.reset().update(random_action(env, 0, 0)))["next"]
+    assert after["terminated"].all() and (after["info", "coverage"] == 1).all()
+    assert (after["info", "local_steps"] == 1).all() and (after["info", "coverage_step_95"] == 1).all()
+    for term in ("explore", "success"):
+        assert not after["info", f"reward_{term}"].any()
