@@ -96,15 +96,15 @@ def test_training_is_split_into_its_parts_for_every_network(capsys):
 
 
 def test_scale_goes_along_its_axes(capsys):
-    words = [*TINY, "scenario.macro_steps=2", "num_robots=1", "largest=4"]
+    words = [*TINY, "scenario.macro_steps=2", "num_robots=1", "largest=8"]
     assert main(["bench", "scale", *words, "axes=envs,robots", "hydra.run.dir=out"]) == 0
     axes = report("out", "bench_scale.json")["axes"]
-    assert [row["num_envs"] for row in axes["envs"]["rows"]] == [1, 4]
-    assert [row["num_robots"] for row in axes["robots"]["rows"]] == [2, 4]
+    assert [row["num_envs"] for row in axes["envs"]["rows"]] == [1, 8]
+    assert [row["num_robots"] for row in axes["robots"]["rows"]] == [2, 4, 8]
     assert all(row["num_envs"] == 2 for row in axes["robots"]["rows"])  # what was set stays
     small, large = axes["envs"]["rows"]
     costs = [one["seconds_per_local_step"] for one in (small, large)]
-    assert axes["envs"]["worst_over_linear"] == pytest.approx(costs[1] / costs[0] / 4)
+    assert axes["envs"]["worst_over_linear"] == pytest.approx(costs[1] / costs[0] / 8)
     assert 0 < costs[0] * small["robot_local_steps_per_second"] < 4  # the rate counts waits, the cost does not
     assert Path("out/scale_envs.png").stat().st_size > 5000 and "linear" in capsys.readouterr().out
 
