@@ -20,11 +20,12 @@ from rich.table import Table
 from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.compose import compose_config
 from maexp.agents.overrides import split_sweeps, without
-from maexp.agents.results import PACKAGES, WIDTH, find_commit
+from maexp.agents.results import PACKAGES, find_commit
 
 OWN = ("action", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""
 LEAST_LAPS = 5
+WIDTH = 116  # columns of the widest table; a narrower terminal wraps lines, which is still readable
 
 
 def sweep_points(cfg: Any, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[Any]:

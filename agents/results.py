@@ -13,11 +13,11 @@ from omegaconf import OmegaConf
 from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from maexp.agents.evaluate import EvaluationResult
 
-WIDTH = 116  # columns the table needs; a narrower terminal wraps lines, which is still readable
 PACKAGES = ("maexp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
 COLUMNS = {
     "exploration_ratio": "coverage",
@@ -112,7 +112,8 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
         summary = result.summary()
         total = summary["exploration_ratio"]["n"]
         table.add_row(name, *(_cell(metric, summary[metric], total) for metric in COLUMNS))
-    Console(width=max(WIDTH, Console().width)).print(table)
+    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
+    Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
 
 
 def _cell(metric: str, value: dict, total: int) -> str:
