@@ -59,33 +59,54 @@ def gather_obstacles(
 
 
 @wp.func
+def gather_mates(
+    robots: Robots,
+    e: int,
+    i: int,
+    reach: float,
+    in_range: float,
+    center: wp.array2d(dtype=wp.vec3),
+    mates: wp.array3d(dtype=wp.int32),
+) -> int:
+    """List the robots in radar range whose bodies come within ``reach`` of a robot's centre; returns how many."""
+    count = int(0)
+    here = point_xy(center[e, i])
+    for other in range(center.shape[1]):
+        if other != i:
+            gap = wp.length(point_xy(center[e, other]) - here)
+            if gap <= in_range and gap <= reach + robots.length[e, other] + robots.width[e, other]:
+                mates[e, i, count] = other
+                count += 1
+    return count
+
+
+@wp.func
 def body_distance(
     robots: Robots,
+    count: int,
     e: int,
     i: int,
     at: wp.vec2,
     theta: float,
     footprint: int,
-    reach: float,
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    mates: wp.array3d(dtype=wp.int32),
 ) -> float:
-    """Distance from a predicted body of robot i to the nearest other body within ``reach`` of its centre now."""
+    """Distance from a predicted body of robot i to the nearest of the listed bodies, where they are now."""
     nearest = float(1.0e30)
-    here = point_xy(center[e, i])
-    for other in range(pose.shape[1]):
-        if other != i:
-            there = point_xy(center[e, other])
-            if wp.length(there - here) <= reach:
-                length = robots.length[e, other]
-                width = robots.width[e, other]
-                if footprint != 0:
-                    gap = rectangles_gap(
-                        at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
-                    )
-                else:
-                    gap = rectangle_distance(at, there, pose[e, other][3], length, width)
-                nearest = wp.min(nearest, gap)
+    for k in range(count):
+        other = mates[e, i, k]
+        there = point_xy(center[e, other])
+        length = robots.length[e, other]
+        width = robots.width[e, other]
+        if footprint != 0:
+            gap = rectangles_gap(
+                at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
+            )
+        else:
+            gap = rectangle_distance(at, there, pose[e, other][3], length, width)
+        nearest = wp.min(nearest, gap)
     return nearest
 
 
@@ -137,6 +158,7 @@ def _plan_dwa(
     known_boundary: wp.array3d(dtype=wp.int32),
     # Scratch:
     nearby: wp.array3d(dtype=wp.vec2),
+    mates: wp.array3d(dtype=wp.int32),
     # Out:
     control: wp.array2d(dtype=wp.vec2),
     error: wp.array(dtype=wp.int32),
@@ -170,6 +192,8 @@ def _plan_dwa(
     if count > nearby.shape[2]:
         wp.atomic_or(error, e, 4)
         count = nearby.shape[2]
+    # A body farther away than this cannot come nearer than the clearance, below which alone it counts.
+    mate_count = gather_mates(robots, e, i, reach, in_range, center, mates)
     reach_turn = turn
     if kind == OMNIDIRECTIONAL:
         reach_turn = accel
@@ -208,7 +232,7 @@ def _plan_dwa(
                 s = wp.sin(theta)
             p = wp.vec2(x + offset * c, y + offset * s)
             d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
-            d = wp.min(d, body_distance(robots, e, i, p, theta, footprint, in_range, pose, center))
+            d = wp.min(d, body_distance(robots, mate_count, e, i, p, theta, footprint, pose, center, mates))
             score = -wp.length(target[e, i] - p)
             if d < clearance:
                 score += weight * wp.log(wp.max(d, NEAREST) / clearance)

@@ -67,6 +67,7 @@ SCRATCH = {
     "limit": ("E N K 2", torch.float32, wp.vec2),
     "occluder_count": ("E N", torch.int32, wp.int32),
     "nearby": ("E N O 2", torch.float32, wp.vec2),
+    "mates": ("E N N", torch.int32, wp.int32),
     "command": ("E N 2", torch.float32, wp.vec2),
     "region": ("E N", torch.int64, wp.int64),
     "offset": ("E N 2", torch.float32, wp.vec2),

@@ -87,7 +87,7 @@ class Shard:
             planner._plan_dwa, self.shape,
             [maps, s.map_id, robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
              int(cfg.footprint), int(cfg.comm_limited), cfg.dt,
-             s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby],
+             s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby, s.mates],
             [s.control, s.error],
         )  # fmt: skip
 

@@ -122,8 +122,6 @@ def add_outline(
     forward = wp.vec2(wp.cos(pose[3]), wp.sin(pose[3]))
     left = wp.vec2(-forward[1], forward[0])
     center = wp.vec2(pose[0], pose[1]) + offset * forward
-    if wp.length(center - wp.vec2(origin[0], origin[1])) > radius + length + width:
-        return count
     along = wp.max(2, int(wp.ceil(length / spacing)))
     across = wp.max(2, int(wp.ceil(width / spacing)))
     rho = wp.min(radius_max, wp.max(length / float(along), width / float(across)) * 0.70710678)
@@ -218,9 +216,11 @@ def _collect_occluders(
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     for other in range(pose.shape[1]):
-        if other != i:
+        length = robots.length[e, other]
+        width = robots.width[e, other]
+        if other != i and wp.length(center[e, other] - origin) <= radius + length + width:
             count = add_outline(
-                pose[e, other], robots.length[e, other], robots.width[e, other], robots.center_offset[e, other],
+                pose[e, other], length, width, robots.center_offset[e, other],
                 maps.resolution[m], maps.outline_radius_max[m], origin, radius, cos_beam,
                 e, i, count, bins, direction, limit,
             )  # fmt: skip
