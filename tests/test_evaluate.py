@@ -97,7 +97,8 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
     main([*words, "scenario.path=floor70.npz,floor71.npz", "hydra.run.dir=both"])
     main([*words, f"scenario.path={tmp_path}/floor71.npz", "hydra.run.dir=alone"])
     both, alone = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("both", "alone"))
-    assert both["run"]["maps"] == ["maze_small_70", "maze_small_71"] and set(alone) == {"random", "nearest_frontier", "run"}
+    assert both["run"]["maps"] == ["maze_small_70", "maze_small_71"]
+    assert set(alone) == {"random", "nearest_frontier", "run"}
     for policy in ("random", "nearest_frontier"):
         first, second = (both[f"{policy} on maze_small_{index}"]["exploration_ratio"] for index in (70, 71))
         assert second == alone[policy]["exploration_ratio"] and first["n"] == second["n"] == 2
