@@ -102,7 +102,7 @@ def finish(done: TrainingRun) -> None:
     draw_rollout(cfg, done, where / "rollout.gif")
     written.append("rollout.gif")
     print(f"Written to {short(where)}: {', '.join(written)}")
-    print(f"Next: maexp view {short(where)}, or maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8")
+    print(f"Next: maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8, or maexp view {short(where)}")
 
 
 def draw_curves(where: Path) -> None:
