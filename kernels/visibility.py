@@ -216,14 +216,15 @@ def _collect_occluders(
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     for other in range(pose.shape[1]):
-        length = robots.length[e, other]
-        width = robots.width[e, other]
-        if other != i and wp.length(center[e, other] - origin) <= radius + length + width:
-            count = add_outline(
-                pose[e, other], length, width, robots.center_offset[e, other],
-                maps.resolution[m], maps.outline_radius_max[m], origin, radius, cos_beam,
-                e, i, count, bins, direction, limit,
-            )  # fmt: skip
+        if other != i:
+            length = robots.length[e, other]
+            width = robots.width[e, other]
+            if wp.length(center[e, other] - origin) <= radius + length + width:
+                count = add_outline(
+                    pose[e, other], length, width, robots.center_offset[e, other],
+                    maps.resolution[m], maps.outline_radius_max[m], origin, radius, cos_beam,
+                    e, i, count, bins, direction, limit,
+                )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
