@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib
 import logging
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
 
 from maexp.envs.map import MAX_POINTS, MapError
 
-from .cloud_files import Cloud
+from .cloud_files import Cloud, check_rest
 
 GEO_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # EPSG codes of linear units, in metres
 PROJECTED_UNIT_KEY = 3076  # ProjLinearUnitsGeoKey
@@ -23,9 +24,7 @@ def read_las(path: Path) -> Cloud:
     """Points of a .las or .laz file without those classed as noise; units from its geo keys or WKT."""
     laspy = _need("laspy", "las", path)
     logging.getLogger("laspy").setLevel(logging.CRITICAL)
-    with path.open("rb") as file:
-        if file.read(4) != b"LASF":
-            raise MapError(f"{path} is no LAS file (it does not begin with LASF); it is damaged or of another kind")
+    _check_las(path)
     try:
         with laspy.open(path) as file:
             promised = file.header.point_count
@@ -33,6 +32,10 @@ def read_las(path: Path) -> Cloud:
                 raise MapError(f"{path} promises {promised} points; thin it to {MAX_POINTS}")
             if path.suffix.lower() == ".las" and promised * file.header.point_format.size > path.stat().st_size:
                 raise MapError(f"{path} is truncated: it promises {promised} points in {path.stat().st_size} bytes")
+            plain = path.suffix.lower() == ".las" and not file.header.number_of_evlrs
+            if plain and not file.header.global_encoding.waveform_data_packets_internal:
+                stride = file.header.point_format.size
+                check_rest(path, file.header.offset_to_point_data + promised * stride, stride)
             data = file.read()
         points = np.stack([np.asarray(data.x), np.asarray(data.y), np.asarray(data.z)], axis=1).astype(np.float64)
         noise = np.isin(np.asarray(data.classification), NOISE)
@@ -46,6 +49,19 @@ def read_las(path: Path) -> Cloud:
     if len(points) != promised or promised == 0:
         raise MapError(f"{path} promises {promised} points, {len(points)} could be read; save it again")
     return Cloud(points[~noise], metres_per_unit=unit, up="z", outdoor=True)
+
+
+def _check_las(path: Path) -> None:
+    """The records a LAS header promises must fit in the file: laspy would read all of them, however many."""
+    with path.open("rb") as file:
+        head = file.read(375)
+    if not head.startswith(b"LASF") or len(head) < 227:
+        raise MapError(f"{path} is no LAS file (it does not begin with LASF); it is damaged or of another kind")
+    size = path.stat().st_size
+    header, points, records = struct.unpack_from("<HII", head, 94)
+    late = struct.unpack_from("<QI", head, 235) if head[25] >= 4 and len(head) >= 247 else (0, 0)
+    if header + 54 * records > points or points > size or late[0] + 60 * late[1] > size:
+        raise MapError(f"{path} is damaged: its header promises more records than the file holds; save it again")
 
 
 def _las_unit(header) -> float | None:

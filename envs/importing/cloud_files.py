@@ -66,7 +66,7 @@ def read_pcd(path: Path) -> Cloud:
         starts = np.cumsum([0, *counts])
         return Cloud(_read_rows(path, start, promised, [int(starts[fields.index(axis)]) for axis in "xyz"]))
     if kind == "binary":
-        _check_rest(path, start + promised * stride, stride)
+        check_rest(path, start + promised * stride, stride)
     return Cloud(_read_with_open3d(path, promised))
 
 
@@ -110,7 +110,7 @@ def read_ply(path: Path) -> Cloud | None:
         return Cloud(_read_rows(path, start, promised, [names.index(axis) for axis in "xyz"]))
     if alone:
         stride = sum(size for _, size in properties)
-        _check_rest(path, start + promised * stride, stride)
+        check_rest(path, start + promised * stride, stride)
     return Cloud(_read_with_open3d(path, promised))
 
 
@@ -137,7 +137,7 @@ def _read_rows(path: Path, start: int, promised: int, columns: list[int]) -> np.
     return points
 
 
-def _check_rest(path: Path, end: int, stride: int) -> None:
+def check_rest(path: Path, end: int, stride: int) -> None:
     """After the points that the header promises there must be no further ones; zeros and a few bytes are padding."""
     with path.open("rb") as file:
         file.seek(end)

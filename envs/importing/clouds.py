@@ -24,6 +24,7 @@ CLOUDS = (".pcd", ".ply", ".xyz", ".las", ".laz", ".bt", *MESHES)
 LEAST_POINTS = 20
 FLAT = 1e-3  # a cloud this thin for its width is a floor plan already
 OUTDOOR_SIZE, OUTDOOR_DENSITY = 100.0, 10.0  # larger [m] and sparser [points / m^2] than this was scanned from the air
+INDOOR_DENSITY = 200.0  # [points / m^2]; a .las denser than this was scanned on the ground
 FLOOR_SHARE = 0.7  # of what the walls enclose; where less of the floor was scanned, the rest is inferred
 
 
@@ -66,7 +67,10 @@ def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportR
     if not good.all():
         bad = int((~good).sum())
         if not options.drop_invalid:
-            raise MapError(f"{path} has {bad} points that are NaN or infinite; remove them, or set drop_invalid=true")
+            raise MapError(
+                f"{path} has {bad} points that are NaN or infinite; remove them, or set drop_invalid=true "
+                "(on the command line importing.drop_invalid=true)"
+            )
         points = points[good]
         report.add("invalid", "NaN and infinite points dropped", len(good), len(points))
     alike = _repeats(points)
@@ -112,6 +116,8 @@ def _is_outdoor(points: np.ndarray, cloud: Cloud, options: ImportOptions) -> boo
     if options.place != "auto":
         return options.place == "outdoor"
     size = np.ptp(points[:, :2], axis=0)
+    if cloud.outdoor and len(points) > INDOOR_DENSITY * size.prod():
+        return False
     return cloud.outdoor or (size.max() > OUTDOOR_SIZE and len(points) < OUTDOOR_DENSITY * size.prod())
 
 

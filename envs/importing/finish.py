@@ -11,6 +11,7 @@ from maexp.envs.checker import START_CLEARANCE
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.reach import count_room
 from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.scenarios.lattice import wall_points
 
 from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, seal, thin_walls
 from .options import ImportOptions
@@ -21,6 +22,7 @@ STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of th
 KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
 CLEANED_CELLS = 6_000_000  # cleaning takes some 200 bytes a cell
 POINTS_IN_RANGE = 2.0  # a radar must reach this many points far
+GAP = 2.0  # points farther apart than this many collision thresholds let a robot through
 
 
 def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOptions, report: ImportReport):
@@ -174,7 +176,13 @@ def _to_map(grid: Grid, scenario: Scenario, name: str, options: ImportOptions, r
     report.add("walls", f"kept {options.wall_depth} cells of wall behind the boundary", before, grid.count(OBSTACLE))
     masks = {"free": grid.labels == FREE, "obstacle": grid.labels == OBSTACLE}
     points = {kind: grid.centres(mask) for kind, mask in masks.items()}
+    between, first = wall_points(*masks.values(), grid.cell, GAP * scenario.collision_threshold)
+    points["obstacle"] = np.concatenate([points["obstacle"], grid.to_world(between + 0.5)])
+    if len(between):
+        report.add("gaps in walls", "points between those of the walls, or a robot fits through", after=len(between))
     heights = {f"{kind}_height": None if grid.height is None else grid.height[mask] for kind, mask in masks.items()}
+    if grid.height is not None:
+        heights["obstacle_height"] = np.concatenate([heights["obstacle_height"], heights["obstacle_height"][first]])
     low = points["free"].min(axis=0)
     recentre = options.recentre
     if recentre is None:
