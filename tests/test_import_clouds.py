@@ -232,6 +232,17 @@ def test_las_in_feet(tmp_path):
     world, report = import_map_with_report(tmp_path / "x.las")
     assert "0.3048 m a unit (by the file)" in report.table()
     assert 0.9 * 11_760 < world.free_area < 12_100
+    room = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    room.header.scales = [0.001] * 3
+    rng = np.random.default_rng(0)
+    floor = rng.uniform(0, 8, (40_000, 3)) * [1, 1, 0]
+    along = rng.uniform(0, 8, 40_000)
+    walls = np.stack([np.where(rng.random(40_000) < 0.5, 0.0, 8.0), along, rng.uniform(0, 2.5, 40_000)], axis=1)
+    walls = np.where(rng.random((40_000, 1)) < 0.5, walls, walls[:, [1, 0, 2]])
+    room.x, room.y, room.z = np.concatenate([floor, walls]).T
+    room.write(tmp_path / "room.las")
+    inside = import_map(tmp_path / "room.las")  # denser than any scan from the air
+    assert inside.scenario == "pointcloud" and inside.resolution <= 0.25 and 45 < inside.free_area < 64
     raw = (tmp_path / "x.las").read_bytes()
     for broken in (raw[: len(raw) // 2], raw[:100], b"LASF" + bytes(500), b"x" * 1000):
         (tmp_path / "y.las").write_bytes(broken)

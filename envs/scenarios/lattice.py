@@ -28,6 +28,35 @@ def grid_points(mask: np.ndarray, resolution: float) -> np.ndarray:
     return points
 
 
+def wall_points(free: np.ndarray, wall: np.ndarray, spacing: float, gap: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points between neighbouring wall cells that touch free space, so that no robot drives through the wall.
+
+    Args:
+        free, wall: cells, bool (nx, ny).
+        spacing: side of a cell [m].
+        gap: how far apart the points of a wall, those at cell centres included, may lie [m].
+
+    Returns:
+        float64 (n, 2) in cells, none half-way between two, and int64 (n,): the number in `np.argwhere(wall)` of the
+        cell from which each starts.
+    """
+    parts = 1
+    while (1 / parts + 0.02) * np.sqrt(2) * spacing >= gap and parts < 100:
+        parts += 1
+    number = np.cumsum(wall).reshape(wall.shape) - 1
+    edge = wall & ndimage.binary_dilation(free, np.ones((3, 3)))
+    points, first = [np.zeros((0, 2))], [np.zeros(0, int)]
+    for step in ((1, 0), (0, 1), (1, 1), (1, -1)) if parts > 1 else ():
+        here = np.argwhere(edge)
+        there = here + step
+        here = here[((there >= 0) & (there < wall.shape)).all(axis=1)]
+        here = here[edge[tuple((here + step).T)]]
+        for k in range(1, parts):
+            points.append(here + 0.98 * k / parts * np.array(step))
+            first.append(number[tuple(here.T)])
+    return np.concatenate(points), np.concatenate(first)
+
+
 def grid_map(free: np.ndarray, resolution: float, *, name: str, scenario: str, **fields) -> PointCloudMap:
     """Map with a free point for each true cell of `free`, shape (nx, ny), an obstacle point for each other.
 

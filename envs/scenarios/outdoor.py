@@ -11,11 +11,12 @@ from scipy.spatial import cKDTree
 
 from maexp.envs.map import PointCloudMap
 
-from .lattice import grid_points, largest_component, make_generator
+from .lattice import grid_points, largest_component, make_generator, wall_points
 
 SIZE = 288.0  # [m]
 RESOLUTIONS = (1.5, 1.6, 1.8, 2.0)  # [m]; each divides the tile
 DRIVABLE_CLEARANCE = 2.25  # [m]: three collision thresholds, what a start needs
+CAR_WIDTH = 1.5  # [m]: two collision thresholds; points of a wall farther apart let a car through
 WATER = -3.0  # height of a pond or river [m]: obstacles, though below ground
 STEEPEST = 0.3  # slope a car climbs
 
@@ -78,15 +79,17 @@ def build_outdoor(index: int, *, scenario: str) -> PointCloudMap:
     _lay_town(scene, _THEMES[theme])
     ground = _terrain(scene, 14.0 if theme == "country" else 6.0)
     free = _drivable(scene, ground)
-    obstacle_height = ground + np.nan_to_num(scene.height, nan=0.0)
+    obstacle_height = (ground + np.nan_to_num(scene.height, nan=0.0))[~free]
+    between, first = wall_points(free, ~free, scene.resolution, CAR_WIDTH)
+    between = np.c_[between, np.zeros(len(between))] * scene.resolution
     return PointCloudMap(
         grid_points(free, scene.resolution),
-        grid_points(~free, scene.resolution),
+        np.concatenate([grid_points(~free, scene.resolution), between.astype(np.float32)]),
         scene.resolution,
         name=f"{scenario}_{index}",
         scenario=scenario,
         free_height=ground[free].astype(np.float32),
-        obstacle_height=obstacle_height[~free].astype(np.float32),
+        obstacle_height=np.concatenate([obstacle_height, obstacle_height[first]]).astype(np.float32),
     )
 
 
