@@ -10,6 +10,7 @@ import random
 import resource
 import signal
 import time
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -91,48 +92,47 @@ def test_kill_9_while_writing(what):
 # A full disk
 
 
-@pytest.fixture
-def full_disk():
-    """No file may grow beyond some bytes: the write fails in the middle, as on a full disk."""
+@contextmanager
+def full_disk(size: int):
+    """No file may grow beyond some bytes: the write fails in the middle, as on a full disk.
+
+    Only around the write itself: pytest's own log may be longer than that.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
-    def limit(size: int) -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
 
-    yield limit
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
-
-
-def test_a_full_disk_keeps_the_old_checkpoint(tmp_path, full_disk):
+def test_a_full_disk_keeps_the_old_checkpoint(tmp_path):
     save_checkpoint(tmp_path / "checkpoints", state(1), 1, keep=3)
-    full_disk(50_000)
-    with pytest.raises(UserError, match="iteration_000002.pt could not be written .*resume="):
+    with full_disk(50_000), pytest.raises(UserError, match="iteration_000002.pt could not be written .*resume="):
         save_checkpoint(tmp_path / "checkpoints", state(2), 2, keep=3)
     assert find_checkpoint(tmp_path)[1]["iteration"] == 1
     assert not list(tmp_path.rglob("*.tmp"))
 
 
-def test_a_full_disk_keeps_the_old_map(tmp_path, full_disk):
+def test_a_full_disk_keeps_the_old_map(tmp_path):
     path = make_map("maze_small", 0).save(tmp_path / "x.npz")
-    full_disk(1000)
-    with pytest.raises(MapError, match="x.npz could not be written"):
+    with full_disk(1000), pytest.raises(MapError, match="x.npz could not be written"):
         make_map("maze_small", 1).save(path)
     assert PointCloudMap.load(path).name == "maze_small_0" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_full_disk_keeps_the_old_results(tmp_path, full_disk):
+def test_a_full_disk_keeps_the_old_results(tmp_path):
     write_results(tmp_path / "results.json", [Results()], {"seed": 0})
     old = (tmp_path / "results.json").read_text()
-    full_disk(20)
-    with pytest.raises(OSError):
+    with full_disk(20), pytest.raises(OSError):
         write_results(tmp_path / "results.json", [Results()], {"seed": 1})
     assert (tmp_path / "results.json").read_text() == old
 
 
 @pytest.mark.parametrize("place", ["checkpoint", "metrics", "summary"])
-def test_a_full_disk_during_a_run_is_one_sentence(place, full_disk, monkeypatch, capsys):
+def test_a_full_disk_during_a_run_is_one_sentence(place, monkeypatch, capsys):
     """The disk fills up while a run writes its checkpoint, its metrics or its summary."""
     home, name, size = {
         "checkpoint": (torch, "save", 5_000),
@@ -144,11 +144,12 @@ def test_a_full_disk_during_a_run_is_one_sentence(place, full_disk, monkeypatch,
     def fill(*args, **settings):
         calls.append(1)
         if place != "checkpoint" or len(calls) > 1:
-            full_disk(size)
+            filled.enter_context(full_disk(size))
         return old(*args, **settings)
 
     monkeypatch.setattr(home, name, fill)
-    assert main(["train", *RUN, "hydra.run.dir=run", "total_frames=8", "checkpoint_every=1"]) == 2
+    with ExitStack() as filled:
+        assert main(["train", *RUN, "hydra.run.dir=run", "total_frames=8", "checkpoint_every=1"]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert told[-1].startswith("maexp: ") and "Traceback" not in "\n".join(told)
     assert find_checkpoint("run")[1]["iteration"] >= 0
