@@ -31,6 +31,7 @@ MEANT = {  # placeholder -> what stands for it here
     "outputs/DATE/RUN": "outputs/run",
     "RUN_OR_CHECKPOINT": "outputs/run",
     "policy=NAME": "policy=voronoi",
+    "algorithm=NAME": "algorithm=ippo",
     "maexp VERB": "maexp train",
     "RUN": "outputs/run",
     "FILE": "floor.yaml",
