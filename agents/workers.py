@@ -28,6 +28,7 @@ from maexp.agents.memory import keep_freed_memory
 from maexp.envs import PointCloudMap
 
 LOOK_EVERY = 0.2  # seconds between two looks whether the workers are alive
+SHOWS_WITHIN = 5.0  # seconds from a broken connection to the end of the process behind it
 ENDLESS = 2**62
 GRACE = 1.0  # seconds for the workers to end by themselves; they have nothing to save
 
@@ -146,9 +147,18 @@ class WorkerExperience(Experience):
             while not call.over.wait(LOOK_EVERY):
                 self._check_alive()
             if call.error is not None:
-                self._check_alive(call.error)
+                self._blame_lost(call.error)
                 raise call.error
         return [call.result for call in calls]
+
+    def _blame_lost(self, error: BaseException) -> None:
+        """WorkerLost if the error came of a worker's end, which shows a moment after its connection broke."""
+        limit = time.monotonic() + (SHOWS_WITHIN if isinstance(error, OSError | EOFError) else 0.0)
+        while True:
+            self._check_alive(error)
+            if time.monotonic() > limit:
+                return
+            time.sleep(0.05)
 
     def _check_alive(self, error: BaseException | None = None) -> None:
         for group in self.groups:

@@ -314,8 +314,8 @@ def test_a_killed_worker_ends_the_run_by_name_and_a_killed_run_ends_its_workers(
     wait_until(lambda: rows("run") > 2, process)
     victim = min(descendants(process.pid))
     os.kill(victim, signal.SIGKILL)
-    assert process.wait(timeout=60) == 2
-    error = process.stderr.read()
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 2, error
     assert re.search(rf"collector worker \d of 2 \(process {victim}\) was killed by SIGKILL", error), error
     assert "last good checkpoint is kept in" in error and "Traceback" not in error
     done = find_checkpoint("run")[1]["iteration"]
