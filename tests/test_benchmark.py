@@ -193,7 +193,7 @@ def test_bad_input_gets_one_sentence(case, capsys, tmp_path, monkeypatch):
 def test_longer_than_a_day_needs_a_yes(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [word for word in TINY if word != "estimate=false"]
-    assert main(["benchmark", *words, "iterations=null", "total_frames=2000000000", "hydra.run.dir=b"]) == 2
+    assert main(["benchmark", *words, "iterations=null", "total_frames=200000000000", "hydra.run.dir=b"]) == 2
     out, err = capsys.readouterr()
     assert "estimated time: " in out and "years" in err and "confirm=true" in err
     assert not Path("b").exists()

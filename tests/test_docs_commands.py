@@ -77,6 +77,7 @@ def small(line: str) -> list[str]:
         more = ()
     return [*words, *more]
 
+
 ANSWERS = re.findall(r"^\$ (maexp .*)\n(maexp: .*)$", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
 
 
@@ -88,7 +89,9 @@ def folder(tmp_path_factory) -> Path:
         if (place / name).suffix == ".pcd":
             cloud = room(30, 21, spacing=0.2)
             flat = np.concatenate([cloud.free, *(cloud.obstacles + [0, 0, h] for h in np.arange(0.2, 1.4, 0.2))])
-            points = open3d.utility.Vector3dVector(1000 * flat[:, [0, 2, 1]].astype(float))  # mm, y up
+            if any(name in line and "units=mm importing.up=y" in line for line in COMMANDS):
+                flat = 1000 * flat[:, [0, 2, 1]]
+            points = open3d.utility.Vector3dVector(flat.astype(float))
             open3d.io.write_point_cloud(str(place / name), open3d.geometry.PointCloud(points))
         elif (place / name).suffix == ".yaml":
             export_ros_map(room(30, 21, spacing=0.2), place / name)
