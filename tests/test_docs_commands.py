@@ -86,7 +86,7 @@ def folder(tmp_path_factory) -> Path:
     """Where a reader would be: maps of their own under the names that the pages use, and a run."""
     place = tmp_path_factory.mktemp("reader")
     for name in {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply)", line)}:
-        if (place / name).suffix == ".pcd":
+        if (place / name).suffix in (".pcd", ".ply"):
             cloud = room(30, 21, spacing=0.2)
             flat = np.concatenate([cloud.free, *(cloud.obstacles + [0, 0, h] for h in np.arange(0.2, 1.4, 0.2))])
             if any(name in line and "units=mm importing.up=y" in line for line in COMMANDS):
