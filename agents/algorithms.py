@@ -7,7 +7,7 @@ from torchrl.modules import PopArtValueNorm
 from maexp.agents import losses
 from maexp.agents.critics import build_critic
 from maexp.agents.model import ModelConfig
-from maexp.agents.ranges import check_ranges, choice, flag, number, whole
+from maexp.agents.settings.ranges import check_ranges, choice, flag, number, whole
 from maexp.agents.updaters import GradientUpdater, TrustRegionUpdater, Updater
 
 

@@ -10,8 +10,8 @@ from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
-from maexp.agents.overrides import split_paths
-from maexp.agents.schema import given
+from maexp.agents.settings.overrides import split_paths
+from maexp.agents.settings.schema import given
 from maexp.agents.updaters import Updater
 from maexp.envs import (
     CommConfig,

@@ -18,11 +18,10 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb: what it does, examples, the module whose `run(cfg, folder, overrides)` does it, bare arguments."""
+    """A verb: what it does, examples, bare arguments; `run(cfg, folder, overrides)` of commands/VERB.py does it."""
 
     summary: str
     examples: tuple[str, ...]
-    home: str
     positional: tuple[str, ...] = ()
     actions: tuple[str, ...] = ()
 
@@ -32,32 +31,27 @@ VERBS = {
         "trains a team, then evaluates it beside the random policy",
         ("maexp train algorithm=mappo scenario=maze", "maexp train resume=outputs/DATE/RUN",
          "maexp train -m algorithm=ippo,mappo seed=0,1,2"),
-        "run_train",
     ),
     "evaluate": Verb(
         "plays held-out episodes with a trained team or a classical policy",
         ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate checkpoint=RUN render=true render_envs=4",
          "maexp evaluate policy=nearest_frontier scenario=maze"),
-        "run_evaluate",
     ),
     "benchmark": Verb(
         "compares algorithms and classical policies over scenarios and seeds, in one table; resumable",
         ("maexp benchmark preset=smoke", "maexp benchmark scenarios=maze,indoor_small algorithms=mappo policies=random",
          "maexp benchmark resume=outputs/DATE/RUN"),
-        "run_benchmark",
     ),
     "view": Verb(
         "shows a run, a recorded episode or a map in 3D: window, picture or browser",
         ("maexp view RUN", "maexp view RUN browser=true", "maexp view floor.yaml policy=nearest_frontier",
          "maexp view maze index=7"),
-        "run_view",
         ("place",),
     ),
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
          "maexp maps check floor.yaml", "maexp maps show map.npz"),
-        "run_maps",
         ("action", "file"),
         ("list", "make", "import", "check", "show"),
     ),
@@ -65,7 +59,6 @@ VERBS = {
         "measures throughput, as a table and JSON",
         ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",
          "maexp bench train model=small,paper", "maexp bench scale axes=envs,robots"),
-        "run_bench",
         ("action",),
         ("env", "kernels", "train", "scale"),
     ),
@@ -123,23 +116,23 @@ def overview() -> str:
 
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
-    from maexp.agents.overrides import find_override, make_overrides, split_flags, without
-    from maexp.agents.run_folder import claim_folder, remove_if_empty
+    from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
+    from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
 
     verb = VERBS[name]
     flags, rest = split_flags(words)
     _check_flags(name, flags)
     if {"-h", "--help"} & set(flags):
-        from maexp.agents.help import verb_help
+        from maexp.agents.commands.help import verb_help
 
         print(verb_help(name, verb))
         return 0
     multirun = bool({"-m", "--multirun"} & set(flags))
     _check_action(name, verb, rest)
     overrides = make_overrides(name, rest, verb.positional, multirun)
-    home = importlib.import_module(f"maexp.agents.{verb.home}")
+    home = importlib.import_module(f"maexp.agents.commands.{name}")
     if multirun:
-        from maexp.agents.sweep import run_sweep
+        from maexp.agents.commands.sweep import run_sweep
 
         return run_sweep(name, overrides)
     prepared = home.prepare(overrides)
@@ -160,7 +153,7 @@ def run_verb(name: str, words: list[str]) -> int:
 
 
 def _compose(name: str, overrides: list[str]) -> Any:
-    from maexp.agents.compose import compose_config
+    from maexp.agents.settings.compose import compose_config
 
     return compose_config(name, overrides)
 

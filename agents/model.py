@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from maexp.agents.ranges import check_ranges, choice, flag, whole
+from maexp.agents.settings.ranges import check_ranges, choice, flag, whole
 
 
 @dataclass(frozen=True)

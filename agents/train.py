@@ -15,15 +15,15 @@ from omegaconf import OmegaConf
 
 from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
-from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
-from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
 from maexp.agents.logs import MetricsLog
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
 from maexp.agents.results import plain
+from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.compose import compose_config
 
 BACKENDS = ("single", "processes", "ray")
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.agents import bench_kernels
-from maexp.agents.bench import spread, sweep_points
-from maexp.agents.bench_census import count_moment
-from maexp.agents.bench_counts import FORMULAS, kernel_cost
-from maexp.agents.bench_scale import large_maze
+from maexp.agents.bench import kernels
+from maexp.agents.bench.census import count_moment
+from maexp.agents.bench.counts import FORMULAS, kernel_cost
+from maexp.agents.bench.scale import large_maze
+from maexp.agents.bench.shared import spread, sweep_points
 from maexp.agents.cli import main
-from maexp.agents.compose import compose_config
-from maexp.agents.overrides import make_overrides, move_sweeps
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import make_overrides, move_sweeps
 from maexp.envs import ExplorationEnv, make_map
 
 TINY = ["scenario=maze_small", "scenario.maps=[0]", "num_envs=2", "seconds=0.02"]
@@ -23,8 +23,8 @@ TINY = ["scenario=maze_small", "scenario.maps=[0]", "num_envs=2", "seconds=0.02"
 @pytest.fixture(autouse=True)
 def somewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(bench_kernels, "COPY_BYTES", 2**20)
-    monkeypatch.setattr(bench_kernels, "MATRIX", 64)
+    monkeypatch.setattr(kernels, "COPY_BYTES", 2**20)
+    monkeypatch.setattr(kernels, "MATRIX", 64)
 
 
 def report(folder: str, name: str) -> dict:
@@ -123,11 +123,11 @@ def test_the_map_axis_makes_larger_mazes():
 
 
 def test_a_change_is_beyond_the_noise_and_the_spread():
-    key = dict.fromkeys(bench_kernels.KEY, 0)
+    key = dict.fromkeys(kernels.KEY, 0)
 
     def compared(median, low, high):
         row = key | {"in_place_us": {"median": median, "p10": low, "p90": high}}
-        bench_kernels.compare([row], {"by_key": {tuple(key.values()): {"median": 1.0, "p10": 0.9, "p90": 1.1}}})
+        kernels.compare([row], {"by_key": {tuple(key.values()): {"median": 1.0, "p10": 0.9, "p90": 1.1}}})
         return row["changed"]
 
     assert compared(2.0, 1.9, 2.1) and compared(0.5, 0.4, 0.6)
@@ -159,8 +159,8 @@ def test_bad_input_gives_a_sentence(case, capsys):
 @pytest.mark.parametrize("settings", ["planner=dwa", "planner=direct"])
 def test_every_kernel_of_the_plain_step_has_a_formula(settings):
     cfg = compose_config("bench", ["action=kernels", *TINY, "num_robots=2", settings])
-    env = bench_kernels.make_env(cfg, [make_map("maze_small", 0)], 2)
-    steps = bench_kernels.record_steps(env, env.simulation.shards[0])
+    env = kernels.make_env(cfg, [make_map("maze_small", 0)], 2)
+    steps = kernels.record_steps(env, env.simulation.shards[0])
     assert {step.kernel for step in steps} <= set(FORMULAS)
 
 
@@ -204,8 +204,8 @@ def test_counting_and_timing_change_nothing():
     env.rollout(1)
     before = {name: value.clone() for name, value in env.simulation.tensors.items()}
     shard = env.simulation.shards[0]
-    steps = bench_kernels.record_steps(env, shard)
-    run = bench_kernels.Runner(env.device, None)
+    steps = kernels.record_steps(env, shard)
+    run = kernels.Runner(env.device, None)
     run.in_place(steps, 0.01, lambda: count_moment(env, shard, before["active"]))
     run.alone(steps, 0.01)
     scratch = ("mask", "nearby")  # `record_steps` marks all envs; the planner's list is written before it is read

@@ -25,9 +25,9 @@ from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, compose_
 from maexp.agents.benchmark.pool import WorkerPool
 from maexp.agents.benchmark.table import ROWS, best, pool_column, print_tables, table_csv, table_latex, table_markdown
 from maexp.agents.cli import main
+from maexp.agents.commands.benchmark import prepare
 from maexp.agents.logs import read_metrics
-from maexp.agents.overrides import make_overrides
-from maexp.agents.run_benchmark import prepare
+from maexp.agents.settings.overrides import make_overrides
 
 TINY = [
     "preset=smoke", "scenarios=maze_small", "policies=voronoi,random", "algorithms=mappo", "seeds=0,1", "episodes=3",

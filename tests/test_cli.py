@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from maexp.agents.cli import VERBS, main
-from maexp.agents.run_folder import claim_folder
+from maexp.agents.commands.run_folder import claim_folder
 from maexp.envs import make_map
 
 TINY = ["scenario.maps=[0]", "scenario.held_out=[70]", "num_envs=2", "collector.steps=2", "scenario.macro_steps=2"]

@@ -17,10 +17,10 @@ from maexp.agents.build import load_maps
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.cli import main
 from maexp.agents.collect import Teams, WorkerLost, batch_statistics, divide_teams
-from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError
 from maexp.agents.logs import read_metrics
-from maexp.agents.overrides import make_overrides
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.train import make_both
 from maexp.envs import ExplorationEnv, make_map
 
@@ -242,8 +242,8 @@ def test_a_worker_that_cannot_start_is_reported(make_experience, monkeypatch):
 
 PROGRAM = """
 import sys
-import maexp.agents.run_train as run_train
-run_train.draw_rollout = run_train.draw_curves = lambda *args: None
+from maexp.agents.commands import train
+train.draw_rollout = train.draw_curves = lambda *args: None
 from maexp.agents.cli import main
 if __name__ == "__main__":
     sys.exit(main(["train", *sys.argv[1:]]))
@@ -377,8 +377,8 @@ def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeyp
     if not present:
         pytest.skip("LOGGERS ABSENT: pip install -c constraints.txt 'maexp[tensorboard,wandb]' to test them")
     monkeypatch.chdir(tmp_path)
-    for place in ("run_train.draw_rollout", "run_train.draw_curves"):
-        monkeypatch.setattr(f"maexp.agents.{place}", lambda *args: None)
+    for place in ("draw_rollout", "draw_curves"):
+        monkeypatch.setattr(f"maexp.agents.commands.train.{place}", lambda *args: None)
     words = [f"logger.backends=[{','.join(present)}]", "logger.mode=offline"]
     assert main(["train", *TINY, *words, "hydra.run.dir=run", f"total_frames={2 * BATCH}"]) == 0
     assert main(["train", "resume=run", f"total_frames={3 * BATCH}"]) == 0

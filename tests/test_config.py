@@ -4,11 +4,11 @@ import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import load_maps, make_env, make_learner, model_settings, team_configs
-from maexp.agents.compose import compose_config, group_choices, groups
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
-from maexp.agents.overrides import find_override, make_overrides, quote, without
-from maexp.agents.schema import SCHEMAS, schema
+from maexp.agents.settings.compose import compose_config, group_choices, groups
+from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
+from maexp.agents.settings.schema import SCHEMAS, schema
 from maexp.envs.scenarios import SCENARIOS
 
 

@@ -8,11 +8,11 @@ import torch
 from maexp.agents import make_policy
 from maexp.agents.build import import_files
 from maexp.agents.cli import main
-from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError
 from maexp.agents.evaluate import evaluate, play
-from maexp.agents.overrides import make_overrides, split_paths
 from maexp.agents.policies import POLICIES
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map
 
 POINTCLOUD = ("scenario=pointcloud", "policy=random")

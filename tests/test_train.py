@@ -34,8 +34,8 @@ def somewhere(tmp_path, monkeypatch):
 @pytest.fixture(autouse=True)
 def no_film(monkeypatch):
     """Pictures have tests of their own."""
-    monkeypatch.setattr("maexp.agents.run_train.draw_rollout", lambda *args: None)
-    monkeypatch.setattr("maexp.agents.run_train.draw_curves", lambda *args: None)
+    monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", lambda *args: None)
+    monkeypatch.setattr("maexp.agents.commands.train.draw_curves", lambda *args: None)
 
 
 def run(folder: str, iterations: int, *words: str) -> Path:
@@ -187,8 +187,8 @@ def test_too_much_memory_is_refused_before_the_run(capsys):
 PROGRAM = """
 import sys, torch
 torch.set_num_threads(1)
-import maexp.agents.run_train as run_train
-run_train.draw_rollout = run_train.draw_curves = lambda *args: None
+from maexp.agents.commands import train
+train.draw_rollout = train.draw_curves = lambda *args: None
 from maexp.agents.cli import main
 sys.exit(main(sys.argv[1:]))
 """

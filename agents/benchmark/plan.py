@@ -13,11 +13,11 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError
-from maexp.agents.overrides import quote
 from maexp.agents.policies import POLICIES
 from maexp.agents.results import plain, write_json
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import quote
 from maexp.envs.scenarios import SCENARIOS, find_scenario, split
 
 PLAN = "benchmark.json"

@@ -18,8 +18,8 @@ from maexp.agents.benchmark.table import (
     table_latex,
     table_markdown,
 )
+from maexp.agents.commands.run_folder import short
 from maexp.agents.results import PACKAGES, find_commit, write_json, write_text
-from maexp.agents.run_folder import short
 
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
 

@@ -23,11 +23,11 @@ from maexp.agents.benchmark.plan import (
 from maexp.agents.benchmark.pool import Outcome, WorkerPool, last_lines
 from maexp.agents.benchmark.report import SMOKE, Report
 from maexp.agents.build import pick_device
-from maexp.agents.checks import check_counts
+from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.errors import UserError
-from maexp.agents.overrides import find_override, without
 from maexp.agents.progress import Progress, duration
-from maexp.agents.run_folder import check_writable, short
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130

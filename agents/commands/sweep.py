@@ -12,12 +12,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from maexp.agents import run_train
-from maexp.agents.compose import compose_config, explain
+from maexp.agents.commands import train
+from maexp.agents.commands.run_folder import claim_folder
 from maexp.agents.errors import UserError
-from maexp.agents.overrides import find_override, without
-from maexp.agents.run_folder import claim_folder
-from maexp.agents.schema import register_schema
+from maexp.agents.settings.compose import compose_config, explain
+from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.schema import register_schema
 
 
 def run_sweep(verb: str, overrides: list[str]) -> int:
@@ -66,7 +66,7 @@ def _run_job(cfg: Any) -> None:
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
     print(f"Run {settings.job.num}: {' '.join(overrides)}")
-    run_train.check(cfg)
-    status = run_train.run(cfg, Path(settings.runtime.output_dir), overrides)
+    train.check(cfg)
+    status = train.run(cfg, Path(settings.runtime.output_dir), overrides)
     if status:
         raise KeyboardInterrupt

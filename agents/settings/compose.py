@@ -40,7 +40,7 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
     Raises:
         UserError: an override that does not fit.
     """
-    from maexp.agents.schema import register_schema
+    from maexp.agents.settings.schema import register_schema
 
     register_schema(verb)
     GlobalHydra.instance().clear()
@@ -74,7 +74,7 @@ def explain(error: Exception, verb: str) -> str:
 
 def _suggest(name: str, verb: str) -> str:
     """A close name among the verb's settings, or the settings beside it."""
-    from maexp.agents.schema import schema
+    from maexp.agents.settings.schema import schema
 
     names = _flat_names(OmegaConf.structured(schema(verb)))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.7)

@@ -2,12 +2,12 @@
 
 from typing import Any
 
-from maexp.agents.compose import group_choices, groups
+from maexp.agents.settings.compose import group_choices, groups
 
 
 def verb_help(name: str, verb: Any) -> str:
     """The help of a verb; the choices are the files of `conf/` with the comment on their first line."""
-    from maexp.agents.schema import describe, schema
+    from maexp.agents.settings.schema import describe, schema
 
     kind = schema(name)
     lines = [f"maexp {name}: {verb.summary}", ""]

@@ -17,7 +17,10 @@ from typing import Any
 import torch
 import warp as wp
 
-from maexp.agents.bench import (
+from maexp.agents.bench.census import count_moment
+from maexp.agents.bench.counts import kernel_cost
+from maexp.agents.bench.env import advance
+from maexp.agents.bench.shared import (
     LEAST_LAPS,
     describe_point,
     print_table,
@@ -26,9 +29,6 @@ from maexp.agents.bench import (
     time_call,
     write_report,
 )
-from maexp.agents.bench_census import count_moment
-from maexp.agents.bench_counts import kernel_cost
-from maexp.agents.bench_env import advance
 from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
@@ -62,7 +62,7 @@ class Step:
     outputs: list[wp.array]
 
 
-def bench_kernels(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     """Times, bytes and operations of every kernel at every point; ``where/bench_kernels.json`` and tables."""
     points = sweep_points(cfg, overrides, TEAM_SIZES)
     before = load_baseline(cfg.baseline) if cfg.baseline else None

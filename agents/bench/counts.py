@@ -1,7 +1,7 @@
 """Bytes and operations of every kernel, counted from its definition.
 
 A formula gives, per robot of the team and launch, the bytes that must move and the operations that must be done
-for the counts `c` of `bench_census`. Rules:
+for the counts `c` of `census`. Rules:
 
 - bytes: every word that a robot reads or writes counts once a launch, in whatever cache it lies; read-modify-write
   counts twice. float32 and int32 are 4 bytes, a vec3 12.

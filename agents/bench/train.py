@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from maexp.agents.bench import describe_point, print_table, spread, sweep_points, write_report
+from maexp.agents.bench.shared import describe_point, print_table, spread, sweep_points, write_report
 from maexp.agents.build import Learner, load_maps, make_env, make_learner
 from maexp.agents.checkpoint import seed_everything
 from maexp.agents.collect import Stopwatch, make_collector
@@ -72,7 +72,7 @@ class Trainee:
         }
 
 
-def bench_train(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     """Seconds of an iteration by part at every point; ``where/bench_train.json`` and a table.
 
     The points take turns, one iteration each, so that what else the machine does meets all of them alike.

@@ -14,15 +14,15 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from maexp.agents.bench import print_table, write_report
-from maexp.agents.bench_env import measure_batch
+from maexp.agents.bench.env import measure_batch
+from maexp.agents.bench.shared import print_table, write_report
 from maexp.agents.build import load_maps, make_env
-from maexp.agents.checks import check_counts
-from maexp.agents.compose import compose_config
 from maexp.agents.errors import UserError
-from maexp.agents.overrides import without
 from maexp.agents.plots import COLOURS, LOOK
 from maexp.agents.progress import Progress
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import without
 from maexp.envs import PointCloudMap
 from maexp.envs.scenarios.maze import build_maze
 
@@ -65,7 +65,7 @@ AXES = {
 COLUMNS = ["ms / local step", "x smallest", "size x", "robot-local-steps/s", "MB/env", "build [s]", "start [s]"]
 
 
-def bench_scale(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     """Costs along every axis asked for; ``where/bench_scale.json``, a table and a plot for each."""
     chosen = pick_axes(cfg.axes)
     plans = {name: plan_axis(AXES[name], cfg, overrides) for name in chosen}

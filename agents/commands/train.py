@@ -6,12 +6,12 @@ from typing import Any
 
 from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.checks import check_counts, team_sizes
+from maexp.agents.commands.evaluate import evaluate_all, report
+from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.errors import UserError
 from maexp.agents.logs import check_logger
-from maexp.agents.overrides import find_override, without
-from maexp.agents.run_evaluate import evaluate_all, report
-from maexp.agents.run_folder import check_writable, short
+from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.checks import check_counts, team_sizes
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.overrides import move_sweeps
+from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.overrides import move_sweeps
 
 ONE_VALUE = ("action", "seconds", "baseline", "largest", "device", "hydra")
 
@@ -40,7 +40,7 @@ def check(cfg: Any) -> None:
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Measure what `action` names; each has a module of its own."""
-    home = importlib.import_module(f"maexp.agents.bench_{cfg.action}")
+    home = importlib.import_module(f"maexp.agents.bench.{cfg.action}")
     with blame_input():
-        getattr(home, f"bench_{cfg.action}")(cfg, where, overrides)
+        home.run(cfg, where, overrides)
     return 0

@@ -11,16 +11,16 @@ import torch
 from maexp.agents.actor import make_policy
 from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.checks import check_counts, team_sizes
+from maexp.agents.commands.run_folder import short
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import EvaluationResult, evaluate, play, pool
 from maexp.agents.films import EPISODES, check_render, play_teams, write_film
-from maexp.agents.overrides import find_override, without
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, write_results
-from maexp.agents.run_folder import short
-from maexp.agents.schema import schema
+from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.schema import schema
 from maexp.agents.train import check_action, load_matching, write_config
 
 PICTURES = 4

@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from maexp.agents.checks import check_counts, team_sizes
-from maexp.agents.compose import compose_config
-from maexp.agents.overrides import split_sweeps, without
 from maexp.agents.results import PACKAGES, find_commit
+from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import split_sweeps, without
 
 OWN = ("action", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""

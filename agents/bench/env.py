@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from maexp.agents.bench import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
+from maexp.agents.bench.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
@@ -22,7 +22,7 @@ PAPER_SECONDS_PER_STEP = {
 COLUMNS = ["scenario", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"]
 
 
-def bench_env(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     """Robot-local-steps and macro steps per second at every point; ``where/bench_env.json`` and tables.
 
     A robot-local-step holds planner, motion, collision, radar, merging and reward; the observation is drawn once

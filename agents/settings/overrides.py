@@ -7,7 +7,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 
 from maexp.agents.errors import UserError
-from maexp.agents.schema import schema
+from maexp.agents.settings.schema import schema
 
 PATHS = (
     "scenario.path", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir"

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.build import import_files, load_maps, make_env
-from maexp.agents.checks import check_counts
+from maexp.agents.commands.evaluate import bind, load_policy, settings_of_run
+from maexp.agents.commands.run_folder import remove_if_empty, short
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
-from maexp.agents.overrides import find_override, quote, without
 from maexp.agents.policies import POLICIES
-from maexp.agents.run_evaluate import bind, load_policy, settings_of_run
-from maexp.agents.run_folder import remove_if_empty, short
-from maexp.agents.schema import given
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.overrides import find_override, quote, without
+from maexp.agents.settings.schema import given
 from maexp.envs import PointCloudMap, import_map, make_map
 from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.checks import check_counts
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.overrides import find_override
-from maexp.agents.schema import given
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.overrides import find_override
+from maexp.agents.settings.schema import given
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map

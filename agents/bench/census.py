@@ -1,6 +1,6 @@
 """How many points, obstacles and robots the kernels of a local step meet: counted at one moment of a simulation.
 
-The formulas of `bench_counts` turn these counts into bytes and operations. Counting repeats the definitions with
+The formulas of `counts` turn these counts into bytes and operations. Counting repeats the definitions with
 NumPy on a sample of robots, apart from the kernels; it takes seconds, not microseconds.
 """
 
