@@ -30,10 +30,15 @@ from maexp.envs.scenarios import find_scenario
 
 @dataclass
 class MapSuite:
-    """The maps trained on and those held out for the evaluation (the same ones where the user brings the map)."""
+    """The maps trained on and those of the evaluation.
+
+    Attributes:
+        is_held_out: no map is in both; a user's own maps are all in both
+    """
 
     train: list[PointCloudMap]
     held_out: list[PointCloudMap]
+    is_held_out: bool
 
 
 def pick_device(name: str, setting: str = "device") -> torch.device:
@@ -68,7 +73,7 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     row = find_scenario(scenario.name)
     if row.build is None:
         maps = import_files(scenario)
-        return MapSuite(maps, maps)
+        return MapSuite(maps, maps, False)
     if scenario.path is not None:
         raise UserError(
             f"scenario.path={scenario.path} needs scenario=pointcloud; scenario={scenario.name} builds its own maps."
@@ -77,7 +82,7 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     indices = _indices("scenario.maps", scenario.maps, trained_on)
     others = _indices("scenario.held_out", scenario.held_out, held_out)
     build = [make_map(scenario.name, index) for index in indices] if train else []
-    return MapSuite(build, [make_map(scenario.name, index) for index in others])
+    return MapSuite(build, [make_map(scenario.name, index) for index in others], set(indices).isdisjoint(others))
 
 
 def import_files(scenario: Any) -> list[PointCloudMap]:

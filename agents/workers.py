@@ -179,6 +179,8 @@ class WorkerExperience(Experience):
         return {str(k): state for k, state in enumerate(states)} | ({"acting": dict(acting)} if self.lag else {})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        done, self.pending = self.pending, []
+        self._wait(done)  # nobody needs these batches, but a worker must not be asked while it answers
         self._wait([Call(group.load_state_dict, state[str(k)]) for k, group in enumerate(self.groups)])
         self._push(self.policy)
         if self.lag:

@@ -19,10 +19,17 @@ def draw_map(world: PointCloudMap, path: str | os.PathLike, *, size: int = 900) 
     from matplotlib.figure import Figure
 
     raster = map_raster(world, size)
+    figure = Figure(figsize=(raster.width / 100 + 1.2, raster.height / 100 + 1.5), dpi=100, layout="constrained")
+    paint_map(figure.add_subplot(), world, size)
+    FigureCanvasAgg(figure).print_png(str(path))
+    return Path(path)
+
+
+def paint_map(axes, world: PointCloudMap, size: int) -> None:
+    """The map with its title and a scale bar, in axes of matplotlib; `size` as for `draw_map`."""
+    raster = map_raster(world, size)
     left, top = raster.corner
     right, bottom = left + raster.width / raster.scale, top - raster.height / raster.scale
-    figure = Figure(figsize=(raster.width / 100 + 1.2, raster.height / 100 + 1.5), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
     axes.imshow(raster.paint(_color_table(world)), extent=(left, right, bottom, top), interpolation="nearest")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     (xmin, ymin), (xmax, ymax) = world.extent
@@ -33,8 +40,6 @@ def draw_map(world: PointCloudMap, path: str | os.PathLike, *, size: int = 900) 
         fontsize=9,
     )
     _draw_scale(axes, left, right, bottom, top)
-    FigureCanvasAgg(figure).print_png(str(path))
-    return Path(path)
 
 
 def _color_table(world: PointCloudMap) -> np.ndarray:

@@ -193,6 +193,34 @@ def test_view_of_an_episode_writes_a_picture(episode, tmp_path, capsys, monkeypa
         assert not np.array_equal(np.asarray(picture), last)
 
 
+def test_the_picture_shows_the_episode_that_is_asked_for(tmp_path, capsys, monkeypatch):
+    """`episode=1` of a folder is what its own file shows alone; a page begins with it, too."""
+    monkeypatch.chdir(tmp_path)
+    env = ExplorationEnv([make_map("maze_small", 0)], num_envs=3, num_robots=2, macro_steps=2, local_steps=5)
+    Path("e/episodes").mkdir(parents=True)
+    for name in ("voronoi", "random"):
+        for number, one in enumerate(play_teams(env, POLICIES[name](env), name), 9):
+            one.save(f"e/episodes/{name}_{number}.npz")
+
+    def picture(*words) -> np.ndarray:
+        view(capsys, *words, "out=a.png", "size=300")
+        with Image.open("a.png") as drawn:
+            found = np.asarray(drawn)
+        Path("a.png").unlink()
+        return found
+
+    alone = {file.stem: picture(f"e/episodes/{file.name}") for file in Path("e/episodes").iterdir()}
+    assert np.array_equal(picture("e"), alone["random_9"]), "the first by number, not by letters (random_10)"
+    assert np.array_equal(picture("e", "episode=10"), alone["random_10"])
+    assert np.array_equal(picture("e", "episode=11", "policy=voronoi"), alone["voronoi_11"])
+    assert not np.array_equal(alone["random_10"], alone["random_9"])
+    for words, wanted in ((["episode=12"], "give 9 to 11"), (["policy=frontier"], "unknown"),
+                          (["policy=nearest_frontier"], "those of random, voronoi")):  # fmt: skip
+        assert main(["view", "e", *words, "out=b.png"]) == 2 and not Path("b.png").exists()
+        err = capsys.readouterr().err
+        assert wanted in err and err.count("\n") == 1, err
+
+
 @pytest.mark.parametrize("words", [["indoor_small", "index=3"], ["scenario=indoor_small", "index=3"], ["map.npz"]])
 def test_view_of_a_map(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -255,6 +283,14 @@ def test_a_window_opens_where_there_is_a_display(episode, tmp_path, capsys, monk
         (["maze_small", "out=none/a.png"], "lies in no folder"),
         (["maze_small", "out=half.npz.png"], "exists already"),
         (["maze_small", "seen_by=0"], "there is no team"),
+        (["maze_small", "episode=1"], "there is no team"),
+        (["maze_small", "seconds=1"], "there is no team"),
+        (["e.npz", "episode=1"], "episode=1 is not in e.npz: give 0"),
+        (["e.npz", "episode=-1"], "from 0 to 2147483647"),
+        (["maze_small", "policy=random", f"episode={2**31}"], "from 0 to 2147483647"),
+        (["e.npz", "seconds=-5"], "seconds=-5"),
+        (["e.npz", "seconds=nan"], "seconds=nan"),
+        (["e.npz", "seconds=inf"], "seconds=inf"),
         (["e.npz", "seen_by=2"], "0 to 1"),
         (["e.npz", "seen_by=-1"], "0 to 1"),
         (["maze_small", "policy=luck"], "policy=luck"),

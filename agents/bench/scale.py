@@ -20,7 +20,7 @@ from maexp.agents.build import load_maps, make_env
 from maexp.agents.errors import UserError
 from maexp.agents.plots import COLOURS, LOOK
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.checks import check_counts, check_distinct
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
 from maexp.envs import PointCloudMap
@@ -87,12 +87,13 @@ def pick_axes(wanted: Any) -> list[str]:
     """The axes to go along.
 
     Raises:
-        UserError: there is no such axis.
+        UserError: there is no such axis, or one is named twice.
     """
     names = list(AXES) if wanted is None else [wanted] if isinstance(wanted, str) else list(wanted)
     for name in names:
         if name not in AXES:
             raise UserError(f"axes={name} is unknown: choose some of {','.join(AXES)}.")
+    check_distinct("axes", names)
     return names
 
 

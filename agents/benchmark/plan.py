@@ -16,6 +16,7 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.errors import UserError
 from maexp.agents.policies import POLICIES
 from maexp.agents.results import plain, write_json
+from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.envs.scenarios import SCENARIOS, find_scenario, split
@@ -107,13 +108,10 @@ def check_lists(cfg: Any) -> None:
             raise UserError(f"{name}=[] leaves nothing to do: give at least one.")
     if not policy_names(cfg):
         raise UserError("algorithms=[] and policies=[] leave nothing to compare: give at least one of either.")
-    for name in ("seeds", "scenarios"):
-        values = as_list(cfg[name])
-        if len(set(values)) < len(values):
-            raise UserError(f"{name}={values} names one twice: give each once.")
+    for name in ("scenarios", "algorithms", "policies", "maps", "seeds"):
+        check_distinct(name, as_list(cfg[name]))
     for seed in as_list(cfg.seeds):
-        if type(seed) is not int or seed < 0:
-            raise UserError(f"seeds={seed} must be whole numbers, 0 or more, as seeds=0,1,2.")
+        check_seed(seed, "seeds")
     _check_policy_per_map(cfg)
 
 

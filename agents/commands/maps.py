@@ -5,11 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from maexp.agents.commands.maps_folder import find_files
+from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.schema import given
 from maexp.envs.checker import check_map, repair_map
+from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map
 from maexp.envs.scenarios import SCENARIOS, make_map
@@ -39,12 +42,25 @@ def check(cfg: Any) -> None:
         raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(_generated())}.")
     if cfg.out and Path(cfg.out).exists():
         raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
-    if cfg.out and cfg.action != "show" and Path(cfg.out).suffix != ".npz":
+    if cfg.out and cfg.action == "check" and Path(cfg.out).suffix != ".npz":
         raise UserError(f"out={cfg.out} must end in .npz.")
+    if cfg.out and cfg.action in ("make", "import") and Path(cfg.out).suffix not in (".npz", ".yaml"):
+        raise UserError(f"out={cfg.out} must end in .npz, or in .yaml for a map of map_server and nav2.")
     if cfg.out and cfg.action == "show" and Path(cfg.out).suffix != ".png":
         raise UserError(f"out={cfg.out} must end in .png.")
     if cfg.out and not Path(cfg.out).parent.is_dir():
         raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
+    if cfg.action == "import" and Path(cfg.file).is_dir():
+        check_folder(cfg)
+
+
+def check_folder(cfg: Any) -> None:
+    """Raise UserError for settings that are meant for one file."""
+    if cfg.out:
+        raise UserError(f"out={cfg.out} is for one file: hydra.run.dir=FOLDER says where the maps of {cfg.file} go.")
+    if cfg.importing.name:
+        raise UserError(f"importing.name={cfg.importing.name} is for one file: each of {cfg.file} keeps its own name.")
+    find_files(Path(cfg.file))
 
 
 def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
@@ -52,46 +68,61 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
     if cfg.action == "list":
         print_scenarios()
         return 0
+    if cfg.action == "import" and Path(cfg.file).is_dir():
+        return run_folder(Path(cfg.file), where, import_options(cfg))
     with blame_input():
-        world, story = read_map(cfg)
+        world, imported = read_map(cfg)
+        story = "" if imported is None else imported.table()
         report = check_map(world, num_robots=cfg.num_robots)
         if cfg.repair and cfg.action == "check":
             world, steps = repair_map(world)
             story = "\n".join(f"repair: {step}" for step in steps or ["nothing to mend"])
             report = check_map(world, num_robots=cfg.num_robots)
-        print("\n".join(part for part in (story, report.table()) if part))
-        written = write_files(cfg, where, world)
-    (where / "report.txt").write_text(report.table() + "\n")
+        told = "\n".join(part for part in (story, report.table()) if part)
+        print(told)
+        written = write_files(cfg, where, world, imported)
+    (where / "report.txt").write_text(told + "\n")
     print(f"Written: {', '.join(str(one) for one in written)}")
     if report.ok and cfg.action in ("make", "import"):
         print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}")
     return 0 if report.ok else UNUSABLE
 
 
-def write_files(cfg: Any, where: Path, world: PointCloudMap) -> list[Path]:
+def write_files(cfg: Any, where: Path, world: PointCloudMap, imported: ImportReport | None) -> list[Path]:
     """The map (unless it was only looked at) and its picture, in the run's folder or where `out` says."""
-    name = re.sub(r"[^\w .()=+-]", "_", world.name)[:100].lstrip(".") or "map"  # a file may name its map ../../x
+    name = file_name(world)
     out = Path(cfg.out) if cfg.out else where / (f"{name}.png" if cfg.action == "show" else f"{name}.npz")
     written = []
-    if cfg.action in ("make", "import") or cfg.repair:
+    if out.suffix == ".yaml":
+        written += [export_ros_map(world, out), out.with_suffix(".pgm")]
+    elif cfg.action in ("make", "import") or cfg.repair:
         world.save(out)
         written.append(out)
     picture = out if cfg.action == "show" else where / f"{name}.png"
-    written.append(draw_map(world, picture))
+    if cfg.action == "import":
+        written.append(draw_import(world, imported, picture))
+    else:
+        written.append(draw_map(world, picture))
     return written
 
 
-def read_map(cfg: Any) -> tuple[PointCloudMap, str]:
-    """The map of a scenario's name or of a file, and what the import did."""
-    from maexp.envs.importing import import_map_with_report
+def file_name(world: PointCloudMap) -> str:
+    """The map's name as that of a file, for a file may name its map ../../x."""
+    return re.sub(r"[^\w .()=+-]", "_", world.name)[:100].lstrip(".") or "map"
 
+
+def read_map(cfg: Any) -> tuple[PointCloudMap, ImportReport | None]:
+    """The map of a scenario's name or of a file, and what the import did."""
     if cfg.file in SCENARIOS and not Path(cfg.file).exists():
-        return make_map(cfg.file, cfg.index), ""
+        return make_map(cfg.file, cfg.index), None
     if cfg.action in ("check", "show") and cfg.file.endswith(".npz"):
-        return PointCloudMap.load(cfg.file), ""
-    options = {"num_robots": cfg.num_robots} | given(cfg.importing)
-    world, report = import_map_with_report(cfg.file, **options)
-    return world, report.table()
+        return PointCloudMap.load(cfg.file), None
+    return import_map_with_report(cfg.file, **import_options(cfg))
+
+
+def import_options(cfg: Any) -> dict[str, Any]:
+    """The settings of the import that were given, and the team."""
+    return {"num_robots": cfg.num_robots} | given(cfg.importing)
 
 
 def _generated() -> list[str]:

@@ -15,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from maexp.agents.commands import train
 from maexp.agents.commands.run_folder import claim_folder
 from maexp.agents.errors import UserError
+from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.compose import compose_config, explain
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.schema import register_schema
@@ -66,6 +67,7 @@ def _run_job(cfg: Any) -> None:
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
     print(f"Run {settings.job.num}: {' '.join(overrides)}")
+    check_seed(cfg.seed)  # Hydra composed these settings, not compose_config
     train.check(cfg)
     status = train.run(cfg, Path(settings.runtime.output_dir), overrides)
     if status:

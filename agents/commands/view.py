@@ -1,5 +1,6 @@
 """`maexp view`: a run, a recorded episode or a map in three dimensions: a window, a picture, a page in the browser."""
 
+import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,7 @@ from maexp.envs.viewing.scene import Stage
 
 CUT_SHARE = 0.06  # walls of an episode's picture are cut here, a share of the map's longer side: robots stay in sight
 ENDINGS = (".png", ".html")
+MOST_EPISODES = 2**31  # their numbers are 32-bit integers
 
 
 def prepare(overrides: list[str]) -> list[str]:
@@ -51,9 +53,14 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 def check(cfg: Any) -> None:
     """Raise UserError for what cannot be viewed, before a folder is made."""
     check_counts(cfg, "num_envs", "num_robots")
-    check_counts(cfg, "index", "episode", "port", least=0)
+    check_counts(cfg, "index", "port", least=0)
     if cfg.num_envs > MOST_TEAMS:
         raise UserError(f"num_envs={cfg.num_envs} teams cannot be viewed at once: give at most {MOST_TEAMS}.")
+    last = MOST_EPISODES - cfg.num_envs
+    if cfg.episode is not None and not 0 <= cfg.episode <= last:
+        raise UserError(f"episode={cfg.episode} must be a whole number from 0 to {last}.")
+    if cfg.seconds is not None and not 0 <= cfg.seconds < math.inf:
+        raise UserError(f"seconds={cfg.seconds:g} must be a time after the start of the episode, 0 s or more.")
     if cfg.policy is not None and cfg.policy not in POLICIES:
         raise UserError(f"policy={cfg.policy} is unknown: choose one of {', '.join(POLICIES)}.")
     if cfg.policy is not None and cfg.checkpoint is not None:
@@ -96,7 +103,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Find what is to be seen, and show it as asked and as this machine can."""
     with blame_input():
         episodes, world = find_subject(cfg, where)
-        check_seen_by(cfg.seen_by, episodes)
+        check_team(cfg, episodes)
         for episode in episodes:
             print(describe(episode))
         if wants_page(cfg):
@@ -115,16 +122,18 @@ def find_subject(cfg: Any, where: Path) -> tuple[list[Episode], PointCloudMap | 
     """
     place = None if cfg.place is None else Path(cfg.place)
     if place is not None and (files := episode_files(place)):
-        return [Episode.load(file) for file in files], None
+        files = choose_files(files, place, cfg.episode, cfg.policy)
+        return [Episode.load(file) for file in files[:MOST_TEAMS]], None
     if cfg.checkpoint is None and cfg.policy is None:
         return [], find_map(cfg, place)
     maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
     env = make_env(cfg, maps, cfg.num_robots)
     policy, name = (cfg.policy, cfg.policy) if cfg.checkpoint is None else (load_policy(cfg, env), "trained")
-    episodes = play_teams(env, bind(policy, env), name, first=cfg.episode, seed=cfg.seed)
+    first = cfg.episode or 0
+    episodes = play_teams(env, bind(policy, env), name, first=first, seed=cfg.seed)
     (where / EPISODES).mkdir()
-    for k, episode in enumerate(episodes):
-        episode.save(where / EPISODES / f"{name}_{cfg.episode + k}.npz")
+    for number, episode in enumerate(episodes, first):
+        episode.save(where / EPISODES / f"{name}_{number}.npz")
     return episodes, None
 
 
@@ -139,12 +148,38 @@ def episode_files(place: Path) -> list[Path]:
         if not files:
             advice = "give a run of maexp train, or of maexp evaluate with render=true"
             raise UserError(f"{place} holds neither checkpoints nor episodes: {advice}.")
-        return files[:MOST_TEAMS]
+        return files
     try:
         with zipfile.ZipFile(place) as archive:
             return [place] if "episode_format.npy" in archive.namelist() else []
     except (OSError, zipfile.BadZipFile):
         return []  # a map of another format, or nothing readable: the import says what is wrong
+
+
+def choose_files(files: list[Path], place: Path, episode: int | None, policy: str | None) -> list[Path]:
+    """Episode files by number and then policy, from `episode` on, of one `policy` or of all.
+
+    Raises:
+        UserError: there is no such episode, or none of that policy.
+    """
+    named = sorted((*split_name(file), file) for file in files)
+    policies = sorted({name for _, name, _ in named})
+    if policy is not None:
+        named = [one for one in named if one[1].split("_N")[0] == policy]
+        if not named:
+            raise UserError(f"policy={policy} has no episode in {place}: there are those of {', '.join(policies)}.")
+    numbers = sorted({number for number, *_ in named})
+    if episode is not None and episode not in numbers:
+        gaps = numbers[-1] - numbers[0] >= len(numbers)
+        held = ", ".join(map(str, numbers)) if gaps or len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
+        raise UserError(f"episode={episode} is not in {place}: give {held}.")
+    return [file for number, _, file in named if episode is None or number >= episode]
+
+
+def split_name(file: Path) -> tuple[int, str]:
+    """The number and the policy that an episode's file is named after, 0 and all of it where there is no number."""
+    name, _, number = file.stem.rpartition("_")
+    return (int(number), name) if number.isascii() and number.isdigit() else (0, file.stem)
 
 
 def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
@@ -156,12 +191,14 @@ def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
     return make_map(cfg.scenario.name, cfg.index)
 
 
-def check_seen_by(robot: int | None, episodes: list[Episode]) -> None:
-    """Raise UserError for a robot that is not in every team."""
-    fewest = min((one.num_robots for one in episodes), default=None)
-    if robot is not None and (fewest is None or not 0 <= robot < fewest):
-        choice = "there is no team" if fewest is None else f"give one of 0 to {fewest - 1}"
-        raise UserError(f"seen_by={robot} is not here: {choice}.")
+def check_team(cfg: Any, episodes: list[Episode]) -> None:
+    """Raise UserError for what needs a team where there is none, and for a robot that is not in every team."""
+    for name in ("seen_by", "episode", "seconds"):
+        if cfg[name] is not None and not episodes:
+            raise UserError(f"{name}={cfg[name]} is not here: there is no team on a map alone; add policy=NAME.")
+    fewest = min((one.num_robots for one in episodes), default=0)
+    if cfg.seen_by is not None and not 0 <= cfg.seen_by < fewest:
+        raise UserError(f"seen_by={cfg.seen_by} is not here: give one of 0 to {fewest - 1}.")
 
 
 def describe(episode: Episode) -> str:

@@ -1,8 +1,11 @@
 """Checks of settings that their types cannot express."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from maexp.agents.errors import UserError
+
+LAST_SEED = 2**31 - 1  # the kernels' random numbers start from a 32-bit integer
 
 
 def check_counts(node: Any, *names: str, least: int = 1, prefix: str = "") -> None:
@@ -11,6 +14,19 @@ def check_counts(node: Any, *names: str, least: int = 1, prefix: str = "") -> No
         value = node[name]
         if type(value) is not int or value < least:
             raise UserError(f"{prefix}{name}={value} must be a whole number, {least} or more.")
+
+
+def check_seed(value: Any, name: str = "seed") -> None:
+    """Raise UserError unless random numbers can start from it: other numbers would share those of a smaller one."""
+    if type(value) is not int or not 0 <= value <= LAST_SEED:
+        raise UserError(f"{name}={value} must be a whole number from 0 to {LAST_SEED}.")
+
+
+def check_distinct(name: str, values: Sequence) -> None:
+    """Raise UserError where a list names something twice."""
+    twice = next((one for k, one in enumerate(values) if one in values[:k]), None)
+    if twice is not None:
+        raise UserError(f"{name}={','.join(map(str, values))} names {twice} twice: give each once.")
 
 
 def team_sizes(value: Any) -> list[int]:
@@ -26,4 +42,5 @@ def team_sizes(value: Any) -> list[int]:
         sizes = []
     if not sizes or not all(type(one) is int and one >= 1 for one in sizes):
         raise UserError(f"num_robots={value} must be a whole number, 1 or more, or several as num_robots=1,2,6.")
+    check_distinct("num_robots", sizes)
     return sizes

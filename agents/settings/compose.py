@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents.errors import UserError
+from maexp.agents.settings.checks import check_seed
 
 KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
 
@@ -38,7 +39,7 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
     """The composed settings of a verb, with Hydra's own under `hydra`.
 
     Raises:
-        UserError: an override that does not fit.
+        UserError: an override that does not fit, or a seed that is none.
     """
     from maexp.agents.settings.schema import register_schema
 
@@ -52,6 +53,8 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
         raise UserError(explain(error, verb)) from error
     if missing:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
+    if "seed" in cfg:
+        check_seed(cfg.seed)
     return cfg
 
 
@@ -73,13 +76,13 @@ def explain(error: Exception, verb: str) -> str:
 
 
 def _suggest(name: str, verb: str) -> str:
-    """A close name among the verb's settings, or the settings beside it."""
+    """The settings that hold the name as a word, or a close one among the verb's, or the settings beside it."""
     from maexp.agents.settings.schema import schema
 
     names = _flat_names(OmegaConf.structured(schema(verb)))
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
-    if close:
-        return f": did you mean {close[0]}"
+    meant = [one for one in names if name in re.split(r"[._]", one)] or difflib.get_close_matches(name, names, 1, 0.7)
+    if meant:
+        return f": did you mean {' or '.join(meant[:3])}"
     parent = name.rpartition(".")[0]
     beside = [one for one in names if one.rpartition(".")[0] == parent]
     return f": choose one of {', '.join(beside)}" if beside else f" (see maexp {verb} --help)"

@@ -175,7 +175,7 @@ class ViewSettings(LearnerSettings):
     checkpoint: str | None = None  # what `place` becomes where it is a run
     num_robots: int = setting(3, "robots in a team")
     num_envs: int = setting(1, "teams to watch, each in a held-out episode of its own")
-    episode: int = setting(0, "number of the first held-out episode to watch")
+    episode: int | None = setting(None, "number of the first held-out episode to watch; default: the first there is")
     seconds: float | None = setting(None, "moment of the picture [s]; default: the end")
     seen_by: int | None = setting(None, "count as explored only what this robot has seen, from 0")
     browser: bool = setting(False, "replay on a page in the browser, with the extra maexp[view]")

@@ -19,6 +19,7 @@ from .report import ImportReport
 from .sources import GridSource
 
 GRIDS = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".tif", ".tiff")
+POINTS = (".npz", ".npy")
 
 
 def import_map(path: str | os.PathLike, options: ImportOptions | None = None, **overrides) -> PointCloudMap:
@@ -64,7 +65,7 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
         return read_npz_map(path, options, report)
     if suffix == ".npy":
         return read_npy_triple(path, options, report)
-    known = ", ".join((*GRIDS, *CLOUDS, ".npz", ".npy"))
+    known = ", ".join((*GRIDS, *CLOUDS, *POINTS))
     raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported; {known} can")
 
 

@@ -15,7 +15,7 @@ from .cloud_extras import read_las, read_mesh, read_octree
 from .cloud_files import Cloud, read_pcd, read_ply, read_xyz
 from .levelling import find_floor, find_strays, guess_up, thin, turn_up
 from .options import ImportOptions
-from .report import ImportReport
+from .report import ImportReport, ScannedPoints
 from .sources import FloorSource, Source
 from .terrain import TerrainSource
 
@@ -85,6 +85,7 @@ def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportR
     points = points * scale
     if not np.abs(points).max() < 1e9:
         raise MapError(f"{path} has coordinates up to {np.abs(points).max():g} m; check units")
+    report.before = ScannedPoints.some_of(points)
     size = " x ".join(f"{span:.1f}" for span in np.ptp(points, axis=0))
     report.add("read", f"{path.name}: {size} m, {scale:g} m a unit ({why})", len(cloud.points), len(points))
     return points

@@ -15,7 +15,7 @@ from maexp.envs.map import MapError, check_file
 
 from .grid import FREE, MAX_CELLS, OBSTACLE, UNKNOWN, Grid
 from .options import ImportOptions
-from .report import ImportReport
+from .report import ImportReport, ScannedImage
 
 MAX_YAML_BYTES = 64 * 1024
 MAX_ORIGIN = 1e8  # [m]
@@ -50,6 +50,7 @@ def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> 
         else:
             raise MapError(f"{path} is an image without {beside.name} beside it; give its yaml, or pixel_size [m]")
     values, opaque = _read_image(sheet.image)
+    report.before = ScannedImage(values.clip(0, 255).astype(np.uint8), sheet.pixel, sheet.origin[:2])
     labels = _label(values, opaque, sheet, options, report)
     grid = Grid(labels[::-1].T.copy(), sheet.pixel, sheet.origin[:2], sheet.origin[2])
     report.add(
