@@ -1,5 +1,6 @@
 """Films of held-out episodes, and the episodes themselves as files that replay without simulation."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,9 @@ def check_render(cfg: Any) -> None:
         raise UserError(f"render_format={cfg.render_format} is unknown: choose one of {', '.join(WRITERS)}.")
     if type(cfg.render_envs) is not int or not 1 <= cfg.render_envs <= MOST_TEAMS:
         raise UserError(f"render_envs={cfg.render_envs} must be a whole number from 1 to {MOST_TEAMS}.")
+    if cfg.render and cfg.render_envs > cfg.episodes:
+        asked = f"render_envs={cfg.render_envs} is more than is played"
+        warnings.warn(f"{asked} (episodes={cfg.episodes}): {cfg.episodes} will be filmed", stacklevel=2)
     if cfg.render and cfg.render_format == "mp4":
         try:
             import imageio_ffmpeg  # noqa: F401

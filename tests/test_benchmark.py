@@ -167,7 +167,7 @@ BAD = {
     "a preset": (["preset=huge"], "cpu, paper, smoke"),
     "no seeds": (["seeds=[]"], "seeds=[]"),
     "a seed": (["seeds=a"], "seeds=a"),
-    "a seed twice": (["seeds=1,1"], "seeds=[1, 1]"),
+    "a seed twice": (["seeds=1,1"], "seeds=1,1 names 1 twice"),
     "no episodes": (["episodes=0"], "episodes=0"),
     "no workers": (["workers=0"], "workers=0"),
     "no policies": (["policies=[]", "algorithms=[]"], "nothing to compare"),

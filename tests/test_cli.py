@@ -89,6 +89,19 @@ BAD = {
     "a file to check": (["maps", "check", "gone.npz"], "gone.npz"),
     "a folder for a map": (["maps", "make", "maze_small", "out=gone/m.npz"], "make gone first"),
     "a picture's name": (["maps", "show", "maze_small", "out=m.txt"], ".png"),
+    "a seed below 0": (["train", "seed=-1"], "seed=-1 must be a whole number from 0 to 2147483647"),
+    "a seed too large": (["evaluate", "policy=random", "seed=2147483648"], "seed=2147483648"),
+    "a seed to view with": (["view", "maze_small", "policy=random", "seed=-1"], "seed=-1"),
+    "a seed to measure with": (["bench", "env", "seed=-1"], "seed=-1"),
+    "a seed among several": (["bench", "env", "seed=0,-1"], "seed=-1"),
+    "a seed to compare with": (["benchmark", "seeds=0,-1"], "seeds=-1"),
+    "a policy twice": (["evaluate", "policy=random,random"], "policy=random,random names random twice"),
+    "a team twice": (["evaluate", "policy=random", "num_robots=2,2"], "num_robots=2,2 names 2 twice"),
+    "a team twice to train": (["train", "num_robots=2,3,2"], "names 2 twice"),
+    "a policy twice to compare": (["benchmark", "policies=random,random"], "names random twice"),
+    "an axis twice": (["bench", "scale", "axes=envs,envs"], "names envs twice"),
+    "the end of a setting's name": (["bench", "scale", "robots=0"], "did you mean num_robots."),
+    "a setting of two groups": (["train", "steps=3"], "did you mean scenario.local_steps or scenario.macro_steps or"),
     "a word too many": (["maps", "check", "a.npz", "b.npz"], "b.npz"),
 }
 
@@ -171,4 +184,5 @@ def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
     assert coverage["n"] == 3 and coverage["ci95"][0] <= coverage["mean"] <= coverage["ci95"][1]
     assert results["run"]["num_robots"] == [1, 2] and results["run"]["episodes"] == 3
     assert (tmp_path / "e" / "picture.png").is_file()
-    assert "nearest_frontier N=2" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "nearest_frontier N=2" in printed and "maze_small: 3 held-out episodes, for each team size" in printed

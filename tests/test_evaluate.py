@@ -1,15 +1,18 @@
 """Evaluation: the same episodes for everyone, every one to its end, and no trace in the random numbers."""
 
 import json
+import re
 
+import numpy as np
 import pytest
 import torch
 
 from maexp.agents import make_policy
-from maexp.agents.build import import_files
+from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
+from maexp.agents.commands.evaluate import describe_episodes
 from maexp.agents.errors import UserError
-from maexp.agents.evaluate import evaluate, play
+from maexp.agents.evaluate import EvaluationResult, evaluate, play
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
@@ -87,7 +90,7 @@ def test_one_policy_for_every_team_size(env):
         assert evaluate(policy, build(2, size), 2).num_robots == size
 
 
-def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatch):
+def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatch, capsys):
     """Each policy plays the same number of episodes on every map, as it would alone."""
     for index in (70, 71):
         make_map("maze_small", index).save(tmp_path / f"floor{index}.npz")
@@ -95,7 +98,10 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
     words = ["evaluate", "policy=random,nearest_frontier", "scenario=pointcloud", "episodes=2", "num_envs=2",
              "scenario.macro_steps=2", "scenario.local_steps=5", "num_robots=2", "device=cpu"]  # fmt: skip
     main([*words, "scenario.path=floor70.npz,floor71.npz", "hydra.run.dir=both"])
+    told = capsys.readouterr().out
+    assert re.search(r"pointcloud: 2 episodes on each of 2 maps *\n", told) and "held-out" not in told
     main([*words, f"scenario.path={tmp_path}/floor71.npz", "hydra.run.dir=alone"])
+    assert re.search(r"pointcloud: 2 episodes *\n", capsys.readouterr().out)
     both, alone = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("both", "alone"))
     assert both["run"]["maps"] == ["maze_small_70", "maze_small_71"]
     assert set(alone) == {"random", "nearest_frontier", "run"}
@@ -104,6 +110,16 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
         assert second == alone[policy]["exploration_ratio"] and first["n"] == second["n"] == 2
         together = both[policy]["exploration_ratio"]
         assert together["n"] == 4 and together["mean"] == pytest.approx((first["mean"] + second["mean"]) / 2)
+
+
+@pytest.mark.parametrize(("words", "wanted"), [
+    (["episodes=3"], "3 held-out episodes"), (["episodes=1"], "1 held-out episode"),
+    (["episodes=3", "scenario.held_out=[0]"], "3 episodes"),  # a map that teams are trained on
+])  # fmt: skip
+def test_episodes_are_called_held_out_where_they_are(words, wanted):
+    cfg = compose_config("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
+    results = [EvaluationResult("random", 2, {"exploration_ratio": np.zeros(cfg.episodes)}, 1.0)]
+    assert describe_episodes(cfg.episodes, results, load_maps(cfg.scenario, train=False)) == wanted
 
 
 def test_paths_of_several_maps():

@@ -177,6 +177,13 @@ def test_evaluate_renders_a_film_of_each_policy(kind, tmp_path, capsys):
     assert "maexp view" in printed
 
 
+def test_no_team_is_filmed_that_is_not_in_the_results(tmp_path, capsys):
+    words = ["policy=random", "episodes=2", "render=true", "render_envs=3", f"hydra.run.dir={tmp_path / 'e'}"]
+    assert main(["evaluate", *TINY, *words]) == 0
+    assert "render_envs=3 is more than is played (episodes=2): 2 will be filmed" in capsys.readouterr().err
+    assert {one.name for one in (tmp_path / "e" / "episodes").iterdir()} == {"random_0.npz", "random_1.npz"}
+
+
 @pytest.mark.parametrize(
     ("word", "wanted"), [("render_format=avi", "gif, mp4"), ("render_envs=0", "1 to 64"), ("render_envs=65", "1 to 64")]
 )

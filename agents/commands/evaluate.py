@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from maexp.agents.actor import make_policy
-from maexp.agents.build import load_maps, make_env, model_settings
+from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.run_folder import short
 from maexp.agents.errors import UserError, blame_input
@@ -18,7 +18,7 @@ from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, write_results
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.schema import schema
 from maexp.agents.train import check_action, load_matching, write_config
@@ -60,6 +60,7 @@ def check(cfg: Any) -> None:
     for name in policy_names(cfg):
         if name not in POLICIES:
             raise UserError(f"policy={name} is unknown: choose one of {', '.join(POLICIES)}.")
+    check_distinct("policy", policy_names(cfg))
     check_render(cfg)
 
 
@@ -73,14 +74,15 @@ def policy_names(cfg: Any) -> list[str]:
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with blame_input():
-        maps = load_maps(cfg.scenario, train=False).held_out
+        suite = load_maps(cfg.scenario, train=False)
+        maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0][0])}
     write_config(cfg, where, "evaluate", overrides)
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
-    report(cfg, results, maps, where / "results.json")
+    report(cfg, results, suite, where / "results.json")
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
     written = ["results.json", "picture.png", "config.yaml"]
     if cfg.render:
@@ -132,7 +134,7 @@ def evaluate_places(cfg: Any, envs: list, policies: dict[str, Any]) -> list[Eval
 def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Path) -> list[Path]:
     """A film of each policy in the first `render_envs` of the episodes, and the episodes as files."""
     films = []
-    env = make_env(cfg, maps, env.num_robots, cfg.render_envs)
+    env = make_env(cfg, maps, env.num_robots, min(cfg.render_envs, cfg.episodes))
     for name, policy in policies.items():
         name = name if len(team_sizes(cfg.num_robots)) == 1 else f"{name}_N{env.num_robots}"
         print(f"filming {name}", file=sys.stderr, flush=True)
@@ -141,11 +143,19 @@ def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Pa
     return films
 
 
-def report(cfg: Any, results: list[EvaluationResult], maps: list, path: Path, **extra: float) -> None:
+def report(cfg: Any, results: list[EvaluationResult], suite: MapSuite, path: Path, **extra: float) -> None:
     """The table on the terminal and the JSON beside it."""
     seconds = sum(one.seconds for one in results)
-    write_results(path, results, describe_run(cfg, maps, seconds) | extra)
-    print_results(results, f"{cfg.scenario.name}: {cfg.episodes} held-out episodes")
+    write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
+    print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
+
+
+def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSuite) -> str:
+    """What was played: `count` episodes, or as many on each of several maps, and again for each team size."""
+    words = f"{count} {'held-out ' * suite.is_held_out}episode{'s' * (count != 1)}"
+    if len(results[0].episodes["exploration_ratio"]) > count:
+        words += f" on each of {len(suite.held_out)} maps"
+    return words + ", for each team size" * (len({one.num_robots for one in results}) > 1)
 
 
 def draw_ends(cfg: Any, maps: list, name: str, policy: Any, path: Path) -> None:

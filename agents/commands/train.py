@@ -97,7 +97,7 @@ def finish(done: TrainingRun) -> None:
         device = choose_device(cfg, "train_device")
         envs = (make_env(cfg, done.suite.held_out, size, device=device) for size in done.sizes)
         results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
-        report(cfg, results, done.suite.held_out, where / "summary.json", training_seconds=round(done.seconds, 2))
+        report(cfg, results, done.suite, where / "summary.json", training_seconds=round(done.seconds, 2))
         written.append("summary.json")
     draw_rollout(cfg, done, where / "rollout.gif")
     written.append("rollout.gif")

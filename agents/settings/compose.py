@@ -80,8 +80,9 @@ def _suggest(name: str, verb: str) -> str:
     from maexp.agents.settings.schema import schema
 
     names = _flat_names(OmegaConf.structured(schema(verb)))
-    meant = [one for one in names if name in re.split(r"[._]", one)] or difflib.get_close_matches(name, names, 1, 0.7)
-    if meant:
+    holding = [one for one in names if name in re.split(r"[._]", one)]
+    nearest = [one for one in holding if one.count(".") == min(other.count(".") for other in holding)]
+    if meant := nearest or difflib.get_close_matches(name, names, 1, 0.7):
         return f": did you mean {' or '.join(meant[:3])}"
     parent = name.rpartition(".")[0]
     beside = [one for one in names if one.rpartition(".")[0] == parent]
