@@ -8,6 +8,7 @@ from typing import Any
 from maexp.agents.commands.maps_folder import find_files
 from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.results import write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.schema import given
@@ -81,7 +82,7 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
         told = "\n".join(part for part in (story, report.table()) if part)
         print(told)
         written = write_files(cfg, where, world, imported)
-    (where / "report.txt").write_text(told + "\n")
+    write_text(where / "report.txt", told + "\n")
     print(f"Written: {', '.join(str(one) for one in written)}")
     if report.ok and cfg.action in ("make", "import"):
         print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}")

@@ -193,9 +193,9 @@ class MapsSettings:
     """`maexp maps`."""
 
     action: str = MISSING
-    file: str | None = setting(None, "a map's file, or for make and show a scenario")
+    file: str | None = setting(None, "a map's file, for import also a folder of them, for make and show a scenario")
     index: int = setting(0, "which map of the scenario")
-    out: str | None = setting(None, "file to write; default: in the run's folder")
+    out: str | None = setting(None, "file to write, .npz or for nav2 .yaml; default: in the run's folder")
     num_robots: int = setting(3, "the team that must find room")
     repair: bool = setting(False, "check: mend what can be mended and write the mended map")
     importing: ImportSettings = field(default_factory=ImportSettings)

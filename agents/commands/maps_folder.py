@@ -1,0 +1,121 @@
+"""`maexp maps import FOLDER`: every file of a folder that can be a map, a line each, refused ones with the reason."""
+
+import csv
+import io
+import time
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.commands.run_folder import short
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.results import write_text
+from maexp.envs.checker import check_map
+from maexp.envs.importing import draw_import, import_map_with_report
+from maexp.envs.importing.api import GRIDS, POINTS
+from maexp.envs.importing.clouds import CLOUDS
+
+YAMLS = (".yaml", ".yml")
+IMAGES = tuple(suffix for suffix in GRIDS if suffix not in YAMLS)
+OTHER_ARRAYS = ("obstacles", "obstacle", "boundary", "boundaries")  # of a triple, read with its free points
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one file; lengths in metres, areas in square metres, empty where it was refused."""
+
+    file: str
+    result: str
+    scenario: str = ""
+    resolution: float | str = ""
+    free_points: int | str = ""
+    free_area: float | str = ""
+    room: int | str = ""
+    visible: str = ""
+    seconds: float | str = ""
+    reason: str = ""
+
+    def line(self) -> str:
+        """For the terminal."""
+        if self.result == "refused":
+            return f"refused  {self.file}: {self.reason}"
+        what = f"{self.free_points:,} points, {self.free_area:,} m2 at {self.resolution:g} m, scenario {self.scenario}"
+        return f"{self.result:<8} {self.file}: {what}{f' ({self.reason})' if self.reason else ''}"
+
+
+def find_files(folder: Path) -> list[Path]:
+    """The files below `folder` that can be maps: images that have a yaml beside them go with it.
+
+    Raises:
+        UserError: there are none.
+    """
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in _suffixes())
+    yamls = {file.with_suffix("") for file in files if file.suffix.lower() in YAMLS}
+    files = [file for file in files if not (file.suffix.lower() in IMAGES and file.with_suffix("") in yamls)]
+    files = [file for file in files if not (file.suffix == ".npy" and file.stem.lower().endswith(OTHER_ARRAYS))]
+    if not files:
+        raise UserError(f"{folder} holds no file that could be a map ({' '.join(_suffixes())}).")
+    return files
+
+
+def _suffixes() -> tuple[str, ...]:
+    return (*GRIDS, *CLOUDS, *POINTS)
+
+
+def run(folder: Path, where: Path, options: dict[str, Any]) -> int:
+    """Import each file, going on after refusals; the reports are whole after every file. 1 if any was refused."""
+    files, rows = find_files(folder), []
+    for file in files:
+        rows.append(_import(file, folder, where, options))
+        print(rows[-1].line(), flush=True)
+        _write_csv(rows, where / "report.csv")
+        _write_markdown(rows, where / "report.md")
+    refused = sum(row.result == "refused" for row in rows)
+    print(f"{len(rows) - refused} of {len(rows)} files became maps, {refused} were refused.")
+    print(f"Written: {short(where)}/: report.csv, report.md, and of each map FILE.npz, FILE.png and FILE.txt")
+    return int(refused > 0)
+
+
+def _import(file: Path, folder: Path, where: Path, options: dict[str, Any]) -> Row:
+    """Import one file and write its map, picture and report under its own name, the folder's sub-folders kept."""
+    begin, name = time.perf_counter(), str(file.relative_to(folder))
+    try:
+        with blame_input():
+            world, report = import_map_with_report(file, **options)
+    except UserError as error:
+        reason = str(error).replace(str(file), file.name)
+        return Row(name, "refused", seconds=_since(begin), reason=reason)
+    seconds = _since(begin)
+    verdict = check_map(world, num_robots=options["num_robots"])
+    target = where / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    world.save(target.with_name(f"{file.name}.npz"))
+    write_text(target.with_name(f"{file.name}.txt"), f"{report.table()}\n{verdict.table()}\n")
+    draw_import(world, report, target.with_name(f"{file.name}.png"))
+    area, seen = round(world.free_area, 1), f"{verdict.visible_share:.1%}"
+    warnings = "; ".join(report.warnings)
+    shown = (world.scenario, round(world.resolution, 4), len(world.free), area, verdict.room, seen, seconds, warnings)
+    return Row(name, verdict.verdict, *shown)
+
+
+def _since(begin: float) -> float:
+    return round(time.perf_counter() - begin, 1)
+
+
+def _write_csv(rows: list[Row], path: Path) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow([field.name for field in fields(Row)])
+    writer.writerows(astuple(row) for row in rows)
+    write_text(path, text.getvalue())
+
+
+def _write_markdown(rows: list[Row], path: Path) -> None:
+    head = ("file", "result", "scenario", "resolution m", "points", "m2", "room", "visible", "s", "reason or warning")
+    lines = [head, ["---"] * len(head), *(map(_cell, astuple(row)) for row in rows)]
+    write_text(path, "".join(f"| {' | '.join(line)} |\n" for line in lines))
+
+
+def _cell(value: Any) -> str:
+    text = f"{value:,}" if isinstance(value, int) else str(value)
+    return text.replace("|", "\\|").replace("\n", " ")
