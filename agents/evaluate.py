@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
 from maexp.envs.metrics import episode_metrics, summarise
+from maexp.envs.recorder import CoverageRecorder
+
+RECORD_EVERY = 10  # local steps between two points of a coverage curve
 
 
 @dataclass
@@ -21,22 +24,46 @@ class EvaluationResult:
         num_robots: team size
         episodes: each metric's value in each episode; NaN where an episode has none
         seconds: wall time
+        place: the map, where several were played one by one; "": all of them
+        times, coverage: coverage over time, [records] [s] and [episodes, records] in [0, 1]; None: not recorded
+        shares: of each robot in what its team discovered, [episodes, robots]; None: not recorded
     """
 
     policy: str
     num_robots: int
     episodes: dict
     seconds: float
+    place: str = ""
+    times: np.ndarray | None = None
+    coverage: np.ndarray | None = None
+    shares: np.ndarray | None = None
 
     def summary(self) -> dict[str, dict]:
         """{metric: {mean, std, ci95: [lo, hi], n}}."""
         return {name: summarise(values) for name, values in self.episodes.items()}
 
 
-def pool(name: str, parts: list[EvaluationResult]) -> EvaluationResult:
-    """The episodes of several results of one policy as one result."""
-    together = {metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes}
-    return EvaluationResult(name, parts[0].num_robots, together, sum(one.seconds for one in parts))
+def pool(parts: list[EvaluationResult]) -> EvaluationResult:
+    """The episodes of several recorded results of one policy as one result."""
+    times = np.unique(np.concatenate([one.times for one in parts]))
+    lines = [np.interp(times, one.times, line) for one in parts for line in one.coverage]
+    return EvaluationResult(
+        parts[0].policy,
+        parts[0].num_robots,
+        {metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes},
+        sum(one.seconds for one in parts),
+        times=times,
+        coverage=np.stack(lines),
+        shares=np.concatenate([one.shares for one in parts]),
+    )
+
+
+def evaluate_recorded(policy: Callable, env, episodes: int, **settings) -> EvaluationResult:
+    """`evaluate`, with the coverage over time and the share of each robot."""
+    with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
+        result = evaluate(policy, env, episodes, **settings)
+    times, coverage = recorder.curves(episodes)
+    return replace(result, times=times, coverage=coverage, shares=recorder.contributions(episodes))
 
 
 @torch.no_grad()

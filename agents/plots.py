@@ -50,6 +50,8 @@ METRICS = (
     ("reward_variance", "Spread of reward over robots", "reward, unscaled", 1),
 )
 
+SHADES = (COLOURS[0], "#A6CEE3")  # of neighbouring shares: dark and light, in grey, too
+
 
 # Learning curves
 
@@ -202,10 +204,11 @@ def draw_coverage(curves: dict, path) -> Path:
     if not curves:
         raise ValueError("curves is empty; give at least one policy")
     with rc_context(LOOK):
-        figure = Figure(figsize=(5.2, 3.4), layout="constrained")
+        figure = Figure(figsize=(6.4, 3.6 + 0.17 * -(-len(curves) // 2)), layout="constrained")
         ax = figure.subplots()
         draw_coverage_lines(ax, curves)
-        finish(ax, "Coverage over time, mean and its 95 % interval", "%", legend=True)
+        finish(ax, "Coverage over time, mean and its 95 % interval", "coverage [%]", legend=False)
+        figure.legend(loc="outside lower center", ncols=2)
         return save(figure, path)
 
 
@@ -228,7 +231,7 @@ def draw_coverage_lines(ax, curves: dict, looks: dict[str, int] | None = None) -
             )
         mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
         k = k if looks is None else looks[name]
-        colour, style = COLOURS[k % len(COLOURS)], STYLES[k % len(STYLES)]
+        colour, style = COLOURS[k % len(COLOURS)], STYLES[(k + k // len(COLOURS)) % len(STYLES)]
         ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
         low, high = np.clip(mean - error, 0, 100), np.clip(mean + error, 0, 100)
         ax.fill_between(seconds, low, high, color=colour, alpha=0.2, linewidth=0)
@@ -303,7 +306,7 @@ def _draw_bars(ax, policies: dict, metric: str, factor: float) -> None:
 
 
 def draw_contributions(contributions: dict, path) -> Path:
-    """Share of each robot in what its team discovered, mean and 95 % interval of the mean; returns the path.
+    """Share of each robot in what its team discovered, a bar of 100 % per policy; returns the path.
 
     Args:
         contributions: policy -> (episodes, robots), as ``CoverageRecorder.contributions`` returns them. Robots
@@ -316,20 +319,27 @@ def draw_contributions(contributions: dict, path) -> Path:
     if not contributions:
         raise ValueError("contributions is empty; give at least one policy")
     with rc_context(LOOK):
-        figure = Figure(figsize=(5.2, 3.2), layout="constrained")
+        figure = Figure(figsize=(6.4, 1.3 + 0.36 * len(contributions)), layout="constrained")
         ax = figure.subplots()
-        width = 0.8 / len(contributions)
-        largest = 0
-        for k, (name, shares) in enumerate(contributions.items()):
-            shares = 100 * -np.sort(-np.asarray(shares, dtype=float), axis=1)
-            mean, error = shares.mean(axis=0), 1.96 * shares.std(axis=0) / np.sqrt(len(shares))
-            place = np.arange(1, len(mean) + 1) - 0.4 + width * (k + 0.5)
-            ax.bar(place, mean, 0.92 * width, label=name, color=COLOURS[k % len(COLOURS)], alpha=0.85)
-            ax.errorbar(place, mean, yerr=error, color="black", linestyle="none", capsize=2, linewidth=1)
-            largest = max(largest, len(mean))
-        ax.axhline(100 / largest, color="#606060", linewidth=1, linestyle=(0, (4, 2)), label="equal shares")
-        ax.set_xticks(range(1, largest + 1))
-        ax.grid(False, axis="x")
-        ax.set_xlabel("robot, by its share within the episode")
-        finish(ax, "Share of each robot in the exploration", "% of what the team discovered", legend=True)
+        for row, shares in enumerate(contributions.values()):
+            ranked = -np.sort(-np.asarray(shares, dtype=float), axis=1)
+            mean = 100 * ranked.sum(axis=0) / max(ranked.sum(), 1e-9)  # episodes that found nothing new do not count
+            _draw_shares(ax, row, mean)
+            ax.plot(100 * np.arange(1, len(mean)) / len(mean), np.full(len(mean) - 1, row + 0.4), "k^", markersize=4)
+        ax.set_yticks(range(len(contributions)), list(contributions))
+        ax.set_ylim(len(contributions) - 0.4, -0.6)
+        ax.set_xlim(0, 100)
+        ax.grid(False)
+        ax.set_xlabel("share [%], the busiest robot of each episode first\n▲ where equal shares would end")
+        ax.set_title("Share of each robot in what its team discovered", loc="left")
         return save(figure, path)
+
+
+def _draw_shares(ax, row: int, mean: np.ndarray) -> None:
+    """The bar of one policy; shades alternate between neighbours, and a share that has room for it says its value."""
+    for rank, (left, width) in enumerate(zip(np.cumsum(mean) - mean, mean, strict=True)):
+        dark = rank % 2 == 0
+        ax.barh(row, width, left=left, height=0.7, color=SHADES[rank % 2], edgecolor="white", linewidth=0.8)
+        if width >= 4:
+            colour = "white" if dark else "black"
+            ax.text(left + width / 2, row, f"{width:.0f}", ha="center", va="center", fontsize=8, color=colour)

@@ -1,13 +1,9 @@
 """What a run found: summary.json and results.json, and the table on the terminal."""
 
-import json
-import math
-import os
 import subprocess
-from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from omegaconf import OmegaConf
 from rich import box
@@ -17,6 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from maexp.agents.evaluate import EvaluationResult
+from maexp.agents.files import write_json
 
 PACKAGES = ("maexp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
 COLUMNS = {
@@ -60,9 +57,11 @@ def find_commit() -> str | None:
 
 
 def result_names(results: list[EvaluationResult]) -> list[str]:
-    """A name per result: the policy, with the team's size where several sizes were played."""
-    sizes = {one.num_robots for one in results}
-    return [one.policy if len(sizes) == 1 else f"{one.policy} N={one.num_robots}" for one in results]
+    """A name per result: the policy, with the map and the team's size where several of them were played."""
+    several = len({one.num_robots for one in results}) > 1
+    places = [f" on {one.place}" if one.place else "" for one in results]
+    sizes = [f" N={one.num_robots}" if several else "" for one in results]
+    return [f"{one.policy}{place}{size}" for one, place, size in zip(results, places, sizes, strict=True)]
 
 
 def write_results(path: Path, results: list[EvaluationResult], run: dict) -> None:
@@ -70,36 +69,6 @@ def write_results(path: Path, results: list[EvaluationResult], run: dict) -> Non
     named = {name: one.summary() for name, one in zip(result_names(results), results, strict=True)}
     named["run"] = run | {"num_robots": sorted({one.num_robots for one in results})}
     write_json(path, named)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """A JSON file, null where a number is NaN."""
-    write_text(path, json.dumps(_without_nan(content), indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all: a kill at any moment leaves the old one or the new one."""
-    write_file(path, lambda file: file.write(text.encode()))
-
-
-def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
-    """The same for a file that `fill` writes into."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    with open(aside, "wb") as file:
-        fill(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN: null instead."""
-    if isinstance(value, dict):
-        return {name: _without_nan(one) for name, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def print_results(results: list[EvaluationResult], title: str) -> None:

@@ -183,6 +183,8 @@ def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
     coverage = results["random N=2"]["exploration_ratio"]
     assert coverage["n"] == 3 and coverage["ci95"][0] <= coverage["mean"] <= coverage["ci95"][1]
     assert results["run"]["num_robots"] == [1, 2] and results["run"]["episodes"] == 3
-    assert (tmp_path / "e" / "picture.png").is_file()
+    for name in ("picture.png", "coverage.png", "metrics.png", "shares.png"):
+        assert (tmp_path / "e" / name).stat().st_size > 5000
     printed = capsys.readouterr().out
+    assert "results.json, coverage.png, metrics.png, shares.png, picture.png, config.yaml" in printed
     assert "nearest_frontier N=2" in printed and "maze_small: 3 held-out episodes, for each team size" in printed

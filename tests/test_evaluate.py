@@ -12,7 +12,7 @@ from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import describe_episodes
 from maexp.agents.errors import UserError
-from maexp.agents.evaluate import EvaluationResult, evaluate, play
+from maexp.agents.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
@@ -46,6 +46,27 @@ def test_episodes_do_not_depend_on_the_batch(env, num_envs):
     for name, values in wanted.items():
         assert len(values) == 5
         torch.testing.assert_close(torch.from_numpy(found[name]), torch.from_numpy(values), equal_nan=True)
+
+
+def test_recording_changes_nothing_and_ends_where_the_episodes_end(env):
+    wanted, found = evaluate(still, env, 4), evaluate_recorded(still, env, 4)
+    for name, values in wanted.episodes.items():
+        np.testing.assert_array_equal(found.episodes[name], values)
+    np.testing.assert_allclose(found.times, [0, 1, 2, 3])
+    np.testing.assert_allclose(found.coverage[:, -1], wanted.episodes["exploration_ratio"], atol=1e-6)
+    assert found.coverage.shape == (4, 4) and found.shares.shape == (4, 2) and wanted.coverage is None
+
+
+def test_pooled_curves_share_their_times():
+    """A place with longer episodes and other moments: what is done keeps its coverage."""
+    one, other = (
+        EvaluationResult("random", 1, {"exploration_ratio": np.ones(1)}, 1.0, "", np.array(times), np.array([coverage]),
+                         np.ones((1, 1)))
+        for times, coverage in (([0.0, 2.0], [0.0, 0.5]), ([0.0, 1.0, 4.0], [0.1, 0.4, 1.0]))
+    )  # fmt: skip
+    both = pool([one, other])
+    assert both.times.tolist() == [0, 1, 2, 4] and both.seconds == 2 and both.shares.shape == (2, 1)
+    np.testing.assert_allclose(both.coverage, [[0, 0.25, 0.5, 0.5], [0.1, 0.4, 0.6, 1.0]])
 
 
 def test_another_seed_gives_other_episodes(env):

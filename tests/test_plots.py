@@ -129,7 +129,7 @@ def test_coverage_over_time(tmp_path, figures):
     coverage = np.stack([np.linspace(0, level, 21) for level in (0.7, 0.8, 0.9)])
     assert readable(draw_coverage({"a": (seconds, coverage), "b": (seconds, coverage[:1])}, tmp_path / "a.png"))
     ax = figures[0].axes[0]
-    assert ax.get_xlabel() == "time [s]" and ax.get_ylabel() == "%"
+    assert ax.get_xlabel() == "time [s]" and ax.get_ylabel() == "coverage [%]"
     assert ax.lines[0].get_label() == "a (n = 3)"
     assert ax.lines[0].get_ydata()[-1] == pytest.approx(80)
     band = ax.collections[0].get_paths()[0].vertices[:, 1]
@@ -171,10 +171,14 @@ def test_a_summary_without_metrics_is_refused(tmp_path):
 
 
 def test_contributions_are_ranked_within_episodes(tmp_path, figures):
-    shares = np.array([[0.2, 0.5, 0.3], [0.6, 0.3, 0.1]])
-    assert readable(draw_contributions({"trained": shares, "random": shares[:1]}, tmp_path / "a.png"))
-    bars = [bar.get_height() for bar in figures[0].axes[0].patches]
-    np.testing.assert_allclose(bars, [55, 30, 15, 50, 30, 20])
+    shares = np.array([[0.2, 0.5, 0.3], [0.6, 0.38, 0.02], [0, 0, 0]])  # nothing new was found in the third
+    assert readable(draw_contributions({"trained": shares, "random": shares[1:2, :2]}, tmp_path / "a.png"))
+    ax = figures[0].axes[0]
+    bars = [(bar.get_x(), bar.get_width()) for bar in ax.patches]
+    np.testing.assert_allclose(bars, [(0, 55), (55, 34), (89, 11), (0, 61.2245), (61.2245, 38.7755)], rtol=1e-4)
+    assert [text.get_text() for text in ax.texts] == ["55", "34", "11", "61", "39"]
+    np.testing.assert_allclose([line.get_xdata() for line in ax.lines[:1]], [[100 / 3, 200 / 3]])
+    assert ax.lines[1].get_xdata().tolist() == [50]
     with pytest.raises(ValueError, match="contributions is empty"):
         draw_contributions({}, tmp_path / "a.png")
 

@@ -13,11 +13,11 @@ from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.run_folder import short
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluate import EvaluationResult, evaluate, play, pool
+from maexp.agents.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.results import describe_run, print_results, write_results
+from maexp.agents.results import describe_run, print_results, result_names, write_results
 from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.schema import schema
@@ -84,7 +84,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
     report(cfg, results, suite, where / "results.json")
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
-    written = ["results.json", "picture.png", "config.yaml"]
+    written = ["results.json", *draw_results(results, where), "picture.png", "config.yaml"]
     if cfg.render:
         films = [film for team in envs for film in film_all(cfg, team[0], maps, policies, where)]
         written += [film.name for film in films] + [f"{EPISODES}/"]
@@ -112,11 +112,9 @@ def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[Evaluatio
     """Each policy on the same episodes."""
     results = []
     for name, policy in policies.items():
-        with Progress(f"{name}, {env.num_robots} robots", cfg.episodes) as progress:
-            bound = bind(policy, env)
-            results.append(
-                evaluate(bound, env, cfg.episodes, name=name, seed=cfg.seed, advance=progress.advance)
-            )
+        with Progress(f"{name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
+            settings = {"name": name, "seed": cfg.seed, "advance": progress.advance}
+            results.append(evaluate_recorded(bind(policy, env), env, cfg.episodes, **settings))
     return results
 
 
@@ -125,9 +123,9 @@ def evaluate_places(cfg: Any, envs: list, policies: dict[str, Any]) -> list[Eval
     parts = [evaluate_all(cfg, env, policies) for env in envs]
     if len(envs) == 1:
         return parts[0]
-    results = [pool(name, list(those)) for name, those in zip(policies, zip(*parts, strict=True), strict=True)]
+    results = [pool(list(those)) for those in zip(*parts, strict=True)]
     for env, those in zip(envs, parts, strict=True):
-        results += [replace(one, policy=f"{one.policy} on {env.maps[0].name}") for one in those]
+        results += [replace(one, place=env.maps[0].name) for one in those]
     return results
 
 
@@ -148,6 +146,18 @@ def report(cfg: Any, results: list[EvaluationResult], suite: MapSuite, path: Pat
     seconds = sum(one.seconds for one in results)
     write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
+
+
+def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
+    """Pictures of what came of all maps together: coverage over time, the metrics, the robots' shares; their names."""
+    from maexp.agents.plots import draw_contributions, draw_coverage, draw_summary
+
+    whole = [one for one in results if not one.place]
+    named = dict(zip(result_names(whole), whole, strict=True))
+    draw_coverage({name: (one.times, one.coverage) for name, one in named.items()}, where / "coverage.png")
+    draw_summary({name: one.summary() for name, one in named.items()}, where / "metrics.png")
+    draw_contributions({name: one.shares for name, one in named.items()}, where / "shares.png")
+    return ["coverage.png", "metrics.png", "shares.png"]
 
 
 def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSuite) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.commands.evaluate import evaluate_all, report
+from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.errors import UserError
 from maexp.agents.logs import check_logger
@@ -98,7 +98,7 @@ def finish(done: TrainingRun) -> None:
         envs = (make_env(cfg, done.suite.held_out, size, device=device) for size in done.sizes)
         results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
         report(cfg, results, done.suite, where / "summary.json", training_seconds=round(done.seconds, 2))
-        written.append("summary.json")
+        written += ["summary.json", *draw_results(results, where)]
     draw_rollout(cfg, done, where / "rollout.gif")
     written.append("rollout.gif")
     print(f"Written to {short(where)}: {', '.join(written)}")
