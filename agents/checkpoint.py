@@ -1,6 +1,5 @@
 """Checkpoints: written whole or not at all, the newest few and the best kept, loaded without unpickling."""
 
-import os
 import random
 import re
 import warnings
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 
 from maexp.agents.errors import UserError
+from maexp.agents.files import write_file
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
@@ -37,26 +37,15 @@ def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: 
 
 
 def _write_atomically(path: Path, state: dict) -> None:
-    """A kill at any moment leaves the old file or the new one: write aside, sync, rename, sync the folder."""
-    aside = path.with_suffix(".tmp")
+    """A kill at any moment leaves the old file or the new one."""
     try:
-        with open(aside, "wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
+        write_file(path, lambda file: torch.save(state, file))
     except (OSError, RuntimeError) as error:  # torch raises the latter when a write fails
-        aside.unlink(missing_ok=True)
         reason = getattr(error, "strerror", None) or "the disk is full or the file too large"
         raise UserError(
             f"The checkpoint {path} could not be written ({reason}): the ones before are whole; free some space and go "
             f"on with maexp train resume={path.parent.parent}."
         ) from error
-    handle = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def list_checkpoints(folder: Path) -> list[Path]:

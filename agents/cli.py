@@ -1,6 +1,5 @@
 """The command `maexp`: a verb, then Hydra overrides."""
 
-import errno
 import importlib
 import os
 import sys
@@ -9,11 +8,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from maexp.agents.errors import UserError
+from maexp.agents.errors import UserError, describe_disk_error
 from maexp.agents.memory import keep_freed_memory
 
 BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
-DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 @dataclass(frozen=True)
@@ -84,10 +82,9 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
     except OSError as error:
-        if error.errno not in DISK_ERRORS:
+        told = describe_disk_error(error)
+        if told is None:
             raise
-        where = f" of {error.filename}" if error.filename else ""
-        told = f"Writing{where} failed ({error.strerror}): free some space; files that were there before are whole."
         print(f"maexp: {told}", file=sys.stderr)
         return BAD_INPUT
 

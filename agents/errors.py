@@ -1,7 +1,10 @@
 """What went wrong on the user's side: one sentence, no traceback."""
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class UserError(Exception):
@@ -24,3 +27,11 @@ def blame_input() -> Iterator[None]:
         raise UserError(f"{error.strerror or error}{where}.") from error
     except (ValueError, ImportError) as error:
         raise UserError(str(error)) from error
+
+
+def describe_disk_error(error: OSError) -> str | None:
+    """A sentence for an error of the disk (full, read-only, broken); None for any other."""
+    if error.errno not in DISK_ERRORS:
+        return None
+    where = f" of {error.filename}" if error.filename else ""
+    return f"Writing{where} failed ({error.strerror}): free some space; files that were there before are whole."

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
+from maexp.agents.files import write_text
 
 MODES = ("online", "offline")
 
@@ -74,9 +75,7 @@ def _keep_rows(path: Path, kept: int) -> list[str] | None:
         rows = list(csv.reader(file))
     columns = rows[0]
     rows = [row for row in rows[1:] if len(row) == len(columns) and int(row[0]) <= kept]
-    aside = path.with_suffix(".tmp")
-    aside.write_text("".join(_line(row) for row in [columns, *rows]))
-    os.replace(aside, path)
+    write_text(path, "".join(_line(row) for row in [columns, *rows]))
     return columns
 
 

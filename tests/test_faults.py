@@ -13,9 +13,12 @@ import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from maexp.agents.benchmark.cell import read_result, write_result
+from maexp.agents.benchmark.plan import Cell, cell_folder
 from maexp.agents.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
@@ -23,6 +26,7 @@ from maexp.agents.logs import MetricsLog
 from maexp.agents.results import write_results
 from maexp.envs import ExplorationEnv, MapError, PointCloudMap, make_map
 
+CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
 RUN = [
     "scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2", "scenario.local_steps=2", "num_envs=2",
@@ -59,6 +63,12 @@ def write(what: str, number: int) -> None:
         make_map("maze_small", number % 2).save("file.npz")
     elif what == "results":
         write_results(Path("file.json"), [Results(20_000)], {"seed": number})
+    elif what == "cell":
+        folder = cell_folder(Path("."), CELL)
+        folder.mkdir(parents=True, exist_ok=True)
+        values = np.full(50_000, float(number))
+        arrays = {"coverage_step_85": values, "curve_seconds": values, "curve_coverage": values}
+        write_result(folder, "held_out", arrays, {"run": {"numbers": [number] * 20_000}})
     else:
         save_checkpoint(Path("."), state(number), number, keep=2, best=True)
 
@@ -68,12 +78,17 @@ def read_back(what: str) -> None:
         assert PointCloudMap.load("file.npz").name in ("maze_small_0", "maze_small_1")
     elif what == "results":
         assert len(json.loads(Path("file.json").read_text())["one"]) == 20_000
+    elif what == "cell":
+        result = read_result(Path("."), CELL, "held_out")
+        for values in (result.seconds, result.coverage, *result.episodes.values()):
+            assert values.shape == (50_000,) and (values == values[0]).all()
+        assert len(set(result.run["numbers"])) == 1
     else:
         state = find_checkpoint(".")[1]
         assert (state["policy"]["weights"] == state["iteration"]).all()
 
 
-@pytest.mark.parametrize("what", ["map", "results", "checkpoint"])
+@pytest.mark.parametrize("what", ["map", "results", "checkpoint", "cell"])
 def test_kill_9_while_writing(what):
     """At any moment the file is the old one or the new one."""
     rng = random.Random(int(os.environ.get("MAEXP_KILL_SEED", 0)))
@@ -153,6 +168,42 @@ def test_a_full_disk_during_a_run_is_one_sentence(place, monkeypatch, capsys):
     told = capsys.readouterr().err.strip().splitlines()
     assert told[-1].startswith("maexp: ") and "Traceback" not in "\n".join(told)
     assert find_checkpoint("run")[1]["iteration"] >= 0
+
+
+BENCHMARK = [
+    "preset=smoke", "scenarios=maze_small", "policies=random,voronoi", "algorithms=[]", "seeds=0", "episodes=2",
+    "num_envs=2", "num_robots=2", "scenario.local_steps=3", "workers=1", "estimate=false", "device=cpu",
+]  # fmt: skip
+
+
+def test_a_full_disk_during_a_benchmark_names_the_cells(capfd):
+    words = [*BENCHMARK, "episodes=300", "hydra.run.dir=b"]
+    with full_disk(5000):  # enough for the plan, too little for a cell's arrays; workers inherit the limit
+        assert main(["benchmark", *words]) in (1, 2)
+    told = "".join(capfd.readouterr())
+    assert told.count("free some space") > 1 and "2 cells are not done" in told
+    assert "maze_small/random/seed_0 failed: " in told and "maze_small/voronoi/seed_0 failed: " in told
+    assert "resume=b" in told and "Traceback" not in told
+    assert not list(Path("b").rglob("held_out*"))
+    assert main(["benchmark", "resume=b", "estimate=false"]) == 0
+    assert read_result(Path("b"), CELL, "held_out").coverage.shape[0] == 300
+
+
+def test_a_damaged_cell_is_named_and_can_be_played_again(capsys):
+    assert main(["benchmark", *BENCHMARK, "hydra.run.dir=b"]) == 0
+    folder = cell_folder(Path("b"), CELL)
+    for name in ("held_out.npz", "held_out.json"):
+        whole = (folder / name).read_bytes()
+        for content in (whole[: len(whole) // 2], b"", b"[1, 2]", bytes(100)):
+            (folder / name).write_bytes(content)
+            capsys.readouterr()
+            assert main(["benchmark", "resume=b", "report=true"]) == 2
+            told = capsys.readouterr().err
+            assert "random/seed_0/held_out.json" in told and "resume=b plays" in told and "Traceback" not in told
+        (folder / name).write_bytes(whole)
+    (folder / "held_out.json").unlink()
+    assert main(["benchmark", "resume=b", "estimate=false"]) == 0
+    assert read_result(Path("b"), CELL, "held_out").coverage.shape[0] == 2
 
 
 # Hostile and foreign checkpoints

@@ -1,7 +1,6 @@
 """What the measurements of `maexp bench` share: points of a sweep, spread of laps, clock, report, machine."""
 
 import itertools
-import json
 import os
 import platform
 import statistics
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from maexp.agents.files import write_json
 from maexp.agents.results import PACKAGES, find_commit
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
@@ -103,9 +103,7 @@ def write_report(path: Path, kind: str, device: str, body: dict) -> None:
     }
     if str(device).startswith("cuda"):
         report["machine"]["gpu"] = torch.cuda.get_device_name(device)
-    aside = path.with_suffix(".tmp")
-    aside.write_text(json.dumps(report | body, indent=2) + "\n")
-    os.replace(aside, path)
+    write_json(path, report | body)
     Console().print(f"written to {path}", soft_wrap=True)
 
 

@@ -2,6 +2,8 @@
 
 import json
 import time
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +14,13 @@ import numpy as np
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
-from maexp.agents.errors import blame_input
+from maexp.agents.commands.run_folder import short
+from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
+from maexp.agents.files import write_file, write_json
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.results import describe_run, write_file, write_json
+from maexp.agents.results import describe_run
 from maexp.agents.train import TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
@@ -102,22 +106,37 @@ def play_suite(
             )
     seconds, coverage = recorder.curves(cfg.episodes)
     arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
-    write_file(folder / f"{suite}.npz", lambda file: np.savez_compressed(file, **arrays))
     described = describe_run(settings, maps, time.perf_counter() - begin) | trained
     described |= {"algorithm": cell.policy if cell.trains else None, "episodes": cfg.episodes, "maps_are": suite}
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
-    write_json(folder / f"{suite}.json", {cell.policy: result.summary(), "run": described})
+    write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
 
 
 _ATTRIBUTE = {"held_out": "held_out", "trained": "train"}
 
 
+def write_result(folder: Path, suite: str, arrays: dict[str, np.ndarray], summary: dict) -> None:
+    """The arrays, then the summary, which marks the end: a cell that was killed in between is played again."""
+    write_file(folder / f"{suite}.npz", lambda file: np.savez_compressed(file, **arrays))
+    write_json(folder / f"{suite}.json", summary)
+
+
 def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
-    """The result of a finished cell."""
+    """The result of a finished cell.
+
+    Raises:
+        UserError: its files are damaged, or hold something else.
+    """
     folder = cell_folder(where, cell)
-    run = json.loads((folder / f"{suite}.json").read_text())["run"]
-    with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    seconds, coverage = (arrays.pop(name) for name in CURVE)
+    try:
+        run = dict(json.loads((folder / f"{suite}.json").read_text())["run"])
+        with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        seconds, coverage = (arrays.pop(name) for name in CURVE)
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(
+            f"{short(folder / suite)}.json and .npz cannot be read ({type(error).__name__}): remove the .json, and "
+            f"maexp benchmark resume={short(where)} plays {cell.name} again."
+        ) from error
     return CellResult(arrays, seconds, coverage, run)

@@ -14,8 +14,9 @@ from omegaconf import OmegaConf
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.errors import UserError
+from maexp.agents.files import write_json
 from maexp.agents.policies import POLICIES
-from maexp.agents.results import plain, write_json
+from maexp.agents.results import plain
 from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote

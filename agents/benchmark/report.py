@@ -19,7 +19,8 @@ from maexp.agents.benchmark.table import (
     table_markdown,
 )
 from maexp.agents.commands.run_folder import short
-from maexp.agents.results import PACKAGES, find_commit, write_json, write_text
+from maexp.agents.files import write_json, write_text
+from maexp.agents.results import PACKAGES, find_commit
 
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
 

@@ -48,7 +48,7 @@ def work(where: Path, order: dict, shelf) -> tuple[str, str]:
     """(done, stopped or failed, what went wrong) of one cell."""
     from maexp.agents.benchmark.cell import run_cell
     from maexp.agents.benchmark.plan import Cell, cell_folder, compose_settings
-    from maexp.agents.errors import UserError
+    from maexp.agents.errors import UserError, describe_disk_error
 
     warnings.filterwarnings("ignore", category=FutureWarning)  # of libraries, for their authors
     cell = Cell(**order["cell"])
@@ -58,6 +58,9 @@ def work(where: Path, order: dict, shelf) -> tuple[str, str]:
     except UserError as error:
         print(error, file=sys.stderr, flush=True)
         return "failed", str(error)
+    except OSError as error:
+        traceback.print_exc()
+        return "failed", describe_disk_error(error) or f"{type(error).__name__}: {error}"
     except Exception as error:  # the other cells go on; the traceback is in the log
         traceback.print_exc()
         return "failed", f"{type(error).__name__}: {error}"

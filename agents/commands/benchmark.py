@@ -148,11 +148,13 @@ def watch(pool: WorkerPool, progress: "BenchmarkProgress", report: Report) -> No
 
 def conclude(report: Report, outcome: Outcome, where: Path, left: int) -> int:
     """Tables, pictures, what failed, how to go on."""
-    report.finish()
-    for cell, reason in outcome.failed.items():
-        print(f"{cell.name} failed: {reason}\n  its output: {short(cell_folder(where, cell) / 'log.txt')}")
-    if left:
-        print(f"{left} cells are not done. Go on with: maexp benchmark resume={short(where)}")
+    try:
+        report.finish()
+    finally:  # on a full disk, too
+        for cell, reason in outcome.failed.items():
+            print(f"{cell.name} failed: {reason}\n  its output: {short(cell_folder(where, cell) / 'log.txt')}")
+        if left:
+            print(f"{left} cells are not done. Go on with: maexp benchmark resume={short(where)}", flush=True)
     if outcome.interrupted:
         return STOPPED
     return FAILED if outcome.failed else 0

@@ -8,7 +8,7 @@ from typing import Any
 from maexp.agents.commands.maps_folder import find_files
 from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.results import write_text
+from maexp.agents.files import write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.schema import given
