@@ -49,7 +49,7 @@ VERBS = {
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
-         "maexp maps check floor.yaml", "maexp maps show map.npz"),
+         "maexp maps import FOLDER", "maexp maps check floor.yaml", "maexp maps show map.npz"),
         ("action", "file"),
         ("list", "make", "import", "check", "show"),
     ),
