@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +36,26 @@ MEANT = {  # placeholder -> what stands for it here
     "maexp VERB": "maexp train",
     "RUN": "outputs/run",
     "FILE": "floor.yaml",
+    "FOLDER": "scans",
 }
-NOT_OURS = ("pip ", "python3 -m venv", "sphinx-build ")
+ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
+"""Words that need a cluster or another project's plugin; the rest of the command is run without them."""
+WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
+NOT_OURS = (
+    "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.golden", "MAEXP_",
+    "python -m maexp.envs.scenarios.",
+)  # fmt: skip
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""
 
 
+ANSWERS = re.findall(r"^\$ (maexp .*)\n(maexp: .*)$", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
+COMPARED = [line for line, _ in ANSWERS]
+
+
 def shown() -> dict[str, list[str]]:
-    """Command -> pages that show it: lines of shell blocks, and `maexp ...` with settings or flags in a sentence."""
+    """Command -> pages that show it: lines of shell blocks, `$ ...` of console blocks less those that are compared with
+    their answers, and `maexp ...` with settings or flags in a sentence.
+    """
     found: dict[str, list[str]] = {}
     for page in PAGES:
         text = page.read_text()
@@ -50,6 +64,9 @@ def shown() -> dict[str, list[str]]:
             for block in re.findall(r"^```(?:sh|bash)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
             for line in block.replace("\\\n", " ").splitlines()
         ]
+        consoles = re.findall(r"^```console\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        typed = [line for block in consoles for line in block.replace("\\\n", " ").splitlines() if line[:2] == "$ "]
+        lines += [line[2:] for line in typed if line[2:] not in COMPARED]
         spoken = [line for line in re.findall(r"`(maexp [^`\n]+)`", text) if "..." not in line and "[" not in line]
         lines += [line for line in spoken if "=" in line or "--" in line]
         for line in lines:
@@ -67,25 +84,43 @@ def small(line: str) -> list[str]:
     """The words of a command, with what it stands for, and small."""
     for name, meaning in MEANT.items():
         line = re.sub(rf"(?<![A-Za-z_]){re.escape(name)}(?![A-Za-z_])", meaning, line)
-    words = shlex.split(line)[1:]
+    words = [word for word in shlex.split(line)[1:] if not word.startswith(ELSEWHERE)]
     if not words or {"--help", "--cfg"} & set(words):
         return words
+    if any(word.endswith("_device=cuda:1") or word.endswith("_device=cuda") for word in words):
+        return [*words, "--cfg", "job"]  # its settings are good; a machine with such devices runs it in test_cuda.py
     more = SMALLER.get(words[0], ())
     if words[0] in SMALLER and not any(w.startswith(("scenario=pointcloud", "checkpoint=", "resume=")) for w in words):
         more = (*more, *OWN_MAPS)
     if any(word.startswith("resume=") for word in words):
-        more = ()
+        more = ("algorithms=mappo",) if words[0] == "benchmark" else ()
+    if any(word.startswith("collector.workers=") for word in words):
+        more = (*more, *WORKERS)
     return [*words, *more]
 
 
-ANSWERS = re.findall(r"^\$ (maexp .*)\n(maexp: .*)$", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
+def set_stage(words: list[str]) -> None:
+    """Earlier commands of a page made what this one reads, and none made what it is to write."""
+    for name, value in (word.split("=", 1) for word in words if "=" in word):
+        place = Path(value)
+        if name == "hydra.run.dir" and place.is_dir():
+            shutil.rmtree(place)
+        elif name == "out":
+            place.unlink(missing_ok=True)
+        elif name == "checkpoint" and not place.exists():
+            shutil.copytree("outputs/run", place)
+        elif name == "resume" and words[0] == "benchmark" and not place.exists():
+            assert main(["benchmark", *SMALLER["benchmark"], *OWN_MAPS, f"hydra.run.dir={place}"]) == 0
+    if words[0] == "view" and words[1].startswith("outputs/") and not Path(words[1]).exists():
+        shutil.copytree("outputs/run", words[1])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Where a reader would be: maps of their own under the names that the pages use, and a run."""
     place = tmp_path_factory.mktemp("reader")
-    for name in {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply)", line)}:
+    (place / "scans").mkdir()
+    for name in {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply)", line)} | {"scans/a.yaml"}:
         if (place / name).suffix in (".pcd", ".ply"):
             cloud = room(30, 21, spacing=0.2)
             flat = np.concatenate([cloud.free, *(cloud.obstacles + [0, 0, h] for h in np.arange(0.2, 1.4, 0.2))])
@@ -107,15 +142,24 @@ def folder(tmp_path_factory) -> Path:
     return place
 
 
-@pytest.mark.parametrize("line", COMMANDS)
+def heavy(line: str) -> bool:
+    """Ray takes half a minute to start; the others need seconds."""
+    return "collector=ray" in line
+
+
+@pytest.mark.parametrize("line", [pytest.param(x, marks=pytest.mark.slow) if heavy(x) else x for x in COMMANDS])
 def test_command(line, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
+    if heavy(line):
+        pytest.importorskip("ray", reason="ray is absent")
     if "browser=true" in line:  # the page opens, and ends at once
         page = pytest.importorskip("maexp.envs.viewing.page", reason="viser is absent")
         monkeypatch.setattr(page.Page, "run", lambda page: None)
-    status = main(small(line))
+    words = small(line)
+    set_stage(words)
+    status = main(words)
     output = capsys.readouterr()
-    assert status == 0, f"{' '.join(small(line))}\n{output.err}"
+    assert status == 0, f"{' '.join(words)}\n{output.err}"
     assert "Traceback" not in output.err
 
 
