@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.agents import checkpoint
+from maexp.agents import checkpoint, files
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
 from maexp.agents.errors import UserError
 
@@ -50,7 +50,7 @@ def test_a_write_that_dies_leaves_the_old_ones(run, monkeypatch):
     def die(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoint.os, "replace", die)
+    monkeypatch.setattr(files.os, "replace", die)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(run / "checkpoints", state(4), 4, keep=3)
     with warnings.catch_warnings():
