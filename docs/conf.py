@@ -8,6 +8,9 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"MAexp {release}"
+html_static_path = ["static"]
+html_css_files = ["wide.css"]
+highlight_language = "none"  # a block without a language is a diagram or what a terminal shows
 myst_heading_anchors = 3
 suppress_warnings = ["myst.header"]  # pages may start below a shared heading
 

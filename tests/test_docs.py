@@ -110,6 +110,17 @@ def test_links_lead_somewhere(page):
         assert link.startswith("https://") or (page.parent / link).exists(), link
 
 
+def test_every_picture_is_shown():
+    """And is small enough to be fetched with the repository; films and curves of many panels may be larger."""
+    links = {page: re.findall(r"!\[.*?\]\((.*?)\)", page.read_text()) for page in PAGES}
+    shown = {(page.parent / link).resolve() for page, found in links.items() for link in found}
+    files = [path for path in (ROOT / "docs").rglob("*.*") if "_build" not in path.parts]
+    pictures = {path for path in files if path.suffix in (".png", ".gif")}
+    assert pictures == shown and len(pictures) > 20
+    large = [path.name for path in pictures if path.stat().st_size > (1.5e6 if path.suffix == ".gif" else 4e5)]
+    assert not large
+
+
 def test_the_pages_build_without_a_warning(tmp_path):
     """Sphinx, warnings as errors: broken references, pages nobody links to, docstrings that are no markup."""
     pytest.importorskip("sphinx", reason="Sphinx is absent: pip install -e '.[docs]'")
