@@ -117,5 +117,5 @@ def _write_markdown(rows: list[Row], path: Path) -> None:
 
 
 def _cell(value: Any) -> str:
-    text = f"{value:,}" if isinstance(value, int) else str(value)
+    text = str(value) if isinstance(value, str) else f"{value:,}"
     return text.replace("|", "\\|").replace("\n", " ")
