@@ -111,6 +111,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "total_weight": np.int32(total),
             "resolution": np.float32(m.resolution),
             "outline_radius_max": np.float32(outline_max),
+            "occluder_radius_max": radius.max(initial=0.0),
             "cell_origin": np.float32(grid.origin),
             "cell_size": np.float32(grid.size),
             "cells_x": np.int32(grid.shape[0]),
@@ -202,14 +203,14 @@ def _weights(m: PointCloudMap) -> tuple[np.ndarray, int]:
 
 
 def _neighbours(m: PointCloudMap, free, boundary, boundary_order) -> tuple[np.ndarray, np.ndarray]:
-    """Free points within 1.5 spacings of every boundary point, as counts and one run."""
+    """Boundary points that lie within 1.5 of their spacings of every free point, as counts and one run."""
     if not len(boundary):
-        return np.zeros(0, np.int64), np.zeros(0, np.int32)
+        return np.zeros(len(free), np.int64), np.zeros(0, np.int32)
     reach = ADJACENT * np.maximum(m.resolution, m.boundary_spacing[boundary_order]) * (1.0 + 1e-5)
-    lists = cKDTree(free).query_ball_point(boundary, reach, return_sorted=True)
-    counts = np.array([len(x) for x in lists], dtype=np.int64)
-    flat = np.concatenate([np.asarray(x, dtype=np.int32) for x in lists]) if counts.sum() else np.zeros(0, np.int32)
-    return counts, flat
+    lists = cKDTree(free).query_ball_point(boundary, reach)
+    walls = np.repeat(np.arange(len(boundary), dtype=np.int32), [len(x) for x in lists])
+    points = np.concatenate([np.asarray(x, dtype=np.int64) for x in lists])
+    return np.bincount(points, minlength=len(free)), walls[np.argsort(points, kind="stable")]
 
 
 def _frame(extent) -> tuple[np.ndarray, float]:

@@ -97,6 +97,7 @@ def step_settings(env) -> Settings:
 def sizes(env) -> dict[str, int]:
     """Lengths of the axes of state and scratch."""
     finest = min(m.resolution for m in env.maps)
+    pixel = float(env.bank.arrays["pixel_size"].min())
     outline = sum(
         2 * (max(2, math.ceil(r.length / finest)) + max(2, math.ceil(r.width / finest))) + 4
         for r in env.robot_configs
@@ -111,7 +112,16 @@ def sizes(env) -> dict[str, int]:
         nearby=env.bank.boundary_in_range,
         track=min(env.local_steps * env.macro_steps + 1, TRACK_LENGTH),
         limited=env.comm_config.limited,
+        body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in env.robot_configs),
     )
+
+
+def body_pixels(length: float, width: float) -> int:
+    """Most pixels in a body of a size in pixels: a convex shape holds at most area + half its rim + 1 (Nosarzewska).
+
+    One more is the pixel next to its centre, one is for rounding.
+    """
+    return min(math.ceil(length * width + length + width + 3.0), int(PIXELS) ** 2 + 1)
 
 
 def bytes_per_env(env) -> int:

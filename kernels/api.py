@@ -104,6 +104,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     radii = torch.zeros(blocks, device=device)
     radii[: occluders.shape[0]] = radius
     maps.occluder, maps.occluder_radius = wp.from_torch(padded, dtype=wp.vec3), wp.from_torch(radii)
+    maps.occluder_radius_max = wp.from_torch(radii.amax().reshape(1))
     maps.occluder_begin = maps.occluder_cell = ints(0, occluders.shape[0])
     maps.cells_x, maps.cells_y, maps.cell_begin = ints(1), ints(1), ints(0)
     maps.cell_origin = wp.from_torch(low.reshape(1, 2).contiguous(), dtype=wp.vec2)
@@ -120,22 +121,22 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
     limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
     counts = [wp.from_torch(zeros(1, 1)) for _ in range(2)]
-    flags = zeros(1, 1, count)
+    views = zeros(1, 1, count)
     listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
     launch = wp.from_torch(free, dtype=wp.vec3).device
     lanes = 1 if launch.is_cpu else 4096
-    map_id = ints(0)
+    map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
     wp.launch(
         visibility._collect_occluders, dim=(1, 1), device=launch,
-        inputs=[maps, map_id, robots, one, pose, center],
+        inputs=[maps, map_id, planar, robots, one, pose, center],
         outputs=[bins, direction, limit, *counts, error],
     )  # fmt: skip
     wp.launch(
         visibility._scan_free, dim=(1, 1, lanes), device=launch,
-        inputs=[maps, map_id, robots, lanes, one, pose, center, bins, direction, limit, counts[0]],
-        outputs=[wp.from_torch(flags), listed, counts[1], error],
+        inputs=[maps, map_id, planar, robots, lanes, one, pose, center, bins, direction, limit, counts[0]],
+        outputs=[wp.from_torch(views), listed, counts[1], error],
     )  # fmt: skip
-    return flags[0, 0] != 0
+    return views[0, 0] != 0
 
 
 def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:

@@ -1,20 +1,16 @@
 """Maps of the robots and of the team (design 4.2): counting what is new, overlap, merging, sharing.
 
-Flags live in words of 32 robots, ``[env, word, point]``. ``now`` holds the scan of this local step,
-``seen`` everything a robot has scanned itself, ``known`` what it also heard from others.
+Flags live in words of 32 robots, ``[env, word, point]``: ``seen`` holds everything a robot has scanned itself,
+``known`` what it also heard from others. How many robots have ever seen a point is counted beside (``viewers``, and in
+its upper half how many see it in this local step), so that no kernel goes through the words of a large team.
 All sums are integers: weights are spacing squared in the map's unit, 1 on maps of even density.
 """
 
 import warp as wp
 
-from maexp.kernels.types import ROBOTS_PER_WORD, Maps
+from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
-
-
-@wp.func
-def many_bits(word: int) -> bool:
-    return wp.bit_count(word) > 1
 
 
 @wp.kernel
@@ -24,20 +20,50 @@ def _count_points(
     map_id: wp.array(dtype=wp.int32),
     # State in:
     active: wp.array(dtype=wp.int32),
-    now_free: wp.array3d(dtype=wp.int32),
-    seen_free: wp.array3d(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),
     visible: wp.array3d(dtype=wp.int32),
     visible_count: wp.array2d(dtype=wp.int32),
     # Out:
     fresh: wp.array2d(dtype=wp.int32),
     overlap: wp.array2d(dtype=wp.int32),
+):
+    """Weigh the points robot (e, i) sees now: new to the team, seen by another now."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    first = maps.free_begin[map_id[e]]
+    fresh_sum = int(0)
+    overlap_sum = int(0)
+    for k in range(wp.min(visible_count[e, i], visible.shape[2])):
+        j = visible[e, i, k]
+        weight = maps.free_weight[first + j]
+        viewers = viewers_free[e, 0, j]
+        if viewers % VIEWER_NOW == 0:
+            fresh_sum += weight
+        if viewers / VIEWER_NOW > 1:
+            overlap_sum += weight
+    fresh[e, i] = fresh_sum
+    overlap[e, i] = overlap_sum
+
+
+@wp.kernel
+def _merge_scan(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    visible: wp.array3d(dtype=wp.int32),
+    visible_count: wp.array2d(dtype=wp.int32),
+    # State out:
+    seen_free: wp.array3d(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),
     covered: wp.array(dtype=wp.int32),
     shared: wp.array(dtype=wp.int32),
 ):
-    """Weigh the points robot (e, i) sees now: new to the team, seen by another now; update the team's sums.
+    """Add the scan of robot (e, i) to what it has seen, and clear the scan's counts.
 
-    ``covered`` grows by points nobody had seen, ``shared`` by points that now have two or more viewers;
-    of several robots that see a point now the lowest one reports it.
+    A point's first viewer adds it to ``covered``, its second one to ``shared``.
     """
     e, i = wp.tid()
     if active[e] == 0:
@@ -45,67 +71,20 @@ def _count_points(
     first = maps.free_begin[map_id[e]]
     word = i / ROBOTS_PER_WORD
     bit = 1 << (i % ROBOTS_PER_WORD)
-    below = ~(-1 << (i % ROBOTS_PER_WORD))
-    words = now_free.shape[1]
-    fresh_sum = int(0)
-    overlap_sum = int(0)
     covered_sum = int(0)
     shared_sum = int(0)
     for k in range(wp.min(visible_count[e, i], visible.shape[2])):
         j = visible[e, i, k]
-        weight = maps.free_weight[first + j]
-        others = int(0)  # does another robot see it now?
-        lowest = int(1)  # is this the lowest robot that sees it now?
-        before = int(0)  # viewers before this step: 0, 1, 2 (or more)
-        after = int(0)
-        for w in range(words):
-            now = now_free[e, w, j]
-            old = seen_free[e, w, j]
-            if now != 0:
-                if w != word or (now & ~bit) != 0:
-                    others = 1
-                if w < word or (w == word and (now & below) != 0):
-                    lowest = 0
-            if old != 0:
-                before = wp.where(before > 0 or many_bits(old), 2, 1)
-            merged = old | now
-            if merged != 0:
-                after = wp.where(after > 0 or many_bits(merged), 2, 1)
-        if before == 0:
-            fresh_sum += weight
-        if others != 0:
-            overlap_sum += weight
-        if lowest != 0:
+        wp.atomic_and(viewers_free, e, 0, j, VIEWER_NOW - 1)
+        if (seen_free[e, word, j] & bit) == 0:
+            wp.atomic_or(seen_free, e, word, j, bit)
+            before = wp.atomic_add(viewers_free, e, 0, j, 1) % VIEWER_NOW
             if before == 0:
-                covered_sum += weight
-            if before < 2 and after == 2:
-                shared_sum += weight
-    fresh[e, i] = fresh_sum
-    overlap[e, i] = overlap_sum
+                covered_sum += maps.free_weight[first + j]
+            elif before == 1:
+                shared_sum += maps.free_weight[first + j]
     wp.atomic_add(covered, e, covered_sum)
     wp.atomic_add(shared, e, shared_sum)
-
-
-@wp.kernel
-def _merge_scan(
-    # State in:
-    active: wp.array(dtype=wp.int32),
-    visible: wp.array3d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
-    # State out:
-    now_free: wp.array3d(dtype=wp.int32),
-    seen_free: wp.array3d(dtype=wp.int32),
-):
-    """Add the scan of robot (e, i) to what it has seen and clear the scan's flags."""
-    e, i = wp.tid()
-    if active[e] == 0:
-        return
-    word = i / ROBOTS_PER_WORD
-    bit = 1 << (i % ROBOTS_PER_WORD)
-    for k in range(wp.min(visible_count[e, i], visible.shape[2])):
-        j = visible[e, i, k]
-        wp.atomic_or(seen_free, e, word, j, bit)
-        wp.atomic_and(now_free, e, word, j, ~bit)
 
 
 @wp.kernel

@@ -27,13 +27,25 @@ def pixel_of(maps: Maps, m: int, p: wp.vec2) -> wp.vec2i:
 
 
 @wp.func
-def count_viewers(maps: Maps, m: int, e: int, p: int, free_count: int, seen_free: wp.array3d(dtype=wp.int32)) -> int:
+def count_viewers(
+    maps: Maps,
+    m: int,
+    e: int,
+    p: int,
+    free_count: int,
+    seen_free: wp.array3d(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),
+) -> int:
     """Robots that have seen a free point shown by pixel p."""
     pixel = m * PIXELS * PIXELS + p
+    begin = maps.pixel_point_begin[pixel]
+    end = maps.pixel_point_begin[pixel + 1]
+    if end - begin == 1 and maps.pixel_point[begin] < free_count:
+        return viewers_free[e, 0, maps.pixel_point[begin]]
     viewers = int(0)
     for w in range(seen_free.shape[1]):
         word = int(0)
-        for k in range(maps.pixel_point_begin[pixel], maps.pixel_point_begin[pixel + 1]):
+        for k in range(begin, end):
             j = maps.pixel_point[k]
             if j < free_count:
                 word = word | seen_free[e, w, j]
@@ -53,16 +65,17 @@ def _draw_points(
     draw_free: wp.array3d(dtype=wp.int32),
     draw_boundary: wp.array3d(dtype=wp.int32),
     seen_free: wp.array3d(dtype=wp.int32),
-    seen_boundary: wp.array3d(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),
+    viewers_boundary: wp.array3d(dtype=wp.int32),
     # Out:
     picture: wp.array4d(dtype=wp.uint8),
     team: wp.array3d(dtype=wp.uint8),
 ):
     """Enter every known point of env e into the pictures of the robots (explored, obstacle) and of the team.
 
-    ``draw_*`` are the flags drawn for the robots (seen or known), ``seen_*`` those of the team's map;
+    ``draw_*`` are the flags drawn for the robots (seen or known), the others tell of the team's map;
     with ``team_bits`` every robot is drawn the team's map (what it knows under perfect communication).
-    The pictures come in as zeros, so a point nobody knows costs only its reading.
+    The pictures come in as zeros, so a point nobody has seen costs only its reading.
     """
     e, lane = wp.tid()
     m = map_id[e]
@@ -70,58 +83,75 @@ def _draw_points(
     count = free_count + maps.boundary_begin[m + 1] - maps.boundary_begin[m]
     for j in range(lane, count, lanes):
         channel = wp.where(j < free_count, 0, 1)
-        start = maps.point_pixel_begin[maps.shown_begin[m] + j]
-        stop = maps.point_pixel_begin[maps.shown_begin[m] + j + 1]
-        anyone = int(0)
-        for w in range(seen_free.shape[1]):
-            word = int(0)
-            if channel == 0:
-                word = draw_free[e, w, j]
-                anyone = anyone | seen_free[e, w, j]
-            else:
-                word = draw_boundary[e, w, j - free_count]
-                anyone = anyone | seen_boundary[e, w, j - free_count]
-            if word != 0 and team_bits == 0:
-                first = w * ROBOTS_PER_WORD
-                for i in range(first, wp.min(first + ROBOTS_PER_WORD, robot_count)):
-                    if (word & (1 << (i - first))) != 0:
-                        for k in range(start, stop):
-                            picture[e, i, channel, maps.point_pixel[k]] = ON
-        if anyone != 0:
+        viewers = int(0)
+        if channel == 0:
+            viewers = viewers_free[e, 0, j]
+        else:
+            viewers = viewers_boundary[e, 0, j - free_count]
+        if viewers != 0:
+            start = maps.point_pixel_begin[maps.shown_begin[m] + j]
+            stop = maps.point_pixel_begin[maps.shown_begin[m] + j + 1]
             for k in range(start, stop):
                 p = maps.point_pixel[k]
                 team[e, channel, p] = ON
                 if channel == 0:
-                    team[e, 2, p] = wp.uint8(wp.min(count_viewers(maps, m, e, p, free_count, seen_free), 255))
+                    shown = count_viewers(maps, m, e, p, free_count, seen_free, viewers_free)
+                    team[e, 2, p] = wp.uint8(wp.min(shown, 255))
                 if team_bits != 0:
                     for i in range(robot_count):
                         picture[e, i, channel, p] = ON
+            if team_bits == 0:
+                for w in range(draw_free.shape[1]):
+                    word = int(0)
+                    if channel == 0:
+                        word = draw_free[e, w, j]
+                    else:
+                        word = draw_boundary[e, w, j - free_count]
+                    first = w * ROBOTS_PER_WORD
+                    for i in range(first, wp.where(word == 0, first, wp.min(first + ROBOTS_PER_WORD, robot_count))):
+                        if (word & (1 << (i - first))) != 0:
+                            for k in range(start, stop):
+                                picture[e, i, channel, maps.point_pixel[k]] = ON
 
 
-@wp.func
-def draw_body(
+@wp.kernel
+def _list_bodies(
+    # Map:
     maps: Maps,
-    m: int,
-    e: int,
-    i: int,
-    at: wp.vec2,
-    theta: float,
-    length: float,
-    width: float,
-    value: wp.uint8,
-    picture: wp.array4d(dtype=wp.uint8),
+    map_id: wp.array(dtype=wp.int32),
+    # Robots:
+    robots: Robots,
+    # State in:
+    pose: wp.array2d(dtype=wp.vec4),
+    center: wp.array2d(dtype=wp.vec3),
+    # Scratch out:
+    body_pixel: wp.array3d(dtype=wp.int32),
+    body_count: wp.array2d(dtype=wp.int32),
+    error: wp.array(dtype=wp.int32),
 ):
-    """Fill the pixels whose centres lie in a body, and the one nearest to its centre."""
+    """List the pixels whose centres lie in the body of robot (e, i), and the one nearest to its centre."""
+    e, i = wp.tid()
+    m = map_id[e]
+    at = point_xy(center[e, i])
+    length = robots.length[e, i]
+    width = robots.width[e, i]
     reach = wp.vec2(1.0, 1.0) * (0.5 * (length + width))
     low = pixel_of(maps, m, at - reach)
     high = pixel_of(maps, m, at + reach)
+    middle = pixel_of(maps, m, at)
+    body_pixel[e, i, 0] = middle[0] * PIXELS + middle[1]
+    count = int(1)
     for ix in range(low[0], high[0] + 1):
         for iy in range(low[1], high[1] + 1):
             p = maps.frame_origin[m] + maps.pixel_size[m] * wp.vec2(float(ix), float(iy))
-            if rectangle_distance(p, at, theta, length, width) == 0.0:
-                picture[e, i, 2, ix * PIXELS + iy] = value
-    middle = pixel_of(maps, m, at)
-    picture[e, i, 2, middle[0] * PIXELS + middle[1]] = value
+            if rectangle_distance(p, at, pose[e, i][3], length, width) == 0.0:
+                if count < body_pixel.shape[2]:
+                    body_pixel[e, i, count] = ix * PIXELS + iy
+                count += 1
+    if count > body_pixel.shape[2]:
+        wp.atomic_or(error, e, 4)
+        count = body_pixel.shape[2]
+    body_count[e, i] = count
 
 
 @wp.func
@@ -139,15 +169,10 @@ def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.ar
 
 @wp.kernel
 def _draw_robots(
-    # Map:
-    maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
-    # Robots:
-    robots: Robots,
     # State in:
-    pose: wp.array2d(dtype=wp.vec4),
-    center: wp.array2d(dtype=wp.vec3),
     comm: wp.array3d(dtype=wp.bool),
+    body_pixel: wp.array3d(dtype=wp.int32),
+    body_count: wp.array2d(dtype=wp.int32),
     local_step: wp.array(dtype=wp.int32),
     track: wp.array3d(dtype=wp.int32),
     # Out:
@@ -155,16 +180,12 @@ def _draw_robots(
 ):
     """Draw bodies (own 255, others it hears 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
     e, i = wp.tid()
-    m = map_id[e]
-    for other in range(pose.shape[1]):
+    for other in range(body_count.shape[1]):
         if other != i and comm[e, i, other]:
-            draw_body(
-                maps, m, e, i, point_xy(center[e, other]), pose[e, other][3],
-                robots.length[e, other], robots.width[e, other], OTHER, picture,
-            )  # fmt: skip
-    draw_body(
-        maps, m, e, i, point_xy(center[e, i]), pose[e, i][3], robots.length[e, i], robots.width[e, i], ON, picture
-    )
+            for k in range(body_count[e, other]):
+                picture[e, i, 2, body_pixel[e, other, k]] = OTHER
+    for k in range(body_count[e, i]):
+        picture[e, i, 2, body_pixel[e, i, k]] = ON
     last = local_step[e]
     depth = track.shape[2]
     oldest = wp.max(0, last - depth + 1)

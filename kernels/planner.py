@@ -20,7 +20,7 @@ def spread(k: int, count: int, limit: float) -> float:
 
 @wp.func
 def is_known(flags: wp.array3d(dtype=wp.int32), e: int, i: int, j: int, limited: int) -> bool:
-    """Whether robot i knows point j: its own flag where communication is limited, anybody's otherwise."""
+    """Whether robot i knows point j: its own flag where communication is limited, any word otherwise."""
     if limited != 0:
         return (flags[e, i / ROBOTS_PER_WORD, j] & (1 << (i % ROBOTS_PER_WORD))) != 0
     for w in range(flags.shape[1]):
@@ -36,25 +36,29 @@ def gather_obstacles(
     e: int,
     i: int,
     at: wp.vec2,
+    in_range: float,
+    middle: wp.vec2,
     reach: float,
     limited: int,
     known_boundary: wp.array3d(dtype=wp.int32),
     nearby: wp.array3d(dtype=wp.vec2),
 ) -> int:
-    """List the known boundary points within ``reach`` of a robot; returns how many there are."""
+    """List the known boundary points in range of a robot and within ``reach`` of ``middle``; returns how many."""
     count = int(0)
-    rows = row_range(maps, m, at, reach)
+    around = wp.where(in_range < reach, at, middle)
+    rows = row_range(maps, m, around, wp.min(in_range, reach))
     first = maps.boundary_begin[m]
     for row in range(rows[0], rows[1] + 1):
-        span = row_span(maps, m, row, at, reach)
+        span = row_span(maps, m, row, around, wp.min(in_range, reach))
         if span[0] <= span[1]:
             base = maps.cell_begin[m] + row * maps.cells_x[m]
             for j in range(maps.boundary_cell[base + span[0]], maps.boundary_cell[base + span[1] + 1]):
                 p = point_xy(maps.boundary[first + j])
-                if wp.length(p - at) <= reach and is_known(known_boundary, e, i, j, limited):
-                    if count < nearby.shape[2]:
-                        nearby[e, i, count] = p
-                    count += 1
+                if wp.length(p - at) <= in_range and wp.length(p - middle) <= reach:
+                    if is_known(known_boundary, e, i, j, limited):
+                        if count < nearby.shape[2]:
+                            nearby[e, i, count] = p
+                        count += 1
     return count
 
 
@@ -63,20 +67,22 @@ def gather_mates(
     robots: Robots,
     e: int,
     i: int,
-    reach: float,
     in_range: float,
+    middle: wp.vec2,
+    reach: float,
     center: wp.array2d(dtype=wp.vec3),
     mates: wp.array3d(dtype=wp.int32),
 ) -> int:
-    """List the robots in radar range whose bodies come within ``reach`` of a robot's centre; returns how many."""
+    """List the robots in radar range whose bodies come within ``reach`` of ``middle``; returns how many."""
     count = int(0)
     here = point_xy(center[e, i])
     for other in range(center.shape[1]):
         if other != i:
-            gap = wp.length(point_xy(center[e, other]) - here)
-            if gap <= in_range and gap <= reach + robots.length[e, other] + robots.width[e, other]:
-                mates[e, i, count] = other
-                count += 1
+            there = point_xy(center[e, other])
+            if wp.length(there - here) <= in_range:
+                if wp.length(there - middle) <= reach + robots.length[e, other] + robots.width[e, other]:
+                    mates[e, i, count] = other
+                    count += 1
     return count
 
 
@@ -88,25 +94,32 @@ def body_distance(
     i: int,
     at: wp.vec2,
     theta: float,
+    clearance: float,
     footprint: int,
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
     mates: wp.array3d(dtype=wp.int32),
 ) -> float:
-    """Distance from a predicted body of robot i to the nearest of the listed bodies, where they are now."""
+    """Distance from a predicted body of robot i to the nearest of the listed bodies, where they are now.
+
+    Bodies that surely keep the clearance may be left out.
+    """
     nearest = float(1.0e30)
+    own = float(footprint) * (robots.length[e, i] + robots.width[e, i])
     for k in range(count):
         other = mates[e, i, k]
         there = point_xy(center[e, other])
         length = robots.length[e, other]
         width = robots.width[e, other]
-        if footprint != 0:
-            gap = rectangles_gap(
-                at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
-            )
-        else:
-            gap = rectangle_distance(at, there, pose[e, other][3], length, width)
-        nearest = wp.min(nearest, gap)
+        if wp.length(there - at) <= 1.001 * clearance + own + length + width:
+            gap = float(0.0)
+            if footprint != 0:
+                gap = rectangles_gap(
+                    at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
+                )
+            else:
+                gap = rectangle_distance(at, there, pose[e, other][3], length, width)
+            nearest = wp.min(nearest, gap)
     return nearest
 
 
@@ -185,15 +198,6 @@ def _plan_dwa(
     at = point_xy(center[e, i])
     steps = float(horizon)
     speed = wp.abs(start[2]) + wp.abs(slip[e, i])
-    travel = dt * steps * (speed + 1.5 * accel * dt * steps) + 2.0 * wp.abs(offset)
-    reach = travel + clearance + float(footprint) * (length + width)
-    in_range = robots.radar_range[e, i]
-    count = gather_obstacles(maps, m, e, i, at, wp.min(reach, in_range), limited, known_boundary, nearby)
-    if count > nearby.shape[2]:
-        wp.atomic_or(error, e, 4)
-        count = nearby.shape[2]
-    # A body farther away than this cannot come nearer than the clearance, below which alone it counts.
-    mate_count = gather_mates(robots, e, i, reach, in_range, center, mates)
     reach_turn = turn
     if kind == OMNIDIRECTIONAL:
         reach_turn = accel
@@ -204,6 +208,16 @@ def _plan_dwa(
     s0 = wp.sin(start[3])
     x0 = start[0] + (v0 * c0 - side0 * s0) * dt
     y0 = start[1] + (v0 * s0 + side0 * c0) * dt
+    # What is farther than this from there cannot come nearer than the clearance, below which alone it counts.
+    middle = wp.vec2(x0, y0)
+    travel = dt * (steps - 1.0) * (speed + 1.5 * accel * dt * steps) + wp.abs(offset)
+    reach = 1.001 * (travel + clearance) + float(footprint) * (length + width)
+    in_range = robots.radar_range[e, i]
+    count = gather_obstacles(maps, m, e, i, at, in_range, middle, reach, limited, known_boundary, nearby)
+    if count > nearby.shape[2]:
+        wp.atomic_or(error, e, 4)
+        count = nearby.shape[2]
+    mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, mates)
     best = float(-1.0e30)
     best_k = int(0)
     for b in range(num_turns):
@@ -231,16 +245,18 @@ def _plan_dwa(
                 c = wp.cos(theta)
                 s = wp.sin(theta)
             p = wp.vec2(x + offset * c, y + offset * s)
-            d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
-            d = wp.min(d, body_distance(robots, mate_count, e, i, p, theta, footprint, pose, center, mates))
             score = -wp.length(target[e, i] - p)
-            if d < clearance:
-                score += weight * wp.log(wp.max(d, NEAREST) / clearance)
-            k = a * num_turns + b
-            if score > best or (score == best and k < best_k):
-                best = score
-                best_k = k
-                control[e, i] = wp.vec2(push, u)
+            if not score < best:  # what is in the way can only lower it
+                d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
+                d = wp.min(d, body_distance(
+                    robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, mates))  # fmt: skip
+                if d < clearance:
+                    score += weight * wp.log(wp.max(d, NEAREST) / clearance)
+                k = a * num_turns + b
+                if score > best or (score == best and k < best_k):
+                    best = score
+                    best_k = k
+                    control[e, i] = wp.vec2(push, u)
 
 
 @wp.kernel

@@ -16,7 +16,7 @@ from maexp.kernels.visibility import BINS
 
 # name: (axes, torch dtype, Warp dtype). Axes: E envs, N robots, W words of 32 robots, F free and B boundary points
 # of the largest map; H, P, Q are W, F, B where communication is limited and 1 elsewhere; T track length,
-# V visible points, K occluders, O boundary points in range; digits are literal.
+# V visible points, K occluders, O boundary points in range, G pixels of a body; digits are literal.
 STATE = {
     "seed": ("1", torch.int32, wp.int32),
     "map_id": ("E", torch.int32, wp.int32),
@@ -46,6 +46,8 @@ STATE = {
     "episode_reward": ("E N", torch.float32, wp.float32),
     "seen_free": ("E W F", torch.int32, wp.int32),
     "seen_boundary": ("E W B", torch.int32, wp.int32),
+    "viewers_free": ("E 1 F", torch.int32, wp.int32),
+    "viewers_boundary": ("E 1 B", torch.int32, wp.int32),
     "known_free": ("E H P", torch.int32, wp.int32),
     "known_boundary": ("E H Q", torch.int32, wp.int32),
     "comm": ("E N N", torch.bool, wp.bool),
@@ -57,7 +59,6 @@ SCRATCH = {
     "fresh": ("E N", torch.int32, wp.int32),
     "overlap": ("E N", torch.int32, wp.int32),
     "crashed": ("E N", torch.int32, wp.int32),
-    "now_free": ("E W F", torch.int32, wp.int32),
     "told_free": ("E H P", torch.int32, wp.int32),
     "told_boundary": ("E H Q", torch.int32, wp.int32),
     "visible": ("E N V", torch.int32, wp.int32),
@@ -68,6 +69,8 @@ SCRATCH = {
     "occluder_count": ("E N", torch.int32, wp.int32),
     "nearby": ("E N O 2", torch.float32, wp.vec2),
     "mates": ("E N N", torch.int32, wp.int32),
+    "body_pixel": ("E N G", torch.int32, wp.int32),
+    "body_count": ("E N", torch.int32, wp.int32),
     "command": ("E N 2", torch.float32, wp.vec2),
     "region": ("E N", torch.int64, wp.int64),
     "offset": ("E N 2", torch.float32, wp.vec2),
@@ -84,6 +87,7 @@ def axis_sizes(
     nearby: int,
     track: int,
     limited: bool,
+    body_pixels: int = 1,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     words = -(-num_robots // ROBOTS_PER_WORD)
@@ -91,7 +95,7 @@ def axis_sizes(
         "E": num_envs, "N": num_robots, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
-        "O": max(nearby, 1), "T": track, "R": int(TERMS), "D": 2 * int(BINS),
+        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": int(TERMS), "D": 2 * int(BINS),
     }  # fmt: skip
 
 

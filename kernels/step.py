@@ -92,8 +92,8 @@ class Shard:
         )  # fmt: skip
 
     def known(self, what: str) -> wp.array:
-        """Flags of what each robot knows: those of the team under perfect communication."""
-        prefix = "known" if self.sim.settings.comm_limited else "seen"
+        """What each robot knows, not 0: flags of robots, or under perfect communication one word, the viewers."""
+        prefix = "known" if self.sim.settings.comm_limited else "viewers"
         return getattr(self.view, f"{prefix}_{what}")
 
     def move(self, launch: Callable) -> None:
@@ -114,27 +114,29 @@ class Shard:
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         launch(
             visibility._collect_occluders, self.shape,
-            [maps, s.map_id, self.robots, running, s.pose, s.center],
+            [maps, s.map_id, 1, self.robots, running, s.pose, s.center],
             [s.bins, s.direction, s.limit, s.occluder_count, s.visible_count, s.error],
         )  # fmt: skip
         launch(
             visibility._scan_free, (*self.shape, self.lanes),
-            [maps, s.map_id, self.robots, self.lanes, running, s.pose, s.center,
+            [maps, s.map_id, 1, self.robots, self.lanes, running, s.pose, s.center,
              s.bins, s.direction, s.limit, s.occluder_count],
-            [s.now_free, s.visible, s.visible_count, s.error],
+            [s.viewers_free, s.visible, s.visible_count, s.error],
         )  # fmt: skip
         launch(
             visibility._scan_boundary, (*self.shape, self.lanes),
-            [maps, s.map_id, self.robots, self.lanes, running, s.center, s.now_free], [s.seen_boundary],
+            [maps, s.map_id, self.robots, self.lanes, running, s.center, s.visible, s.visible_count],
+            [s.seen_boundary, s.viewers_boundary],
         )  # fmt: skip
         launch(
             merge._count_points, self.shape,
-            [maps, s.map_id, running, s.now_free, s.seen_free, s.visible, s.visible_count],
-            [s.fresh, s.overlap, s.covered, s.shared],
+            [maps, s.map_id, running, s.viewers_free, s.visible, s.visible_count],
+            [s.fresh, s.overlap],
         )  # fmt: skip
         launch(
-            merge._merge_scan, self.shape, [running, s.visible, s.visible_count], [s.now_free, s.seen_free]
-        )
+            merge._merge_scan, self.shape, [maps, s.map_id, running, s.visible, s.visible_count],
+            [s.seen_free, s.viewers_free, s.covered, s.shared],
+        )  # fmt: skip
         if cfg.comm_limited:
             launch(
                 merge._hear_robots, self.shape,
@@ -172,7 +174,7 @@ class Shard:
         """Reset the envs of ``mask``: clear, place the team, take the first scan."""
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         envs, n = self.shape
-        flags = [s.seen_free, s.seen_boundary, s.now_free]
+        flags = [s.seen_free, s.seen_boundary, s.viewers_free, s.viewers_boundary]
         if cfg.comm_limited:
             flags += [s.known_free, s.known_boundary]
         for f in flags:
@@ -231,12 +233,16 @@ class Shard:
         launch(
             observe._draw_points, dim=(self.shape[0], lanes),
             inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, lanes,
-                    free, boundary, s.seen_free, s.seen_boundary],
+                    free, boundary, s.seen_free, s.viewers_free, s.viewers_boundary],
             outputs=out,
         )  # fmt: skip
         launch(
+            observe._list_bodies, dim=self.shape, inputs=[maps, s.map_id, self.robots, s.pose, s.center],
+            outputs=[s.body_pixel, s.body_count, s.error],
+        )  # fmt: skip
+        launch(
             observe._draw_robots, dim=self.shape,
-            inputs=[maps, s.map_id, self.robots, s.pose, s.center, s.comm, s.local_step, s.track], outputs=[out[0]],
+            inputs=[s.comm, s.body_pixel, s.body_count, s.local_step, s.track], outputs=[out[0]],
         )  # fmt: skip
         launch(
             observe._observe_pose, dim=self.shape,

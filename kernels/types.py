@@ -13,6 +13,9 @@ import warp as wp
 ROBOTS_PER_WORD = 32
 """Robots that share one int32 of flags: robot ``i`` owns bit ``i % 32`` of word ``i // 32``."""
 
+VIEWER_NOW = wp.constant(1 << 16)
+"""What a robot that sees a point now adds to its viewers during a scan; one that has ever seen it adds 1."""
+
 ACKERMANN = wp.constant(0)
 DIFFERENTIAL = wp.constant(1)
 OMNIDIRECTIONAL = wp.constant(2)
@@ -45,16 +48,17 @@ class Maps:
     free_cell: wp.array(dtype=wp.int32)
     total_weight: wp.array(dtype=wp.int32)  # [M]
 
-    # Boundary points (obstacles that touch free space) and their free neighbours within 1.5 spacings.
+    # Boundary points (obstacles that touch free space), and for every free point those within 1.5 of their spacings.
     boundary: wp.array(dtype=wp.vec3)
     boundary_begin: wp.array(dtype=wp.int32)  # [M + 1]
     boundary_cell: wp.array(dtype=wp.int32)
-    neighbour_begin: wp.array(dtype=wp.int32)  # [all boundary points + 1]
+    neighbour_begin: wp.array(dtype=wp.int32)  # [all free points + 1]
     neighbour: wp.array(dtype=wp.int32)
 
     # Points that mask the radar: the boundary, or all obstacles where the radius leaves gaps.
     occluder: wp.array(dtype=wp.vec3)
     occluder_radius: wp.array(dtype=wp.float32)
+    occluder_radius_max: wp.array(dtype=wp.float32)  # [M]
     occluder_begin: wp.array(dtype=wp.int32)  # [M + 1]
     occluder_cell: wp.array(dtype=wp.int32)
 
@@ -108,9 +112,8 @@ def point_xy(p: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def cell_index(value: float, origin: float, size: float, count: int) -> int:
-    """Cell of a coordinate, clamped to the grid."""
-    return wp.clamp(int(wp.floor((value - origin) / size)), 0, count - 1)
+def cell_center(maps: Maps, m: int, row: int, col: int) -> wp.vec2:
+    return maps.cell_origin[m] + maps.cell_size[m] * wp.vec2(float(col) + 0.5, float(row) + 0.5)
 
 
 @wp.func

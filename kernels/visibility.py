@@ -11,17 +11,34 @@ Directions are cut into bins so that most points need no pairwise test. For ever
 distance of the nearest occluder that may touch it (``near``) and of the nearest one that surely
 covers all of it (``full``). A free point nearer than ``near`` is visible, one behind ``full`` is
 masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit.
+
+Likewise an occluder all of whose bins are full nearer than itself decides nothing: every free point
+that it could mask is masked. So occluders are entered the nearest rows of cells first, and cells and bodies
+behind what is full are left out at once: with walls around, the cost follows what is seen, not the
+square of the range. In a cloud that is not ``planar`` bins do not decide alone, and nothing is left out.
 """
 
 import warp as wp
 
-from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots, row_range, row_span
+from maexp.kernels.types import (
+    ROBOTS_PER_WORD,
+    VIEWER_NOW,
+    Maps,
+    Robots,
+    cell_center,
+    floor_within,
+    row_range,
+    row_span,
+)
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
 BINS = wp.constant(128)
 FAR = wp.constant(1.0e30)
 BIN_MARGIN = wp.constant(1.0e-4)  # in diamond angle; far above float32 error of the exact test
+CELL_HALF = wp.constant(0.709)  # half the diagonal of a cell in edges, with room for rounding
+WORTH_A_TEST = wp.constant(6)  # free points of a cell from which on it pays to ask first whether it is hidden
+WORTH_AN_OCCLUDER = wp.constant(2)  # occluders from which on it does
 
 
 @wp.func
@@ -50,26 +67,49 @@ def lower_all_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, dist: flo
 
 
 @wp.func
-def cover_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, u: wp.vec3, c: float, dist: float):
-    """Enter an occluder of direction ``u`` and angular half-width acos(c) into the bins."""
-    if c < 0.0 or wp.abs(u[2]) > 1.0e-6:
-        lower_all_bins(bins, e, i, dist)
-        return
+def sector(x: float, y: float, c: float) -> wp.vec2:
+    """First and last diamond angle (the last up to 8) of the directions within acos(c) of the unit vector (x, y)."""
     s = wp.sqrt(wp.max(1.0 - c * c, 0.0))
-    start = diamond_angle(c * u[0] + s * u[1], c * u[1] - s * u[0])
-    stop = diamond_angle(c * u[0] - s * u[1], c * u[1] + s * u[0])
+    start = diamond_angle(c * x + s * y, c * y - s * x)
+    stop = diamond_angle(c * x - s * y, c * y + s * x)
     if stop < start - BIN_MARGIN:
         stop += 4.0
+    return wp.vec2(start, stop)
+
+
+@wp.func
+def cover_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, u: wp.vec3, c: float, dist: float) -> bool:
+    """Enter an occluder of direction ``u`` and angular half-width acos(c); False where all its bins are full before."""
+    if c < 0.0 or wp.abs(u[2]) > 1.0e-6:
+        lower_all_bins(bins, e, i, dist)
+        return True
+    edges = sector(u[0], u[1], c)
     scale = float(BINS) / 4.0
-    first = int(wp.floor((start - BIN_MARGIN) * scale))
-    last = int(wp.floor((stop + BIN_MARGIN) * scale))
-    full_from = (start + BIN_MARGIN) * scale
-    full_to = (stop - BIN_MARGIN) * scale
-    for b in range(first, last + 1):
+    full_from = (edges[0] + BIN_MARGIN) * scale
+    full_to = (edges[1] - BIN_MARGIN) * scale
+    farthest = float(0.0)
+    for b in range(int(wp.floor((edges[0] - BIN_MARGIN) * scale)), int(wp.floor((edges[1] + BIN_MARGIN) * scale)) + 1):
         k = b & (BINS - 1)
+        farthest = wp.max(farthest, bins[e, i, BINS + k])
         bins[e, i, k] = wp.min(bins[e, i, k], dist)
         if float(b) >= full_from and float(b + 1) <= full_to:
             bins[e, i, BINS + k] = wp.min(bins[e, i, BINS + k], dist)
+    return farthest > dist
+
+
+@wp.func
+def is_hidden(bins: wp.array3d(dtype=wp.float32), e: int, i: int, x: float, y: float, size: float, near: float) -> bool:
+    """Whether all bins that a disc of radius ``size`` around (x, y) touches are full nearer than ``near``."""
+    dist = wp.sqrt(x * x + y * y)
+    if size >= dist * 0.9999:
+        return False
+    s = size / dist
+    edges = sector(x / dist, y / dist, wp.sqrt(1.0 - s * s))
+    scale = float(BINS) / 4.0
+    for b in range(int(wp.floor((edges[0] - BIN_MARGIN) * scale)), int(wp.floor((edges[1] + BIN_MARGIN) * scale)) + 1):
+        if bins[e, i, BINS + (b & (BINS - 1))] > near:
+            return False
+    return True
 
 
 @wp.func
@@ -78,6 +118,7 @@ def add_occluder(
     rho: float,
     radius: float,
     cos_beam: float,
+    cull: int,
     e: int,
     i: int,
     count: int,
@@ -85,17 +126,18 @@ def add_occluder(
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
 ) -> int:
-    """Append an occluder at ``delta`` from the sensor if it is in range; returns the new count."""
+    """Append an occluder at ``delta`` from the sensor if it is in range and matters; returns the new count."""
     dist = wp.length(delta)
     if dist > radius or dist == 0.0:
         return count
     s = wp.min(1.0, rho / dist)
     c = wp.min(cos_beam, wp.sqrt(1.0 - s * s))
     u = delta / dist
+    if not cover_bins(bins, e, i, u, c, dist) and cull != 0:
+        return count
     if count < direction.shape[2]:
         direction[e, i, count] = u
         limit[e, i, count] = wp.vec2(c, dist)
-        cover_bins(bins, e, i, u, c, dist)
     return count + 1
 
 
@@ -110,6 +152,7 @@ def add_outline(
     origin: wp.vec3,
     radius: float,
     cos_beam: float,
+    cull: int,
     e: int,
     i: int,
     start: int,
@@ -141,7 +184,7 @@ def add_outline(
         p = center + a * length * forward + b * width * left
         count = add_occluder(
             wp.vec3(p[0] - origin[0], p[1] - origin[1], 0.0),
-            rho, radius, cos_beam, e, i, count, bins, direction, limit,
+            rho, radius, cos_beam, cull, e, i, count, bins, direction, limit,
         )  # fmt: skip
     return count
 
@@ -172,11 +215,96 @@ def is_masked(
     return False
 
 
+@wp.func
+def run_length(begin: wp.array(dtype=wp.int32), base: int, span: wp.vec2i, worth: int, cull: int) -> int:
+    """How many cells of a row to take at once: one where they hold so many points that to test each pays, else all."""
+    cells = span[1] - span[0] + 1
+    if cells > 0 and cull != 0:
+        if begin[base + span[1] + 1] - begin[base + span[0]] >= worth * cells:
+            return 1
+    return wp.max(cells, 1)
+
+
+@wp.func
+def add_cells(
+    maps: Maps,
+    m: int,
+    row: int,
+    col: int,
+    run: int,
+    spread: float,
+    origin: wp.vec3,
+    radius: float,
+    cos_beam: float,
+    cull: int,
+    e: int,
+    i: int,
+    start: int,
+    bins: wp.array3d(dtype=wp.float32),
+    direction: wp.array3d(dtype=wp.vec3),
+    limit: wp.array3d(dtype=wp.vec2),
+) -> int:
+    """Append the occluders of a run of cells, unless it is one that is hidden; returns the new count."""
+    count = int(start)
+    cell = maps.cell_begin[m] + row * maps.cells_x[m] + col
+    begin = maps.occluder_cell[cell]
+    end = maps.occluder_cell[cell + run]
+    if run == 1 and end > begin and cull != 0:
+        at = cell_center(maps, m, row, col) - wp.vec2(origin[0], origin[1])
+        half = CELL_HALF * maps.cell_size[m]
+        dist = wp.length(at)
+        width = wp.max(maps.occluder_radius_max[m], spread * (dist + half))
+        if is_hidden(bins, e, i, at[0], at[1], half + width, dist - half):
+            return count
+    first = maps.occluder_begin[m]
+    for j in range(first + begin, first + end):
+        count = add_occluder(
+            maps.occluder[j] - origin, maps.occluder_radius[j], radius, cos_beam, cull,
+            e, i, count, bins, direction, limit,
+        )  # fmt: skip
+    return count
+
+
+@wp.func
+def add_body(
+    maps: Maps,
+    m: int,
+    robots: Robots,
+    other: int,
+    pose: wp.vec4,
+    at: wp.vec2,
+    spread: float,
+    origin: wp.vec3,
+    radius: float,
+    cos_beam: float,
+    planar: int,
+    e: int,
+    i: int,
+    start: int,
+    bins: wp.array3d(dtype=wp.float32),
+    direction: wp.array3d(dtype=wp.vec3),
+    limit: wp.array3d(dtype=wp.vec2),
+) -> int:
+    """Append the outline of robot ``other`` at ``at`` from the sensor, unless it is hidden; returns the new count."""
+    length = robots.length[e, other]
+    width = robots.width[e, other]
+    dist = wp.length(at)
+    half = 0.501 * wp.sqrt(length * length + width * width)
+    reach = half + wp.max(0.36 * wp.max(length, width), spread * (dist + half))
+    if planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
+        return start
+    return add_outline(
+        pose, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
+        origin, radius, cos_beam, planar, e, i, start, bins, direction, limit,
+    )  # fmt: skip
+
+
 @wp.kernel
 def _collect_occluders(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),
+    planar: int,
     # Robots:
     robots: Robots,
     # State in:
@@ -191,13 +319,16 @@ def _collect_occluders(
     visible_count: wp.array2d(dtype=wp.int32),
     error: wp.array(dtype=wp.int32),
 ):
-    """Gather what can mask the radar of robot (e, i): static occluders and the other robots' bodies."""
+    """Gather what can mask the radar of robot (e, i): static occluders, the nearest rows first, and other bodies."""
     e, i = wp.tid()
     if active[e] == 0:
         return
     m = map_id[e]
     radius = robots.radar_range[e, i]
     cos_beam = robots.radar_cos_beam[e, i]
+    spread = wp.sqrt(wp.max(1.0 - cos_beam * cos_beam, 0.0))
+    if cos_beam < 0.0:
+        spread = FAR
     origin = center[e, i]
     visible_count[e, i] = 0
     for b in range(2 * BINS):
@@ -205,26 +336,30 @@ def _collect_occluders(
     count = int(0)
     at = wp.vec2(origin[0], origin[1])
     rows = row_range(maps, m, at, radius)
-    first = maps.occluder_begin[m]
-    for row in range(rows[0], rows[1] + 1):
-        span = row_span(maps, m, row, at, radius)
-        if span[0] <= span[1]:
+    # Few occluders a cell: to ask first costs more than to enter them.
+    cells = maps.cells_x[m] * maps.cells_y[m]
+    cull = wp.where(maps.occluder_begin[m + 1] - maps.occluder_begin[m] >= WORTH_AN_OCCLUDER * cells, planar, 0)
+    middle = floor_within(at[1] - maps.cell_origin[m][1], maps.cell_size[m], 0, maps.cells_y[m] - 1)
+    for k in range(2 * wp.max(middle - rows[0], rows[1] - middle) + 1):
+        row = rows[0] + k
+        if cull != 0:
+            row = middle + wp.where(k % 2 == 0, k / 2, -(k + 1) / 2)
+        if row >= rows[0] and row <= rows[1]:
+            span = row_span(maps, m, row, at, radius)
             base = maps.cell_begin[m] + row * maps.cells_x[m]
-            for j in range(first + maps.occluder_cell[base + span[0]], first + maps.occluder_cell[base + span[1] + 1]):
-                count = add_occluder(
-                    maps.occluder[j] - origin, maps.occluder_radius[j], radius, cos_beam,
+            run = run_length(maps.occluder_cell, base, span, WORTH_AN_OCCLUDER, cull)
+            for col in range(span[0], span[1] + 1, run):
+                count = add_cells(
+                    maps, m, row, col, run, spread, origin, radius, cos_beam, cull,
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     for other in range(pose.shape[1]):
-        if other != i:
-            length = robots.length[e, other]
-            width = robots.width[e, other]
-            if wp.length(center[e, other] - origin) <= radius + length + width:
-                count = add_outline(
-                    pose[e, other], length, width, robots.center_offset[e, other],
-                    maps.resolution[m], maps.outline_radius_max[m], origin, radius, cos_beam,
-                    e, i, count, bins, direction, limit,
-                )  # fmt: skip
+        there = center[e, other] - origin
+        if other != i and wp.length(there) <= radius + robots.length[e, other] + robots.width[e, other]:
+            count = add_body(
+                maps, m, robots, other, pose[e, other], wp.vec2(there[0], there[1]), spread, origin, radius,
+                cos_beam, planar, e, i, count, bins, direction, limit,
+            )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
@@ -236,6 +371,7 @@ def _scan_free(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),
+    planar: int,
     # Robots:
     robots: Robots,
     lanes: int,
@@ -249,12 +385,12 @@ def _scan_free(
     limit: wp.array3d(dtype=wp.vec2),
     occluder_count: wp.array2d(dtype=wp.int32),
     # Scratch out:
-    now_free: wp.array3d(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),
     visible: wp.array3d(dtype=wp.int32),
     visible_count: wp.array2d(dtype=wp.int32),
     error: wp.array(dtype=wp.int32),
 ):
-    """Set the flags of the free points that robot (e, i) sees now and list them."""
+    """List the free points that robot (e, i) sees now and count its view at each of them."""
     e, i, lane = wp.tid()
     if active[e] == 0:
         return
@@ -265,27 +401,31 @@ def _scan_free(
     heading = wp.vec3(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]), 0.0)
     origin = center[e, i]
     count = occluder_count[e, i]
-    word = i / ROBOTS_PER_WORD
-    bit = 1 << (i % ROBOTS_PER_WORD)
     at = wp.vec2(origin[0], origin[1])
+    half = CELL_HALF * maps.cell_size[m]
     rows = row_range(maps, m, at, radius)
     first = maps.free_begin[m]
     for row in range(rows[0], rows[1] + 1):
         span = row_span(maps, m, row, at, radius)
-        if span[0] <= span[1]:
-            base = maps.cell_begin[m] + row * maps.cells_x[m]
-            stop = maps.free_cell[base + span[1] + 1]
-            for j in range(maps.free_cell[base + span[0]] + lane, stop, lanes):
-                delta = maps.free[first + j] - origin
-                dist = wp.length(delta)
-                if dist <= radius and wp.dot(delta, heading) >= cos_fov * dist:
-                    if not is_masked(delta, dist, alpha2, e, i, count, bins, direction, limit):
-                        wp.atomic_or(now_free, e, word, j, bit)
-                        slot = wp.atomic_add(visible_count, e, i, 1)
-                        if slot < visible.shape[2]:
-                            visible[e, i, slot] = j
-                        else:
-                            wp.atomic_or(error, e, 4)
+        base = maps.cell_begin[m] + row * maps.cells_x[m]
+        run = run_length(maps.free_cell, base, span, WORTH_A_TEST, planar)
+        for col in range(span[0], span[1] + 1, run):
+            hidden = bool(False)
+            if run == 1 and planar != 0:
+                to = cell_center(maps, m, row, col) - at
+                hidden = is_hidden(bins, e, i, to[0], to[1], half, wp.length(to) - half + wp.min(alpha2, 0.0))
+            if not hidden:
+                for j in range(maps.free_cell[base + col] + lane, maps.free_cell[base + col + run], lanes):
+                    delta = maps.free[first + j] - origin
+                    dist = wp.length(delta)
+                    if dist <= radius and wp.dot(delta, heading) >= cos_fov * dist:
+                        if not is_masked(delta, dist, alpha2, e, i, count, bins, direction, limit):
+                            wp.atomic_add(viewers_free, e, 0, j, VIEWER_NOW)
+                            slot = wp.atomic_add(visible_count, e, i, 1)
+                            if slot < visible.shape[2]:
+                                visible[e, i, slot] = j
+                            else:
+                                wp.atomic_or(error, e, 4)
 
 
 @wp.kernel
@@ -299,9 +439,11 @@ def _scan_boundary(
     # State in:
     active: wp.array(dtype=wp.int32),
     center: wp.array2d(dtype=wp.vec3),
-    now_free: wp.array3d(dtype=wp.int32),
+    visible: wp.array3d(dtype=wp.int32),
+    visible_count: wp.array2d(dtype=wp.int32),
     # State out:
     seen_boundary: wp.array3d(dtype=wp.int32),
+    viewers_boundary: wp.array3d(dtype=wp.int32),
 ):
     """Mark the boundary points in range that touch a free point seen now by the same robot."""
     e, i, lane = wp.tid()
@@ -312,18 +454,12 @@ def _scan_boundary(
     origin = center[e, i]
     word = i / ROBOTS_PER_WORD
     bit = 1 << (i % ROBOTS_PER_WORD)
-    at = wp.vec2(origin[0], origin[1])
-    rows = row_range(maps, m, at, radius)
-    first = maps.boundary_begin[m]
-    for row in range(rows[0], rows[1] + 1):
-        span = row_span(maps, m, row, at, radius)
-        if span[0] <= span[1]:
-            base = maps.cell_begin[m] + row * maps.cells_x[m]
-            stop = maps.boundary_cell[base + span[1] + 1]
-            for j in range(maps.boundary_cell[base + span[0]] + lane, stop, lanes):
-                if (seen_boundary[e, word, j] & bit) == 0:
-                    if wp.length(maps.boundary[first + j] - origin) <= radius:
-                        for k in range(maps.neighbour_begin[first + j], maps.neighbour_begin[first + j + 1]):
-                            if (now_free[e, word, maps.neighbour[k]] & bit) != 0:
-                                wp.atomic_or(seen_boundary, e, word, j, bit)
-                                break
+    first = maps.free_begin[m]
+    begin = maps.boundary_begin[m]
+    for k in range(lane, wp.min(visible_count[e, i], visible.shape[2]), lanes):
+        point = first + visible[e, i, k]
+        for n in range(maps.neighbour_begin[point], maps.neighbour_begin[point + 1]):
+            j = maps.neighbour[n]
+            if (seen_boundary[e, word, j] & bit) == 0 and wp.length(maps.boundary[begin + j] - origin) <= radius:
+                if (wp.atomic_or(seen_boundary, e, word, j, bit) & bit) == 0:
+                    wp.atomic_add(viewers_boundary, e, 0, j, 1)

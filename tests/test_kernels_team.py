@@ -9,6 +9,7 @@ from oracle import motion, radar
 from worlds import act, moment, room, turned
 
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
+from maexp.kernels import unpack_flags
 from maexp.kernels.state import STATE
 
 pytestmark = pytest.mark.kernels
@@ -38,7 +39,8 @@ def place(env: ExplorationEnv, pose: torch.Tensor, target: torch.Tensor) -> None
     offset = env.simulation.robot_tensors["center_offset"]
     s["center"][..., 0] = pose[..., 0] + offset * torch.cos(pose[..., 3])
     s["center"][..., 1] = pose[..., 1] + offset * torch.sin(pose[..., 3])
-    for name in ("seen_free", "seen_boundary", "known_free", "known_boundary", "covered", "covered_before", "shared"):
+    for name in ("seen_free", "seen_boundary", "known_free", "known_boundary", "covered", "covered_before",
+                 "shared", "viewers_free", "viewers_boundary"):
         s[name].zero_()
     s["goal"].copy_(target)
     s["target"].copy_(target)
@@ -130,6 +132,19 @@ def test_masked_reset_leaves_other_envs_alone(limited):
     scanned = [moment(env, e) for e in (1, 3)]
     for now in scanned:  # of the old episode nothing is left but what the first scan saw
         np.testing.assert_array_equal(now.seen_free, now.visible)
+
+
+@pytest.mark.parametrize("robots", [12, 40])
+def test_viewers_are_the_robots_that_have_seen_a_point(robots):
+    env = team_env(room(34, 27, "jittered", 4), 2, robots)
+    env.reset()
+    generator = torch.Generator().manual_seed(4)
+    for _ in range(2):
+        env.step(act(env, generator))
+        state = env.simulation.tensors
+        for what in ("free", "boundary"):
+            robots_seen = unpack_flags(state[f"seen_{what}"], robots).sum(1)
+            assert torch.equal(state[f"viewers_{what}"][:, 0].long(), robots_seen) and robots_seen.max() > 1
 
 
 def test_an_env_that_ended_stays_frozen():

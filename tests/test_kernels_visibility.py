@@ -8,6 +8,7 @@ import torch
 from oracle import radar
 
 import maexp.kernels as mk
+from maexp.envs import ExplorationEnv, RadarConfig, make_map
 
 pytestmark = pytest.mark.kernels
 
@@ -255,3 +256,21 @@ def test_agrees_with_the_recorded_poses(oracle_dir):
                 got = scan(maze["freespace"], walls, origin, radar_range=10.0, alpha1=alpha1)
                 differ += ((got != poses[verdict][k]) & ~poses[skip][k]).sum()
             assert differ <= 2  # distances equal to within a float32 digit
+
+
+@pytest.mark.parametrize("radius", ["auto", 0.0])
+def test_what_is_hidden_cell_by_cell_is_what_the_definition_masks(radius):
+    """A long range makes cells of many points, which are left out whole where they are hidden."""
+    place = make_map("maze_small", 3)
+    env = ExplorationEnv(place, 6, 1, radar=RadarConfig(range=30.0, obstacle_radius=radius), num_threads=1)
+    env.reset()
+    closed = radius == "auto"
+    walls, rho = (place.boundary, place.resolution / math.sqrt(2.0)) if closed else (place.obstacles, 0.0)
+    seen = 0
+    for e in range(6):
+        shot = env.snapshot(e)
+        origin = np.append(shot["center"][0], 0.0)
+        want, clear = radar.visible_points(place.free, walls, origin, 30.0, obstacle_radius=rho)
+        np.testing.assert_array_equal(shot["visible"][0][clear], want[clear])
+        seen += want.sum()
+    assert 60 < seen < 0.3 * 6 * len(place.free) or not closed, "or nothing was hidden"

@@ -58,7 +58,8 @@ def count_sizes(env: ExplorationEnv, shard: Any) -> dict[str, float]:
         "pixels_per_point": float(shown["point_pixel"].mean()),
         "points_per_pixel": float(shown["pixel_point"][shown["pixel_point"] > 0].mean()),
         "track": float(torch.clamp(s["local_step"][part] + 1, max=sizes["T"]).double().mean()),
-        "pixels_per_body": _pixels_per_body(env),
+        "pixels_tested": _pixels_tested(env),
+        "body_pixels": float(s["body_count"][part].double().mean()),
     }
 
 
@@ -70,7 +71,7 @@ def _bits(words: torch.Tensor) -> torch.Tensor:
     return counted
 
 
-def _pixels_per_body(env: ExplorationEnv) -> float:
+def _pixels_tested(env: ExplorationEnv) -> float:
     """Pixels that the square around a body holds, all of which are tested."""
     pixel = float(np.mean(env.bank.arrays["pixel_size"]))
     sides = [(one.length + one.width) / pixel + 1.0 for one in env.robot_configs]
@@ -82,8 +83,7 @@ def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, 
     s = env.simulation.tensors
     names = (
         "active driving rows plan_rows free_near free_in undecided pair_tests visible occluder_near occluders "
-        "bins_touched outline_points boundary_near boundary_new boundary_in neighbours plan_near plan_known mates "
-        "hit_near"
+        "bins_touched outline_points neighbours plan_near plan_known mates hit_near"
     )
     counts = dict.fromkeys(names.split(), 0.0)
     if not active:
@@ -100,7 +100,7 @@ def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, 
     counts["occluder_near"] = len(cloud.near("occluder", at, reach)[1])
     counts["occluders"] = float(s["occluder_count"][e, i])
     counts |= count_outlines(env, e, i, m, at, reach)
-    counts |= count_boundary(env, cloud, e, i, at, reach)
+    counts["neighbours"] = count_neighbours(env, e, i, m)
     counts["hit_near"] = len(cloud.near("boundary", at, robot.collision_threshold)[1])
     return counts | count_plan(env, cloud, e, i, at)
 
@@ -167,21 +167,11 @@ def count_outlines(env: ExplorationEnv, e: int, i: int, m: int, at: np.ndarray, 
     return {"outline_points": float(points)}
 
 
-def count_boundary(env: ExplorationEnv, cloud: Cloud, e: int, i: int, at: np.ndarray, reach: float) -> dict[str, float]:
-    """Boundary points met by the scan: near, not seen before, in range, and their free neighbours."""
-    points, index = cloud.near("boundary", at, reach)
-    seen = env.simulation.tensors["seen_boundary"][e, i // 32].cpu().numpy()[index] >> (i % 32) & 1
-    inside = np.linalg.norm(points - at, axis=1) <= reach
-    fresh = (seen == 0) & inside
-    begin = env.bank.arrays["neighbour_begin"]
-    first = int(env.bank.arrays["boundary_begin"][cloud.m])
-    neighbours = (begin[first + index + 1] - begin[first + index])[fresh].sum()
-    return {
-        "boundary_near": len(index),
-        "boundary_new": float((seen == 0).sum()),
-        "boundary_in": float(fresh.sum()),
-        "neighbours": float(neighbours),
-    }
+def count_neighbours(env: ExplorationEnv, e: int, i: int, m: int) -> float:
+    """Boundary points beside the free points that the robot sees, once for each of those."""
+    s, begin = env.simulation.tensors, env.bank.arrays["neighbour_begin"]
+    listed = s["visible"][e, i, : int(s["visible_count"][e, i])].cpu().numpy() + env.bank.arrays["free_begin"][m]
+    return float((begin[listed + 1] - begin[listed]).sum())
 
 
 def count_plan(env: ExplorationEnv, cloud: Cloud, e: int, i: int, at: np.ndarray) -> dict[str, float]:

@@ -89,20 +89,19 @@ def scan_free(c: Counts) -> Cost:
 
 
 def scan_boundary(c: Counts) -> Cost:
-    """Flags of the boundary points near; place and neighbours of those not seen yet."""
-    moved = c["rows"] * ROW + c["boundary_near"] * WORD + c["boundary_new"] * VEC3
-    moved += c["boundary_in"] * 2 * WORD + c["neighbours"] * 2 * WORD
-    return Cost(moved, c["boundary_near"] + 7 * c["boundary_new"] + 2 * c["neighbours"])
+    """The visible points, and the flags of the boundary points beside them (most have been seen before)."""
+    moved = c["visible"] * 3 * WORD + c["neighbours"] * 2 * WORD
+    return Cost(moved, c["visible"] + 2 * c["neighbours"])
 
 
 def count_points(c: Counts) -> Cost:
-    """Flags now and before, and weight, of every visible point."""
-    return Cost(c["visible"] * (2 * WORD + 2 * WORD * c["words"]) + 4 * WORD, c["visible"] * (8 + 8 * c["words"]))
+    """Viewers and weight of every visible point."""
+    return Cost(c["visible"] * 3 * WORD + 2 * WORD, c["visible"] * 6)
 
 
 def merge_scan(c: Counts) -> Cost:
-    """Two flags read and written for every visible point."""
-    return Cost(c["visible"] * (WORD + 4 * WORD), 2 * c["visible"])
+    """Viewers read and written, and the flag read, for every visible point (most have been seen before)."""
+    return Cost(c["visible"] * (WORD + 3 * WORD), 2 * c["visible"])
 
 
 def reward_robots(c: Counts) -> Cost:
@@ -121,20 +120,24 @@ def close_step(c: Counts) -> Cost:
 
 
 def draw_points(c: Counts) -> Cost:
-    """Flags of every point of the map; pixels of what each robot and the team have seen."""
+    """Viewers of every point of the map; flags and pixels of what each robot and the team have seen."""
     share = 1 / c["robots"]
     known, drawn, pixels = c["team_points"], c["drawn_points"], c["pixels_per_point"]
-    flags = share * c["map_points"] * (2 * WORD + WORD * c["words"])
-    viewers = known * pixels * (2 * WORD + c["points_per_pixel"] * (WORD + WORD * c["words"]))
+    flags = share * c["map_points"] * WORD + known * (2 * WORD + WORD * c["words"])
+    viewers = known * pixels * (2 * WORD + c["points_per_pixel"] * 2 * WORD)
     moved = flags + drawn * pixels * (WORD + 1) + known * pixels * (WORD + 3) + viewers
-    return Cost(moved, share * c["map_points"] * c["words"] + drawn * 2 + known * pixels * 4 * c["words"])
+    return Cost(moved, share * c["map_points"] + drawn * 2 + known * (c["words"] + pixels * 4))
+
+
+def list_bodies(c: Counts) -> Cost:
+    """The pixels around a body, each tested."""
+    return Cost(VEC4 + VEC3 + 3 * WORD + c["body_pixels"] * WORD, c["pixels_tested"] * (18 + 2 * TRIG) + 20)
 
 
 def draw_robots(c: Counts) -> Cost:
-    """Bodies, pixel by pixel, and the trajectory."""
-    bodies = c["robots"]
-    moved = bodies * (VEC4 + VEC3 + 2 * WORD + 1) + bodies * c["pixels_per_body"] + c["track"] * (WORD + 1)
-    return Cost(moved, bodies * (c["pixels_per_body"] * (18 + 2 * TRIG) + 20) + c["track"] * 12)
+    """Bodies, from their lists of pixels, and the trajectory."""
+    moved = c["robots"] * (WORD + 1 + c["body_pixels"] * (WORD + 1)) + c["track"] * (WORD + 1)
+    return Cost(moved, c["robots"] * (1 + c["body_pixels"]) + c["track"] * 12)
 
 
 def observe_pose(c: Counts) -> Cost:
@@ -185,6 +188,7 @@ FORMULAS: dict[str, Callable[[Counts], Cost]] = {
     "_record_track": record_track,
     "_close_step": close_step,
     "_draw_points": draw_points,
+    "_list_bodies": list_bodies,
     "_draw_robots": draw_robots,
     "_observe_pose": observe_pose,
     "_clear_flags": clear_flags,
