@@ -147,7 +147,11 @@ def heavy(line: str) -> bool:
     return "collector=ray" in line
 
 
-@pytest.mark.parametrize("line", [pytest.param(x, marks=pytest.mark.slow) if heavy(x) else x for x in COMMANDS])
+DIFFERENT = {tuple(small(line)): line for line in reversed(COMMANDS)}.values()  # small, some are the same command
+RUNS = [pytest.param(x, id=x, marks=[pytest.mark.slow] if heavy(x) else []) for x in COMMANDS if x in DIFFERENT]
+
+
+@pytest.mark.parametrize("line", RUNS)
 def test_command(line, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     if heavy(line):
