@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from maexp.envs.map import BOUNDARY_REACH, MapError, PointCloudMap
 
 MAX_RASTER_CELLS = 30_000_000
+WIDE = 24  # steps; wider discs are painted row by row
 MAX_PAIRS = 100_000_000  # of points that touch; 16 bytes each
 ROOM_LIMIT = 64  # teams larger than this are not counted out
 
@@ -77,6 +78,8 @@ class Raster:
         base = np.floor((points[:, :2].astype(np.float64) - self.corner) / self.step).astype(int)
         limit = np.array(self.shape)
         reach = int(np.ceil(radius.max() / self.step))
+        if reach > WIDE:
+            return self._paint_wide(points[:, :2].astype(np.float64), radius, base[:, 0], reach)
         for dx in range(-reach, reach + 2):
             for dy in range(-reach, reach + 2):
                 index = base + (dx, dy)
@@ -84,6 +87,22 @@ class Raster:
                 hit = (away <= radius) & (index >= 0).all(axis=1) & (index < limit).all(axis=1)
                 painted[index[hit, 0], index[hit, 1]] = True
         return painted
+
+    def _paint_wide(self, points: np.ndarray, radius: np.ndarray, base: np.ndarray, reach: int) -> np.ndarray:
+        """The same row by row, where discs are so much larger than the step that place by place takes minutes."""
+        rows, columns = self.shape
+        ends = np.zeros((rows, columns + 1), dtype=np.int32)  # +1 where a chord of a disc begins, -1 behind its end
+        for dx in range(-reach, reach + 2):
+            row = base + dx
+            half = radius**2 - (row * self.step + self.corner[0] - points[:, 0]) ** 2
+            met = (half >= 0) & (row >= 0) & (row < rows)
+            row, half, middle = row[met], np.sqrt(half[met]), points[met, 1] - self.corner[1]
+            first = np.ceil((middle - half) / self.step).clip(0, columns).astype(int)
+            behind = (np.floor((middle + half) / self.step) + 1).clip(0, columns).astype(int)
+            behind = np.maximum(first, behind)  # a chord between two places
+            np.add.at(ends, (row, first), 1)
+            np.add.at(ends, (row, behind), -1)
+        return ends.cumsum(axis=1)[:, :-1] > 0
 
 
 @dataclass(frozen=True)

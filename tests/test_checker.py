@@ -6,6 +6,7 @@ import pytest
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map
+from maexp.envs.reach import WIDE, Raster
 from maexp.envs.scenarios import make_map
 
 
@@ -110,3 +111,16 @@ def test_the_picture(tmp_path):
     assert 200 < pixels.shape[1] < 700
     blue = (pixels == (198, 219, 239)).all(axis=-1).mean()
     assert 0.2 < blue < 0.8
+
+
+@pytest.mark.parametrize("reach", [WIDE // 2, WIDE * 3])
+def test_discs_are_painted_by_their_definition(reach):
+    rng = np.random.default_rng(0)
+    raster = Raster(np.array([-2.0, 1.0]), 0.05, (3 * reach, 4 * reach))
+    corner, size = np.array([-2.0, 1.0, 0.0]), 0.05 * reach * np.array([3.0, 4.0, 0.0])
+    points = rng.uniform(corner - 0.2 * size, corner + 1.2 * size, (6, 3))
+    radius = rng.uniform(0.0, 0.05 * reach, 6)
+    places = raster.places(np.ones(raster.shape, dtype=bool)).reshape(*raster.shape, 2)
+    away = np.linalg.norm(places[:, :, None] - points[:, :2], axis=-1)
+    painted = raster.paint(points, radius)
+    assert (painted == (away <= radius).any(axis=-1)).all() and 0 < painted.mean() < 1

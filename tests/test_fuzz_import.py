@@ -22,7 +22,7 @@ from PIL import Image
 from test_import import picture
 from test_import_clouds import scan_room, terrain, turn, write_pcd, write_ply, write_xyz
 
-from maexp.envs import make_map
+from maexp.envs import MapError, import_map, make_map
 
 LONG = settings.get_current_profile_name() == "long"
 SECONDS = 60.0 * float(os.environ.get("MAEXP_FUZZ_MINUTES", 30))
@@ -257,6 +257,14 @@ def test_odd_clouds(importer, tmp_path_factory, suffix, steps):
     tilt = sum(abs(value) for kind, value in steps if kind == "tilt")
     if plain and tilt < 10 and suffix != "npz" and answer["kind"] == "map":
         assert answer["area"] == pytest.approx(ROOM_AREA, rel=0.15), "another room than the one that was scanned"
+
+
+@pytest.mark.parametrize("kind", ["binary.ply", "binary.pcd"])
+def test_one_byte_less_than_promised_is_refused(kind, tmp_path):
+    content = good_files(tmp_path)[kind]
+    assert import_map(put(tmp_path, kind, content)).name == "x"
+    with pytest.raises(MapError, match="truncated"):
+        import_map(put(tmp_path, kind, content[:-1]))
 
 
 class Payload:
