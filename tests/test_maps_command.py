@@ -10,6 +10,7 @@ from test_import_clouds import scan_room, turn, write_pcd
 from worlds import room
 
 from maexp.agents.cli import main
+from maexp.agents.commands.maps_folder import find_files
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.importing import draw_import, import_map_with_report
 from maexp.envs.importing.report import SHOWN_POINTS, ScannedPoints
@@ -100,6 +101,21 @@ def test_a_folder(tmp_path, capsys):
     assert "4 of 6 files became maps, 2 were refused." in out and not err
     table = (tmp_path / "run" / "report.md").read_text().splitlines()
     assert len(table) == 2 + len(rows) and len({line.count(" | ") for line in table}) == 1
+
+
+def test_a_folder_passes_over_images_that_a_yaml_names_hidden_files_and_earlier_runs(tmp_path, capsys, monkeypatch):
+    folder = make_folder(tmp_path)
+    sheet = folder / "floors" / "first.yaml"
+    sheet.rename(folder / "floors" / "level_1.yaml")
+    (folder / "floors" / "._room.pcd").write_bytes(b"left by another system")
+    (folder / "odd.yaml").write_text('image: "a\\0b"\nresolution: 1')
+    monkeypatch.chdir(folder)
+    for _ in range(2):
+        assert main(["maps", "import", "."]) == 1
+        assert "4 of 7 files became maps, 3 were refused." in capsys.readouterr().out
+    runs = [file.parent for file in folder.rglob("report.csv")]
+    assert len(runs) == 2
+    assert len(find_files(runs[0].relative_to(folder))) == 8, "an earlier run can be asked for: 4 maps, 4 pictures"
 
 
 def test_a_folder_of_good_files_and_its_settings(tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import os
 import time
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -14,9 +15,11 @@ from maexp.envs.checker import check_map
 from maexp.envs.importing import draw_import, import_map_with_report
 from maexp.envs.importing.api import GRIDS, POINTS
 from maexp.envs.importing.clouds import CLOUDS
+from maexp.envs.importing.occupancy import find_image
 
 YAMLS = (".yaml", ".yml")
 IMAGES = tuple(suffix for suffix in GRIDS if suffix not in YAMLS)
+RUNS = "outputs"  # where runs write, as in conf/run.yaml
 OTHER_ARRAYS = ("obstacles", "obstacle", "boundary", "boundaries")  # of a triple, read with its free points
 
 
@@ -44,18 +47,32 @@ class Row:
 
 
 def find_files(folder: Path) -> list[Path]:
-    """The files below `folder` that can be maps: images that have a yaml beside them go with it.
+    """The files below `folder` that can be maps: an image goes with the yaml that names it, or has its name.
+
+    Hidden files and what earlier runs left under outputs/ are passed over.
 
     Raises:
         UserError: there are none.
     """
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in _suffixes())
-    yamls = {file.with_suffix("") for file in files if file.suffix.lower() in YAMLS}
-    files = [file for file in files if not (file.suffix.lower() in IMAGES and file.with_suffix("") in yamls)]
+    files = [file for file in files if not _is_hidden(file, folder)]
+    yamls = [file for file in files if file.suffix.lower() in YAMLS]
+    beside = {file.with_suffix("") for file in yamls}
+    named = {image for file in yamls if (image := find_image(file)) is not None}
+    files = [file for file in files if not (file.suffix.lower() in IMAGES and file.with_suffix("") in beside)]
+    files = [file for file in files if os.path.abspath(file) not in named]
     files = [file for file in files if not (file.suffix == ".npy" and file.stem.lower().endswith(OTHER_ARRAYS))]
     if not files:
         raise UserError(f"{folder} holds no file that could be a map ({' '.join(_suffixes())}).")
     return files
+
+
+def _is_hidden(file: Path, folder: Path) -> bool:
+    """Whether a name below `folder` starts with a dot, or the file is of an earlier run and `folder` is not."""
+    runs, place = Path(RUNS).resolve(), folder.resolve()
+    if any(part.startswith(".") for part in file.relative_to(folder).parts):
+        return True
+    return file.resolve().is_relative_to(runs) and not place.is_relative_to(runs)
 
 
 def _suffixes() -> tuple[str, ...]:

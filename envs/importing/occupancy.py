@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,7 @@ def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> 
     return grid
 
 
-def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Sheet:
+def _load_yaml(path: Path) -> dict:
     check_file(path)
     if path.stat().st_size > MAX_YAML_BYTES:
         raise MapError(f"{path} has {path.stat().st_size} bytes; a map_server yaml has at most {MAX_YAML_BYTES}")
@@ -78,6 +79,20 @@ def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Shee
         raise MapError(f"{path} is not yaml ({' '.join(str(error).split())[:200]}); repair the file") from error
     if not isinstance(content, dict) or not {"image", "resolution"} <= content.keys():
         raise MapError(f"{path} is not a map_server yaml: it needs the keys image and resolution")
+    return content
+
+
+def find_image(path: Path) -> str | None:
+    """The absolute path of the image that a yaml names; None where it is no yaml of map_server."""
+    try:
+        image = _load_yaml(path)["image"]
+    except MapError:
+        return None
+    return os.path.abspath(path.parent / image) if isinstance(image, str) else None
+
+
+def _read_yaml(path: Path, options: ImportOptions, report: ImportReport) -> Sheet:
+    content = _load_yaml(path)
     origin = content.get("origin")
     if isinstance(origin, list) and len(origin) > 3:
         report.warn(f"origin has {len(origin)} numbers; the first three are taken as x, y, yaw")
