@@ -201,6 +201,11 @@ def test_a_damaged_cell_is_named_and_can_be_played_again(capsys):
             told = capsys.readouterr().err
             assert "random/seed_0/held_out.json" in told and "resume=b plays" in told and "Traceback" not in told
         (folder / name).write_bytes(whole)
+    todo = cell_folder(Path("b"), Cell("maze_small", "voronoi", 0)) / "held_out.json"
+    todo.unlink()
+    (folder / "held_out.npz").write_bytes(b"")
+    assert main(["benchmark", "resume=b", "estimate=false"]) == 2
+    assert not todo.exists(), "named before the other cells are played"
     (folder / "held_out.json").unlink()
     assert main(["benchmark", "resume=b", "estimate=false"]) == 0
     assert read_result(Path("b"), CELL, "held_out").coverage.shape[0] == 2

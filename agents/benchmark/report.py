@@ -41,6 +41,16 @@ class Report:
         self._columns: dict[tuple, Column] = {}
         self._written: set[tuple[int, str]] = set()
 
+    def read_all(self) -> None:
+        """Read every finished cell, so that a damaged one is named before hours go into the others.
+
+        Raises:
+            UserError: one is damaged.
+        """
+        for scenario, policy in dict.fromkeys((one.scenario, one.policy) for one in self.cells):
+            for suite in self.suites:
+                self.results(scenario, policy, suite)
+
     def update(self, done: list[Cell], running: list[Cell]) -> None:
         """Write the tables when a scenario has been through all its policies with a seed."""
         blocks = {(one.seed, one.scenario) for one in done}

@@ -92,6 +92,7 @@ def run_locked(cfg: Any, where: Path, overrides: list[str]) -> int:
     todo = [one for one in cells if not all(finished(where, one, suite) for suite in suites)]
     report = Report(cfg, where, cells, suites)
     check_unchanged(where, cfg)
+    report.read_all()
     if cfg.report or not todo:
         return conclude(report, Outcome(done=[]), where, len(todo))
     gpus = count_gpus(cfg.device)
