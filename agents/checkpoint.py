@@ -31,7 +31,7 @@ def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: 
         _write_atomically(target, state)
     for old in list_checkpoints(folder)[keep:]:
         old.unlink()
-    for leftover in folder.glob("*.tmp"):
+    for leftover in folder.glob(".*.part"):
         leftover.unlink()
     return path
 

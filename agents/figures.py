@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from maexp.envs.files import whole_file
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)), "-", "--")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -54,5 +56,6 @@ def finish(ax, title: str, unit: str, legend: bool) -> None:
 def save(figure: Figure, path) -> Path:
     """Write the picture; returns its path."""
     path = Path(path)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=150, format=path.suffix[1:])
     return path

@@ -1,11 +1,12 @@
-"""Files that are whole or not there: written aside, synced, renamed."""
+"""JSON, text and other files of a run, whole or not there."""
 
 import json
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
+
+from maexp.envs.files import whole_file
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -25,21 +26,8 @@ def write_text(path: Path, text: str) -> None:
 def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     """The same for a file that `fill` writes into."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    try:
-        with open(aside, "wb") as file:
-            fill(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    except BaseException:  # a full disk is not made fuller
-        aside.unlink(missing_ok=True)
-        raise
-    handle = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(handle)  # the new name, too, is on the disk
-    finally:
-        os.close(handle)
+    with whole_file(path) as part, open(part, "wb") as file:
+        fill(file)
 
 
 def _without_nan(value: Any) -> Any:

@@ -1,12 +1,11 @@
 """GIF and MP4 files from frames."""
 
-import os
-import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from maexp.envs.files import whole_file
 
 HOLD = 2.0  # seconds the last picture of a GIF stays before it starts over
 
@@ -97,19 +96,3 @@ def _shared_palette(frames: list[np.ndarray]) -> np.ndarray:
 
 def _unpack(packed: np.ndarray) -> np.ndarray:
     return np.stack([packed >> 16, packed >> 8, packed], axis=-1).astype(np.uint8)
-
-
-@contextmanager
-def whole_file(path: Path):
-    """Yields a temporary path beside ``path`` that replaces it at the end, or vanishes on an error."""
-    handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
-    try:
-        yield part
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(part, 0o666 & ~mask)
-        os.replace(part, path)
-    except BaseException:
-        os.unlink(part)
-        raise

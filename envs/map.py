@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+
+from maexp.envs.files import whole_file
 
 BOUNDARY_REACH = 1.5  # an obstacle point bounds free space within this many spacings of a free point
 MAX_POINTS = 20_000_000  # of a scan; a file that promises more is refused before anything is allocated
@@ -186,19 +187,11 @@ def write_npz(path: str | os.PathLike, arrays: dict[str, np.ndarray]) -> Path:
     path = Path(path)
     if not path.parent.is_dir():
         raise MapError(f"{path} lies in no folder: make {path.parent} first")
-    part = None
     try:
-        handle, part = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        with os.fdopen(handle, "wb") as file:
+        with whole_file(path) as part, open(part, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
-        os.chmod(part, 0o666 & ~_umask())
-        os.replace(part, path)
-    except BaseException as error:
-        if part is not None:
-            os.unlink(part)
-        if isinstance(error, OSError):
-            raise MapError(f"{path} could not be written ({error.strerror or error}): choose another place") from error
-        raise
+    except OSError as error:
+        raise MapError(f"{path} could not be written ({error.strerror or error}): choose another place") from error
     return path
 
 
@@ -369,9 +362,3 @@ def _spacing_of_nearest(points, obstacles, spacing, resolution) -> np.ndarray:
         return np.full(len(points), resolution, dtype=np.float32)
     _, nearest = cKDTree(obstacles).query(points)
     return spacing[nearest]
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maexp.envs.files import whole_file
 from maexp.envs.map import PointCloudMap
 from maexp.envs.raster import map_raster
 
@@ -21,7 +22,8 @@ def draw_map(world: PointCloudMap, path: str | os.PathLike, *, size: int = 900) 
     raster = map_raster(world, size)
     figure = Figure(figsize=(raster.width / 100 + 1.2, raster.height / 100 + 1.5), dpi=100, layout="constrained")
     paint_map(figure.add_subplot(), world, size)
-    FigureCanvasAgg(figure).print_png(str(path))
+    with whole_file(Path(path)) as part:
+        FigureCanvasAgg(figure).print_png(part)
     return Path(path)
 
 

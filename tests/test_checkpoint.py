@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.agents import checkpoint, files
+from maexp.agents import checkpoint
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
 from maexp.agents.errors import UserError
+from maexp.envs import files
 
 
 def state(number: int) -> dict:

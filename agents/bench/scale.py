@@ -18,6 +18,7 @@ from maexp.agents.bench.env import measure_batch
 from maexp.agents.bench.shared import print_table, write_report
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.errors import UserError
+from maexp.agents.figures import save
 from maexp.agents.plots import COLOURS, LOOK
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_distinct
@@ -181,4 +182,4 @@ def draw_axis(axis: Axis, rows: list[dict], path: Path) -> None:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if max(costs) < 50 * min(costs) else (1.0,)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.legend()
-        figure.savefig(path, dpi=150)
+        save(figure, path)

@@ -25,6 +25,7 @@ from maexp.agents.train import TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
+RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 CURVE = ("curve_seconds", "curve_coverage")
 
 
@@ -130,13 +131,15 @@ def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
     """
     folder = cell_folder(where, cell)
     try:
-        run = dict(json.loads((folder / f"{suite}.json").read_text())["run"])
+        summary = json.loads((folder / f"{suite}.json").read_text())
         with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         seconds, coverage = (arrays.pop(name) for name in CURVE)
+        run = {name: summary["run"][name] for name in RUN} | summary["run"]
+        episodes = {name: arrays[name] for name in summary[cell.policy]} | arrays
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
             f"{short(folder / suite)}.json and .npz cannot be read ({type(error).__name__}): remove the .json, and "
             f"maexp benchmark resume={short(where)} plays {cell.name} again."
         ) from error
-    return CellResult(arrays, seconds, coverage, run)
+    return CellResult(episodes, seconds, coverage, run)

@@ -204,7 +204,8 @@ def check_team(cfg: Any, episodes: list[Episode]) -> None:
 def describe(episode: Episode) -> str:
     """A line about an episode."""
     crashed = int(episode.collided[-1].sum())
-    words = [episode.map.name, episode.policy, f"{episode.num_robots} robots", *[f"{crashed} collided"] * (crashed > 0)]
+    team = f"{episode.num_robots} robot{'s' * (episode.num_robots > 1)}"
+    words = [episode.map.name, episode.policy, team, *[f"{crashed} collided"] * (crashed > 0)]
     return f"{', '.join(words)}: {percent(episode.coverage[-1]):.1f} % explored after {episode.seconds[-1]:.1f} s"
 
 
@@ -236,13 +237,15 @@ def show_scene(cfg: Any, episodes: list[Episode], world: PointCloudMap | None, w
     show.write_picture(picture, out, snapshot)
     print(f"Written: {short(out.absolute())} ({how})")
     if episodes:
-        print(f"Next: maexp view {next_place(cfg, where)} browser=true")
+        print(f"Next: maexp view {' '.join(see_again(cfg, where))} browser=true")
     return 0
 
 
-def next_place(cfg: Any, where: Path) -> str:
-    """Where what was just seen can be seen again without playing it anew."""
-    return short(where) if (where / EPISODES).is_dir() else str(cfg.place)
+def see_again(cfg: Any, where: Path) -> list[str]:
+    """The words that show what was just seen again, without playing it anew."""
+    if (where / EPISODES).is_dir():
+        return [short(where)]
+    return [str(cfg.place), *(f"{name}={cfg[name]}" for name in ("policy", "episode") if cfg[name] is not None)]
 
 
 def make_stage(cfg: Any, world: PointCloudMap, has_team: bool) -> Stage:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from maexp.envs.files import whole_file
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map, paint_map
 
@@ -37,7 +38,8 @@ def draw_import(world: PointCloudMap, report: ImportReport, path: str | os.PathL
     before.suptitle(f"before: {Path(report.path).name}", fontsize=11)
     paint_map(after.add_subplot(), world, PANEL)
     after.suptitle("after", fontsize=11)
-    FigureCanvasAgg(figure).print_png(str(path))
+    with whole_file(Path(path)) as part:
+        FigureCanvasAgg(figure).print_png(part)
     return Path(path)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.envs.film import whole_file
+from maexp.envs.files import whole_file
 from maexp.envs.render import EXPLORED, OVERLAP, UNEXPLORED, WALL_SEEN, WALL_UNSEEN, percent
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from maexp.envs.film import whole_file
+from maexp.envs.files import whole_file
 from maexp.envs.render import draw_caption
 from maexp.envs.viewing.paint import Camera, look_at, paint
 from maexp.envs.viewing.quads import Quads, make_quads
