@@ -134,7 +134,18 @@ def check_map(
         memory_per_env=estimate_memory(world, num_robots, radar_range),
     )
     _judge(report, world)
+    report.errors += _too_coarse(world, radar_range)
     return report
+
+
+def _too_coarse(world: PointCloudMap, radar_range: float) -> list[str]:
+    """The error of a map whose points lie farther apart than a radar reaches; else nothing."""
+    if radar_range >= world.resolution:
+        return []
+    return [
+        f"a radar of {radar_range:g} m does not reach from one point to the next, {world.resolution:g} m away: "
+        "check the units, or use a finer resolution"
+    ]
 
 
 def find_starts(world: PointCloudMap, start_clearance: float) -> np.ndarray:
@@ -216,6 +227,8 @@ def repair_map(
     scenario = find_scenario(world.scenario)
     threshold = scenario.collision_threshold if threshold is None else threshold
     start_clearance = START_CLEARANCE * threshold if start_clearance is None else start_clearance
+    if hopeless := _too_coarse(world, scenario.radar_range):
+        raise MapError(f"{world.name}: {hopeless[0]}")
     steps = []
     if not _boundary_fits(world):
         world = _replace(world)

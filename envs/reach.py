@@ -194,7 +194,7 @@ def visible_free(world: PointCloudMap, places: np.ndarray, radar_range: float) -
     then, for the points still unseen, from places around them: a lower bound that is tight in practice.
     """
     seen = np.zeros(len(world.free), dtype=bool)
-    if not len(places):
+    if not len(places) or radar_range < world.resolution:  # the second: millions of places, none in reach of another
         return seen
     scan = _Scan(world, radar_range)
     for place in places[_spread(places, radar_range / 3)]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from maexp.envs.checker import check_map, repair_map
-from maexp.envs.map import PointCloudMap
+from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.map_plot import draw_map
 from maexp.envs.reach import WIDE, Raster
 from maexp.envs.scenarios import make_map
@@ -111,6 +111,16 @@ def test_the_picture(tmp_path):
     assert 200 < pixels.shape[1] < 700
     blue = (pixels == (198, 219, 239)).all(axis=-1).mean()
     assert 0.2 < blue < 0.8
+
+
+def test_points_farther_apart_than_the_radar_reaches_are_an_error():
+    maze = make_map("maze_small", 3)
+    huge = PointCloudMap(maze.free * 16_000.0, maze.obstacles * 16_000.0, maze.resolution * 16_000.0)
+    report = check_map(huge)
+    assert not report.ok and any("check the units" in one for one in report.errors)
+    assert not any("check the units" in one for one in check_map(maze).errors)
+    with pytest.raises(MapError, match="check the units"):
+        repair_map(huge)
 
 
 @pytest.mark.parametrize("reach", [WIDE // 2, WIDE * 3])

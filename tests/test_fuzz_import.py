@@ -7,6 +7,7 @@ MAEXP_FUZZ_MINUTES (30) are over for each of the two random tests, and prints ho
 
 import os
 import pickle
+import struct
 import time
 import zipfile
 from collections import Counter
@@ -265,6 +266,19 @@ def test_one_byte_less_than_promised_is_refused(kind, tmp_path):
     assert import_map(put(tmp_path, kind, content)).name == "x"
     with pytest.raises(MapError, match="truncated"):
         import_map(put(tmp_path, kind, content[:-1]))
+
+
+def test_a_laz_that_promises_billions_of_chunks_is_refused(importer, tmp_path):
+    """The decompressor asks for memory for all of them, and aborts the process."""
+    content = bytearray(good_files(tmp_path)["laz"])
+    assert ask(importer, put(tmp_path, "laz", bytes(content)), "hostile")["kind"] == "map"
+    (points,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, points)
+    for at, number in ((table + 4, 2**32 - 1), (points, 2**40), (points, -5)):
+        broken = bytearray(content)
+        struct.pack_into("<I" if at > points else "<q", broken, at, number)
+        answer = ask(importer, put(tmp_path, "laz", bytes(broken)), "hostile")
+        assert answer["kind"] == "error" and "table of its compressed points" in answer["text"]
 
 
 class Payload:

@@ -26,7 +26,8 @@ def read_las(path: Path) -> Cloud:
     logging.getLogger("laspy").setLevel(logging.CRITICAL)
     _check_las(path)
     try:
-        with laspy.open(path) as file:
+        # One thread: the parallel reader aborts the process where a damaged table of chunks asks for too much memory.
+        with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as file:
             promised = file.header.point_count
             if promised > MAX_POINTS:
                 raise MapError(f"{path} promises {promised} points; thin it to {MAX_POINTS}")
@@ -62,6 +63,24 @@ def _check_las(path: Path) -> None:
     late = struct.unpack_from("<QI", head, 235) if head[25] >= 4 and len(head) >= 247 else (0, 0)
     if header + 54 * records > points or points > size or late[0] + 60 * late[1] > size:
         raise MapError(f"{path} is damaged: its header promises more records than the file holds; save it again")
+    if path.suffix.lower() == ".laz":
+        _check_chunks(path, points, size)
+
+
+def _check_chunks(path: Path, points: int, size: int) -> None:
+    """The table of chunks of a .laz file: its place stands in front of the points, and it holds no more than fit."""
+    with path.open("rb") as file:
+        file.seek(points)
+        at = struct.unpack("<q", file.read(8).ljust(8, b"\0"))[0]
+        if at == -1:  # written by a program that could not go back
+            file.seek(size - 8)
+            at = struct.unpack("<q", file.read(8))[0]
+        if points < at <= size - 8:
+            file.seek(at)
+            version, chunks = struct.unpack("<II", file.read(8))
+            if version == 0 and chunks <= at - points:
+                return
+    raise MapError(f"{path} is damaged: it holds no table of its compressed points; save it again")
 
 
 def _las_unit(header) -> float | None:
