@@ -172,7 +172,7 @@ def test_undamaged_files_are_maps(importer, tmp_path):
         assert ask(importer, put(tmp_path, kind, good_files(tmp_path)[kind]), "good")["kind"] == "map", kind
 
 
-@settings(QUIET, max_examples=100_000 if LONG else 25)
+@settings(QUIET, max_examples=10_000 if LONG else 25)
 @given(kind=st.sampled_from(KINDS), steps=damages, other=st.sampled_from([None] * 9 + list(KINDS)))
 def test_damaged_files(importer, tmp_path_factory, kind, steps, other):
     if time_is_over("files"):
@@ -237,7 +237,7 @@ def change(points: np.ndarray, steps) -> np.ndarray:
     return points
 
 
-@settings(QUIET, max_examples=100_000 if LONG else 15)
+@settings(QUIET, max_examples=10_000 if LONG else 15)
 @given(
     suffix=st.sampled_from(["pcd", "ply", "xyz", "npz"]),
     steps=st.one_of(st.lists(harmless, max_size=3), st.lists(st.one_of(harmful, harmless), max_size=3)),
