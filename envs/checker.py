@@ -271,7 +271,8 @@ def find_seal(world: PointCloudMap) -> np.ndarray:
         return np.zeros((0, 2))
     unit = world.resolution
     lattice = Raster.around(world, 0.9 * unit, 3 * unit)
-    away, _ = cKDTree(world.free[:, :2]).query(places := lattice.places(np.ones(lattice.shape, dtype=bool)))
+    places = lattice.places(np.ones(lattice.shape, dtype=bool))
+    away, _ = cKDTree(world.free[:, :2]).query(places, distance_upper_bound=2.1 * unit)  # infinite beyond
     ring = places[(away > 0.75 * unit) & (away < 2.1 * unit)]
     near = round(0.7 * unit / leaks.raster.step) + 1
     way_out = ndimage.binary_dilation(leaks.mouths, np.ones((2 * near + 1, 2 * near + 1)))
