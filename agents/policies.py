@@ -4,7 +4,8 @@ A policy is a `TensorDictModule` that writes ("agents", "action", "region") and 
 All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way
 from every robot to every target. They differ in which target each robot takes. How it is approached they share:
 where the env drives by `wavefront` the goal is the target; where it drives by plain DWA, the farthest point in
-sight on the way to it, near enough to brake for.
+sight on the way to it, near enough to brake for. A robot that would be there before its next decision goes on into
+the unknown.
 
 Sources and tuning: docs/planners.md.
 """
@@ -24,7 +25,7 @@ from maexp.kernels.assignment import FORBIDDEN, assign_targets
 
 DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
 STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
-ONWARD = 1.5  # goals lie at most so many times as far beyond a target as the middle of what is to be seen there
+SIGHT = 1.5  # goals for plain DWA lie at most so many radar ranges away
 REGION_COUNT = 64
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
 LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
@@ -144,21 +145,12 @@ class FrontierPlanner:
     Args:
         env: the env to plan for.
         choose: `Scene` -> int64 [E, N], the target of each robot.
-        ahead: how far away a goal may be where plain DWA drives to it [m]; default: what a robot drives in a
-            macro step from standstill, at most its radar's range.
     """
 
-    def __init__(
-        self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor], ahead: float | None = None
-    ):
+    def __init__(self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor]):
         self.env, self.choose, self.nav = env, choose, Navigation(env)
-        if ahead is None:
-            accel = min(r.max_accel for r in env.robot_configs)
-            threshold = max(r.collision_threshold for r in env.robot_configs)
-            ahead = min(0.5 * accel * (0.1 * env.local_steps) ** 2 + threshold, self.nav.radar_range)
+        self.seconds = 0.1 * env.local_steps
         shape = (env.num_envs, env.num_robots)
-        self.reach = torch.full(shape, float(ahead), device=env.device)
-        self.drive = 0.1 * env.local_steps * min(r.max_speed for r in env.robot_configs)
         self.dwell = torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=env.device)
         self.chosen = torch.full((*shape, 1), -1, device=env.device)
         self.stood = torch.zeros((*shape, 2), device=env.device)
@@ -187,13 +179,38 @@ class FrontierPlanner:
         self.chosen = torch.where(found.unsqueeze(-1), chosen, -1)
         self.stood = nav.centers().clone()
         goal_cell = torch.where(found, cells.gather(2, chosen).squeeze(-1), -1)
-        elsewhere = self._roam()
+        target = torch.where(found.unsqueeze(-1), nav.points(goal_cell.clamp_min(0)), self._roam())
+        toward = middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
+        return nav.to_action(self._approach(goal_cell, target, torch.where(found.unsqueeze(-1), toward, 0.0)))
+
+    def _approach(self, goal_cell: torch.Tensor, target: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
+        """Goals [m] on the way to `target` (of cell `goal_cell`, -1 = none), float32 [E, N, 2].
+
+        A robot that stopped at its target would stand there until the next decision. So goals lie beyond targets that
+        are near, `toward` what is to be seen from there, as far as the robot still gets. Plain DWA brakes too late for
+        that between walls, and for far goals altogether: there it gets a goal near enough to be braked for.
+        """
+        nav = self.nav
+        drive = self._drive(nav.state["pose"][..., 2].abs())
+        gap = (target - nav.centers()).norm(dim=-1)
+        left = (drive - gap).clamp_min(0.0) / toward.norm(dim=-1).clamp_min(1e-6)
+        beyond = target + toward * left.unsqueeze(-1)
         if self.env.planner_config.name == "wavefront":
-            goal = nav.points(goal_cell.clamp_min(0)) + self._go_on(way, middle, chosen)
-            goal = torch.where(found.unsqueeze(-1), goal, elsewhere)
-        else:
-            goal = nav.waypoints(goal_cell, elsewhere, self.reach)
-        return nav.to_action(goal)
+            return beyond
+        threshold = max(r.collision_threshold for r in self.env.robot_configs)
+        far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
+        near = (self._drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
+        near = nav.waypoints(goal_cell, target, near)
+        is_open = nav.leads_through_open_ground(far)
+        at_target = (far - target).norm(dim=-1) <= nav.cell_of_env().view(-1, 1)
+        far = torch.where(at_target.unsqueeze(-1), beyond, far)
+        return torch.where(is_open.unsqueeze(-1), far, near)
+
+    def _drive(self, speed: torch.Tensor) -> torch.Tensor:
+        """How far robots get in a macro step [m], from their speeds [m/s]."""
+        accel = min(r.max_accel for r in self.env.robot_configs)
+        full = self.seconds * min(r.max_speed for r in self.env.robot_configs)
+        return (speed * self.seconds + 0.5 * accel * self.seconds**2).clamp(max=full)
 
     def _look_around(self) -> tuple[torch.Tensor, torch.Tensor]:
         """What is to be seen from every target, as a share of the radar's disc, float32 [E, N, K], and the middle of
@@ -202,16 +219,6 @@ class FrontierPlanner:
         disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
         area, middle = nav.look_around(nav.radar_range)
         return (area / disc.view(-1, 1, 1)).expand(-1, robots, -1), middle.expand(-1, robots, -1, -1)
-
-    def _go_on(self, way: torch.Tensor, middle: torch.Tensor, chosen: torch.Tensor) -> torch.Tensor:
-        """How far beyond the chosen target the goal lies [m], float32 [E, N, 2].
-
-        Towards what is to be seen there, as far as a robot still gets in the macro step: one that stopped at the
-        frontier would stand there until the next decision.
-        """
-        onward = middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
-        left = (self.drive - way).clamp_min(0.0) / onward.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        return onward * left.clamp(max=ONWARD)
 
     def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for

@@ -16,13 +16,15 @@ from maexp.envs.environment import ExplorationEnv
 from maexp.envs.nav_grid import bank_nav_grids
 from maexp.kernels import targets
 from maexp.kernels.frontier import mark_frontier
-from maexp.kernels.geodesic import STRAIGHT, UNREACHED
+from maexp.kernels.geodesic import BLOCKED, STRAIGHT, UNREACHED
 from maexp.kernels.known_grid import KnownGrids, PassableGrids
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
 
 BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
+OPEN_GROUND = 1.2  # places with so many clearances of room around are open: DWA pays nothing for being there
+OPEN_SAMPLES = 7  # places on a way that are looked at
 
 
 class Navigation:
@@ -64,6 +66,8 @@ class Navigation:
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
         self.paths = PathSearch(self.passable, mask_of_robot)
+        room = comfort * (OPEN_GROUND / COMFORT)
+        self.open_ground = PassableGrids(self.known_grids, room, None, 0.0, through_unknown=True)
         self._size_blocks(env, float(threshold.max()))
         self._make_views(cells)
         self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
@@ -81,7 +85,9 @@ class Navigation:
     def _make_views(self, cells: int) -> None:
         """Outputs as torch tensors that share memory with the kernels' arrays."""
         e, n, r, k = self.num_envs, self.num_robots, self.rows, self.num_blocks
-        self.cell_size, self.width = (wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width"))
+        self.cell_size, self.width, self.height = (
+            wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width", "height")
+        )
         self.origin = wp.to_torch(self.grids.origin)
         self.known = wp.to_torch(self.known_grids.known).view(e, r, cells)
         self.frontier = torch.zeros_like(self.known)
@@ -212,6 +218,25 @@ class Navigation:
             wp.from_torch(result, dtype=wp.vec2),
         )  # fmt: skip
         return result
+
+    def leads_through_open_ground(self, points: torch.Tensor) -> torch.Tensor:
+        """Whether a robot has `OPEN_GROUND` clearances of room somewhere on its straight way to a point.
+
+        Args:
+            points: float32 [E, N, 2], one for each robot [m].
+
+        Returns:
+            bool [E, N].
+        """
+        self.open_ground.paint(self.launch)
+        share = torch.linspace(0.0, 1.0, OPEN_SAMPLES, device=self.device).view(1, 1, -1, 1)
+        at = self.centers().unsqueeze(2)
+        m = self.state["map_id"].long().view(-1, 1, 1)
+        cell = (at + share * (points.unsqueeze(2) - at) - self.origin[m]) / self.cell_size[m].unsqueeze(-1)
+        x, y = cell.floor().long().clamp_min(0).unbind(-1)
+        index = torch.minimum(y, self.height[m] - 1) * self.width[m] + torch.minimum(x, self.width[m] - 1)
+        rows = wp.to_torch(self.paths.row_of_item).long().view(index.shape[:2]).unsqueeze(-1)
+        return (wp.to_torch(self.open_ground.passable)[rows, index] != BLOCKED).any(-1)
 
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""

@@ -159,14 +159,15 @@ def test_actions_mean_the_points_they_came_from():
 def test_goals_under_dwa_are_in_sight_and_in_reach():
     env = make_env(4, planner="dwa")
     td = env.reset()
-    planner = FrontierPlanner(env, choose_nearest, ahead=4.0)
+    planner = FrontierPlanner(env, choose_nearest)
+    reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill; no place of these corridors is open ground
     for _ in range(3):
         td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
         centers = planner.nav.centers().clone()
         passable = planner.nav.passable.passable.numpy().copy()
         td = env.step(td)["next"]
         goal = env.simulation.tensors["goal"]
-        assert ((goal - centers).norm(dim=-1) <= 4.0 + 1e-3).float().mean() > 0.9
+        assert ((goal - centers).norm(dim=-1) <= reach + 1e-3).float().mean() > 0.9
         for e in range(4):
             w = int(planner.nav.width[planner.nav.state["map_id"][e]])
             for i in range(3):
@@ -278,14 +279,56 @@ def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
     assert planner._give_up(travel, points)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
 
 
-def test_goals_lie_beyond_the_frontier_as_far_as_a_robot_gets():
-    planner = FrontierPlanner(make_env(1), choose_nearest)
-    planner.drive = 16.0
-    middle = torch.zeros(1, 3, 4, 2)
-    middle[..., 0] = 6.0
-    way = torch.tensor([[[2.0], [13.0], [30.0]]])
-    onward = planner._go_on(way, middle, torch.zeros((1, 3, 1), dtype=torch.long))
-    assert onward.tolist() == [[[9.0, 0.0], [3.0, 0.0], [0.0, 0.0]]]  # 1.5 times the middle; what is left; nothing
+@pytest.mark.parametrize("speed, drive", [(0.0, 4.0), (3.0, 10.0), (8.0, 16.0)])
+def test_goals_lie_beyond_the_target_as_far_as_a_robot_gets(speed, drive):
+    """Two seconds at 2 m/s^2 and at most 8 m/s."""
+    env = make_env(1)
+    env.reset()
+    planner = FrontierPlanner(env, choose_nearest)
+    env.simulation.tensors["pose"][..., 2] = speed
+    gap = torch.tensor([2.0, 9.0, 30.0])
+    target = planner.nav.centers() + torch.stack([torch.zeros(3), gap], -1)
+    goal = planner._approach(torch.zeros(1, 3, dtype=torch.long), target, torch.tensor([6.0, 0.0]).expand(1, 3, 2))
+    expected = torch.stack([(drive - gap).clamp_min(0.0), torch.zeros(3)], -1)
+    torch.testing.assert_close(goal - target, expected.unsqueeze(0), atol=1e-4, rtol=0)
+
+
+def test_open_ground_is_where_no_known_obstacle_is_near():
+    env = make_env(12, planner="dwa", maps=[make_map("indoor_small", 1)])
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    ends = nav.centers() + 2.0 * (keyed_uniform(env, 2) - 0.5)
+    found = nav.leads_through_open_ground(ends)
+    width, radius = int(nav.width[0]), 1.2 * 4.2 * 0.06
+    for e in range(12):
+        at = (nav.known[e, 0] == OBSTACLE).nonzero()[:, 0].numpy()
+        walls = np.stack([at % width, at // width], -1)
+        for i in range(3):
+            places = np.linspace(nav.centers()[e, i].numpy(), ends[e, i].numpy(), 7)
+            cells = np.floor((places - nav.origin[0].numpy()) / float(nav.cell_size[0]))
+            cells = cells.clip(0, [width - 1, int(nav.height[0]) - 1])
+            gaps = np.linalg.norm(cells[:, None] - walls[None], axis=-1).min(1) * float(nav.cell_size[0])
+            assert bool(found[e, i]) == bool((gaps >= radius).any())
+    assert found.any() and not found.all()
+
+
+@pytest.mark.parametrize("scenario, drive", [("outdoor", 16.0), ("maze_small", 0.0)])
+def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, drive):
+    """Four seconds from standstill at 2 m/s^2 outdoors; corridors of a maze are no open ground."""
+    env = make_env(2, planner="dwa", maps=[make_map(scenario, 0)])
+    env.reset()
+    planner = FrontierPlanner(env, choose_nearest)
+    nav = planner.nav
+    nav.update()
+    cell, x = float(nav.cell_size[0]), torch.tensor([1.0, 0.0])
+    near = (nav.centers() / cell).round() * cell  # the robot's own place, as the middle of a cell
+    cells = ((near - nav.origin[0]) / cell).floor().long()
+    cells = cells[..., 1] * int(nav.width[0]) + cells[..., 0]
+    beyond = planner._approach(cells, nav.points(cells), (6.0 * x).expand(2, 3, 2)) - nav.points(cells)
+    is_open = nav.leads_through_open_ground(nav.centers())
+    assert is_open.any() == (drive > 0.0)
+    torch.testing.assert_close(beyond, drive * is_open.unsqueeze(-1) * x, atol=1e-4, rtol=0)
 
 
 def test_wavefront_holds_nothing_that_a_saved_state_lacks():
