@@ -22,9 +22,9 @@ from maexp.kernels.state import SCRATCH, STATE, allocate, memory_per_env, robots
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import Wavefront
 
-BLOCK_BYTES = 2**20
-"""State and scratch of a block of envs: what a core's own cache holds, more or less."""
-BLOCK_ROBOTS = 32
+BLOCK_BYTES = 2**19
+"""State and scratch of a block of envs: what they touch fits a core's own cache."""
+BLOCK_ROBOTS = 16
 """A block holds no fewer robots, so that what a launch costs by itself stays small beside them."""
 
 

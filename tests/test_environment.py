@@ -18,7 +18,7 @@ from maexp.envs import (
     make_map,
 )
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
-from maexp.kernels import step
+from maexp.kernels import step as stepping
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +123,8 @@ def test_same_bits_in_blocks_of_any_size(maps, planner, monkeypatch):
     plan = actions(5, 3, 4)
     settings = {"num_envs": 5, "seed": 3, "macro_steps": 3, "planner": PlannerConfig(name=planner)}
     whole = ExplorationEnv(maps, num_threads=1, **settings)
-    monkeypatch.setattr(step, "BLOCK_BYTES", 1)
-    monkeypatch.setattr(step, "BLOCK_ROBOTS", 1)
+    monkeypatch.setattr(stepping, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(stepping, "BLOCK_ROBOTS", 1)
     cut = ExplorationEnv(maps, num_threads=2, **settings)
     assert [len(env.simulation.blocks) for env in (whole, cut)] == [1, 4]
     for a, b in zip(play(whole, plan), play(cut, plan), strict=True):
