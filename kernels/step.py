@@ -2,22 +2,30 @@
 
 A `Simulation` owns state and scratch, split into shards of envs. The launches of every shard are
 recorded once and replayed; on the CPU each shard runs in a thread of its own (native code releases
-the interpreter lock), and results do not depend on the number of shards.
+the interpreter lock). Local steps run over smaller blocks of envs: what the kernels of a block touch
+stays in the processor's cache while it goes through all of them, and threads take blocks as they get
+free. Results depend on neither the number of shards nor that of blocks.
 """
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 import warp as wp
 
 from maexp.kernels import collision, dynamics, merge, observe, planner, reset, reward, visibility
 from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.state import SCRATCH, STATE, allocate, robots_struct, warp_views
+from maexp.kernels.launches import RecordedLaunch
+from maexp.kernels.state import SCRATCH, STATE, allocate, memory_per_env, robots_struct, warp_views
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import Wavefront
+
+BLOCK_BYTES = 2**19
+"""State and scratch of a block of envs: what they touch fits a core's own cache."""
+BLOCK_ROBOTS = 16
+"""A block holds no fewer robots, so that what a launch costs by itself stays small beside them."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Settings:
 
 
 class Shard:
-    """Envs ``first`` to ``last`` of a simulation: Warp views and recorded launches."""
+    """Envs ``first`` to ``last`` of a simulation: Warp views, and launches recorded when first needed."""
 
     def __init__(self, sim: "Simulation", first: int, last: int):
         self.first, self.last = first, last
@@ -50,19 +58,34 @@ class Shard:
         self.robots = robots_struct(sim.robot_tensors, first, last)
         self.shape = (last - first, sim.sizes["N"])
         self.lanes = 1 if self.device.is_cpu else 32
-        self.wavefront = Wavefront(sim, self) if sim.settings.planner == "wavefront" else None
-        self.goal_launches = self.record(self.set_goals)
-        self.step_launches = self.record(self.local_step)
-        self.reset_launches = self.record(self.place)
 
-    def record(self, stage: Callable) -> list[wp.Launch]:
+    @cached_property
+    def wavefront(self) -> Wavefront | None:
+        return Wavefront(self.sim, self) if self.sim.settings.planner == "wavefront" else None
+
+    @cached_property
+    def goal_launches(self) -> list[RecordedLaunch]:
+        return self.record(self.set_goals)
+
+    @cached_property
+    def step_launches(self) -> list[RecordedLaunch]:
+        return self.record(self.local_step)
+
+    @cached_property
+    def reset_launches(self) -> list[RecordedLaunch]:
+        return self.record(self.place)
+
+    def prepare(self, *names: str) -> None:
+        """Make what is made when first needed."""
+        for name in names:
+            getattr(self, name)
+
+    def record(self, stage: Callable) -> list[RecordedLaunch]:
         """Record the launches that ``stage(launch)`` makes."""
-        launches: list[wp.Launch] = []
+        launches: list[RecordedLaunch] = []
 
         def launch(kernel, dim, inputs, outputs):
-            launches.append(
-                wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, record_cmd=True)
-            )
+            launches.append(RecordedLaunch(kernel, dim, inputs, outputs, self.device))
 
         stage(launch)
         return launches
@@ -200,7 +223,7 @@ class Shard:
             reset._start_env, envs, [s.mask, s.covered], [s.covered_before, s.active, s.fresh, s.overlap]
         )
 
-    def replay(self, launches: list[wp.Launch]) -> None:
+    def replay(self, launches: list[RecordedLaunch]) -> None:
         stream = None if self.device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.sim.device))
         for command in launches:
             command.launch(stream)
@@ -292,30 +315,49 @@ class Simulation:
         self.tensors["episode"].fill_(-1)
         self.tensors["comm"].fill_(True)
         count = max(1, min(num_shards, sizes["E"]))
-        cuts = [sizes["E"] * k // count for k in range(count + 1)]
-        self.shards = [Shard(self, a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+        self.shards = self.split(count)
+        per_thread = self.blocks_per_thread(count)
+        self.blocks = self.shards if per_thread == 1 else self.split(count * per_thread)
+        for shard in self.shards:  # here, for threads must not load kernels at the same time
+            shard.prepare("goal_launches", "reset_launches")
+        for block in self.blocks:
+            block.prepare("wavefront", "step_launches")
         self.pool = ThreadPoolExecutor(count) if count > 1 else None
 
-    def each_shard(self, task: Callable[[Shard], None]) -> None:
-        """Run ``task`` on every shard, in threads where there are several."""
+    def split(self, count: int) -> list[Shard]:
+        """The envs in ``count`` runs of about the same length."""
+        cuts = [self.sizes["E"] * k // count for k in range(count + 1)]
+        return [Shard(self, a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+
+    def blocks_per_thread(self, threads: int) -> int:
+        """How many blocks each thread gets on average; a GPU takes all envs at once."""
+        if self.device.type != "cpu":
+            return 1
+        fitting = BLOCK_BYTES // sum(memory_per_env(self.sizes).values())
+        envs = max(fitting, -(-BLOCK_ROBOTS // self.sizes["N"]))
+        return max(1, self.sizes["E"] // (envs * threads))
+
+    def each(self, shards: list[Shard], task: Callable[[Shard], None]) -> None:
+        """Run ``task`` on every shard or block, in threads where there are several."""
         if self.pool is None:
-            task(self.shards[0])
+            for shard in shards:
+                task(shard)
         else:
-            list(self.pool.map(task, self.shards))
+            list(self.pool.map(task, shards))
 
     def reset(self, mask: torch.Tensor) -> None:
         """Start a new episode in the envs where ``mask`` [E] is true."""
         self.tensors["mask"].copy_(mask)
-        self.each_shard(lambda shard: shard.replay(shard.reset_launches))
+        self.each(self.shards, lambda shard: shard.replay(shard.reset_launches))
 
     def set_goals(self) -> None:
         """Take ``region`` and ``offset`` (or ``command``), and start the macro step's reward at zero."""
         self.tensors["terms"].zero_()
-        self.each_shard(lambda shard: shard.replay(shard.goal_launches))
+        self.each(self.shards, lambda shard: shard.replay(shard.goal_launches))
 
     def step(self, start: int, count: int) -> None:
         """Run ``count`` local steps, the first being number ``start`` of the macro step."""
-        self.each_shard(lambda shard: shard.run(start, count))
+        self.each(self.blocks, lambda block: block.run(start, count))
 
     def observe(self, picture, team, pose, grid) -> None:
         """Fill the observation tensors.
@@ -324,7 +366,7 @@ class Simulation:
             picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125].
             pose, grid: float32 [E, N, 4] and [E, N, 4, 8, 8].
         """
-        self.each_shard(lambda shard: shard.observe(picture, team, pose, grid))
+        self.each(self.shards, lambda shard: shard.observe(picture, team, pose, grid))
 
 
 def maps_struct(tensors: dict[str, torch.Tensor]) -> Maps:

@@ -18,6 +18,7 @@ from maexp.envs import (
     make_map,
 )
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
+from maexp.kernels import step as stepping
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +115,20 @@ def test_same_bits_for_any_number_of_envs_and_threads(maps):
     for a, b, c in zip(many, few, again, strict=True):
         assert equal(b, a[:2]) and equal(c, a)
     assert not equal(many[0], other[0])
+
+
+@pytest.mark.parametrize("planner", ["dwa", "wavefront"])
+def test_same_bits_in_blocks_of_any_size(maps, planner, monkeypatch):
+    """Blocks of one env, taken by two threads as they get free, against all envs at once."""
+    plan = actions(5, 3, 4)
+    settings = {"num_envs": 5, "seed": 3, "macro_steps": 3, "planner": PlannerConfig(name=planner)}
+    whole = ExplorationEnv(maps, num_threads=1, **settings)
+    monkeypatch.setattr(stepping, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(stepping, "BLOCK_ROBOTS", 1)
+    cut = ExplorationEnv(maps, num_threads=2, **settings)
+    assert [len(env.simulation.blocks) for env in (whole, cut)] == [1, 4]
+    for a, b in zip(play(whole, plan), play(cut, plan), strict=True):
+        assert equal(a, b)
 
 
 def test_episodes_of_an_env_differ_and_resets_are_partial(maps):

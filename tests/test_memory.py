@@ -23,8 +23,8 @@ def test_memory_is_counted_before_it_is_taken(limited):
         num_threads=2,
     )  # fmt: skip
     taken = sum(tensor.nbytes for tensor in env.simulation.tensors.values())
-    for shard in env.simulation.shards:
-        taken += sum(grid.capacity for grid in arrays_of(shard.wavefront))
+    for block in env.simulation.blocks:
+        taken += sum(grid.capacity for grid in arrays_of(block.wavefront))
     assert bytes_per_env(env) * 6 == pytest.approx(taken, rel=0.02)
 
 
