@@ -1,5 +1,6 @@
 """The benchmark: its cells, its table, what a kill leaves, and the paper's numbers against the paper."""
 
+import contextlib
 import csv
 import fcntl
 import json
@@ -213,6 +214,29 @@ def wait_for(path: Path, process: subprocess.Popen, lines: int = 1) -> None:
     assert process.poll() is None
 
 
+def workers_of(process: subprocess.Popen) -> list[int]:
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(one) for one in children if "benchmark.worker" in Path(f"/proc/{one}/cmdline").read_text()]
+
+
+@contextlib.contextmanager
+def held(workers: list[int]):
+    """Processes stand still until each has been sent SIGTERM."""
+    for one in workers:
+        os.kill(one, signal.SIGSTOP)
+    yield
+    for one in workers:
+        while not asked_to_end(one):
+            time.sleep(0.02)
+        os.kill(one, signal.SIGCONT)
+
+
+def asked_to_end(process: int) -> bool:
+    status = Path(f"/proc/{process}/status").read_text()
+    pending = [int(line.split()[1], 16) for line in status.splitlines() if line.startswith(("SigPnd", "ShdPnd"))]
+    return any(mask >> (signal.SIGTERM - 1) & 1 for mask in pending)
+
+
 def assert_same_cells(first: Path, second: Path) -> None:
     for cell in CELLS:
         one, other = (read_result(folder, cell, "held_out") for folder in (first, second))
@@ -237,13 +261,31 @@ def test_killed_and_resumed_is_uninterrupted(whole, tmp_path, capsys):
     assert len(log.read_text().splitlines()) == left < 5  # its worker went with it
     process = start(folder, f"resume={folder}")
     wait_for(cell_folder(folder, CELLS[5]) / "metrics.csv", process, lines=2)
-    process.send_signal(signal.SIGINT)
+    with held(workers_of(process)):  # however long it is at a picture, no cell ends before the signal
+        process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130 and "maexp benchmark resume=" in out and "Traceback" not in err
     assert "maze_small: 6 episodes" in out  # what was done is in the table already
     assert main(["benchmark", f"resume={folder}"]) == 0
     assert log.read_text().splitlines()[1] == first  # clocks and all: it went on, it did not start again
     assert_same_cells(whole, folder)
+
+
+@pytest.mark.slow
+def test_a_cell_that_ends_while_stopping_counts(copy):
+    """Ctrl-C while the last worker is about to say that it is done: nothing is left, nothing was interrupted."""
+    (cell_folder(copy, CELLS[0]) / "held_out.json").unlink()
+    words = json.loads((copy / "benchmark.json").read_text())["overrides"]
+    stop = []
+
+    def ask(pool: WorkerPool) -> None:
+        while not (cell_folder(copy, CELLS[0]) / "held_out.json").is_file():
+            time.sleep(0.02)
+        time.sleep(0.5)  # its answer is in the pipe
+        stop.append(signal.SIGINT)
+
+    outcome = WorkerPool(copy, words, ["held_out"], workers=1).run(CELLS[:1], stop, ask)
+    assert outcome.done == CELLS[:1] and not outcome.interrupted
 
 
 @pytest.mark.slow

@@ -69,8 +69,8 @@ class WorkerPool:
                 self._listen()
                 watch(self)
             if stop:
-                self.outcome.interrupted = True
                 self._stop_running()
+                self.outcome.interrupted = len(self.outcome.done) + len(self.outcome.failed) < len(cells)
         finally:
             self._dismiss()
         return self.outcome
@@ -141,7 +141,7 @@ class WorkerPool:
             raise RuntimeError(f"a worker ended with status {status} before its first cell")
 
     def _stop_running(self) -> None:
-        """Let trainings write their checkpoint; evaluations are short and start again."""
+        """Let trainings write their checkpoint; evaluations are short and start again. A cell that ends now counts."""
         for worker in self.workers:
             worker.process.terminate()
         end = time.monotonic() + GRACE
@@ -150,6 +150,9 @@ class WorkerPool:
                 worker.process.wait(max(0.0, end - time.monotonic()))
             except subprocess.TimeoutExpired:
                 worker.process.kill()
+            for line in worker.process.stdout:
+                if worker.cell is not None:
+                    self._note(worker, json.loads(line))
 
     def _dismiss(self) -> None:
         """The end of their input ends the workers."""
