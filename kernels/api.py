@@ -117,6 +117,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     pose_t, center_t = zeros(1, 1, 4, dtype=torch.float32), zeros(1, 1, 3, dtype=torch.float32)
     pose_t[..., 3] = heading
     pose, center = wp.from_torch(pose_t, dtype=wp.vec4), wp.from_torch(center_t, dtype=wp.vec3)
+    facing = wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2)  # only other robots' are read
     bins = wp.from_torch(zeros(1, 1, 2 * int(visibility.BINS), dtype=torch.float32))
     direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
     limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
@@ -128,7 +129,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
     wp.launch(
         visibility._collect_occluders, dim=(1, 1), device=launch,
-        inputs=[maps, map_id, planar, robots, one, pose, center],
+        inputs=[maps, map_id, planar, robots, one, pose, center, facing],
         outputs=[bins, direction, limit, *counts, error],
     )  # fmt: skip
     wp.launch(

@@ -3,7 +3,7 @@
 import warp as wp
 
 from maexp.kernels.dynamics import rectangle_distance, rectangles_gap
-from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
+from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span, within
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -63,8 +63,11 @@ def _detect_collisions(
     theta = pose[e, i][3]
     hit = hits_boundary(maps, map_id[e], robots, e, i, at, theta, footprint)
     for other in range(pose.shape[1]):
-        if other != i and not hit:
-            there = point_xy(center[e, other])
+        there = point_xy(center[e, other])
+        reach = robots.threshold[e, i]
+        if footprint != 0:
+            reach = robots.length[e, i] + robots.width[e, i] + robots.length[e, other] + robots.width[e, other]
+        if within(there - at, reach) and other != i and not hit:
             if footprint != 0:
                 gap = rectangles_gap(
                     at, theta, robots.length[e, i], robots.width[e, i],

@@ -18,11 +18,6 @@ def wrap_angle(theta: float) -> float:
 
 
 @wp.func
-def center_of(pose: wp.vec4, offset: float) -> wp.vec2:
-    return wp.vec2(pose[0] + offset * wp.cos(pose[3]), pose[1] + offset * wp.sin(pose[3]))
-
-
-@wp.func
 def curvature(kind: int, turn: float, wheelbase: float) -> float:
     """Turn per metre driven [rad/m] that a control asks of a car; 0 for the other kinds."""
     if kind == ACKERMANN:
@@ -41,14 +36,20 @@ def heading_change(kind: int, v: float, turn: float, curve: float, dt: float) ->
 
 
 @wp.func
-def rectangle_distance(p: wp.vec2, center: wp.vec2, theta: float, length: float, width: float) -> float:
-    """Distance of a point to an oriented rectangle, 0 inside."""
+def box_distance(p: wp.vec2, center: wp.vec2, ahead: wp.vec2, length: float, width: float) -> float:
+    """Distance of a point to a rectangle whose length lies along the unit vector ``ahead``, 0 inside."""
     d = p - center
-    c = wp.cos(theta)
-    s = wp.sin(theta)
+    c = ahead[0]
+    s = ahead[1]
     a = wp.max(wp.abs(c * d[0] + s * d[1]) - 0.5 * length, 0.0)
     b = wp.max(wp.abs(c * d[1] - s * d[0]) - 0.5 * width, 0.0)
     return wp.sqrt(a * a + b * b)
+
+
+@wp.func
+def rectangle_distance(p: wp.vec2, center: wp.vec2, theta: float, length: float, width: float) -> float:
+    """Distance of a point to an oriented rectangle, 0 inside."""
+    return box_distance(p, center, wp.vec2(wp.cos(theta), wp.sin(theta)), length, width)
 
 
 @wp.func
@@ -98,6 +99,20 @@ def rectangles_gap(
 
 
 @wp.kernel
+def _face_robots(
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.vec4),
+    # Scratch out:
+    facing: wp.array2d(dtype=wp.vec2),
+):
+    """Note where robot (e, i) faces: every robot near it asks, and trigonometry is dear."""
+    e, i = wp.tid()
+    if active[e] != 0:
+        facing[e, i] = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+
+
+@wp.kernel
 def _move_robots(
     # Robots:
     robots: Robots,
@@ -111,6 +126,8 @@ def _move_robots(
     slip: wp.array2d(dtype=wp.float32),
     center: wp.array2d(dtype=wp.vec3),
     path_length: wp.array2d(dtype=wp.float32),
+    # Scratch out:
+    facing: wp.array2d(dtype=wp.vec2),
 ):
     """Clamp the controls to the robot's limits and move it by one local step."""
     e, i = wp.tid()
@@ -141,5 +158,7 @@ def _move_robots(
             velocity = velocity * (limit / speed)
         slip[e, i] = velocity[1]
         pose[e, i] = wp.vec4(x, y, velocity[0], old[3])
-    at = center_of(pose[e, i], robots.center_offset[e, i])
-    center[e, i] = wp.vec3(at[0], at[1], 0.0)
+    offset = robots.center_offset[e, i]
+    ahead = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+    facing[e, i] = ahead
+    center[e, i] = wp.vec3(pose[e, i][0] + offset * ahead[0], pose[e, i][1] + offset * ahead[1], 0.0)

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from maexp.kernels.dynamics import curvature, heading_change, rectangle_distance, rectangles_gap
-from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span
+from maexp.kernels.dynamics import box_distance, curvature, heading_change, rectangle_distance, rectangles_gap
+from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span, within
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -77,8 +77,8 @@ def gather_mates(
     count = int(0)
     here = point_xy(center[e, i])
     for other in range(center.shape[1]):
-        if other != i:
-            there = point_xy(center[e, other])
+        there = point_xy(center[e, other])
+        if within(there - here, in_range) and other != i:
             if wp.length(there - here) <= in_range:
                 if wp.length(there - middle) <= reach + robots.length[e, other] + robots.width[e, other]:
                     mates[e, i, count] = other
@@ -98,6 +98,7 @@ def body_distance(
     footprint: int,
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec2),
     mates: wp.array3d(dtype=wp.int32),
 ) -> float:
     """Distance from a predicted body of robot i to the nearest of the listed bodies, where they are now.
@@ -118,7 +119,7 @@ def body_distance(
                     at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
                 )
             else:
-                gap = rectangle_distance(at, there, pose[e, other][3], length, width)
+                gap = box_distance(at, there, facing[e, other], length, width)
             nearest = wp.min(nearest, gap)
     return nearest
 
@@ -167,6 +168,7 @@ def _plan_dwa(
     pose: wp.array2d(dtype=wp.vec4),
     slip: wp.array2d(dtype=wp.float32),
     center: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec2),
     target: wp.array2d(dtype=wp.vec2),
     known_boundary: wp.array3d(dtype=wp.int32),
     # Scratch:
@@ -249,7 +251,7 @@ def _plan_dwa(
             if not score < best:  # what is in the way can only lower it
                 d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
                 d = wp.min(d, body_distance(
-                    robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, mates))  # fmt: skip
+                    robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, facing, mates))  # fmt: skip
                 if d < clearance:
                     score += weight * wp.log(wp.max(d, NEAREST) / clearance)
                 k = a * num_turns + b

@@ -56,6 +56,7 @@ STATE = {
 }
 SCRATCH = {
     "mask": ("E", torch.int32, wp.int32),
+    "facing": ("E N 2", torch.float32, wp.vec2),
     "fresh": ("E N", torch.int32, wp.int32),
     "overlap": ("E N", torch.int32, wp.int32),
     "crashed": ("E N", torch.int32, wp.int32),

@@ -87,7 +87,8 @@ class Shard:
             planner._plan_dwa, self.shape,
             [maps, s.map_id, robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
              int(cfg.footprint), int(cfg.comm_limited), cfg.dt,
-             s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby, s.mates],
+             s.active, s.collided, s.pose, s.slip, s.center, s.facing, s.target, self.known("boundary"), s.nearby,
+             s.mates],
             [s.control, s.error],
         )  # fmt: skip
 
@@ -101,7 +102,8 @@ class Shard:
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         launch(
             dynamics._move_robots, self.shape,
-            [self.robots, cfg.dt, s.active, s.collided, s.control], [s.pose, s.slip, s.center, s.path_length],
+            [self.robots, cfg.dt, s.active, s.collided, s.control],
+            [s.pose, s.slip, s.center, s.path_length, s.facing],
         )  # fmt: skip
         launch(
             collision._detect_collisions, self.shape,
@@ -114,7 +116,7 @@ class Shard:
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         launch(
             visibility._collect_occluders, self.shape,
-            [maps, s.map_id, 1, self.robots, running, s.pose, s.center],
+            [maps, s.map_id, 1, self.robots, running, s.pose, s.center, s.facing],
             [s.bins, s.direction, s.limit, s.occluder_count, s.visible_count, s.error],
         )  # fmt: skip
         launch(
@@ -152,6 +154,7 @@ class Shard:
     def local_step(self, launch: Callable) -> None:
         """Plan, move, collide, scan, merge, reward, terminate (design 4.2)."""
         s, maps = self.view, self.sim.maps
+        launch(dynamics._face_robots, self.shape, [s.active, s.pose], [s.facing])
         self.plan(launch)
         self.move(launch)
         self.scan(launch, s.active)
@@ -194,6 +197,7 @@ class Shard:
             [s.slip, s.control, s.goal, s.target, s.collided, s.crashed, s.path_length, s.milestone_path,
              s.terms, s.raw, s.episode_reward],
         )  # fmt: skip
+        launch(dynamics._face_robots, (envs, n), [s.mask, s.pose], [s.facing])
         self.scan(launch, s.mask)
         launch(observe._record_track, (envs, n), [maps, s.map_id, s.mask, s.center, s.local_step, 0], [s.track])
         launch(

@@ -112,6 +112,12 @@ def point_xy(p: wp.vec3) -> wp.vec2:
 
 
 @wp.func
+def within(offset: wp.vec2, radius: float) -> bool:
+    """False only for an offset longer than the radius: asked of every pair of robots before the exact root."""
+    return wp.dot(offset, offset) <= 1.0001 * radius * radius
+
+
+@wp.func
 def cell_center(maps: Maps, m: int, row: int, col: int) -> wp.vec2:
     return maps.cell_origin[m] + maps.cell_size[m] * wp.vec2(float(col) + 0.5, float(row) + 0.5)
 

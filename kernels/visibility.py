@@ -27,8 +27,10 @@ from maexp.kernels.types import (
     Robots,
     cell_center,
     floor_within,
+    point_xy,
     row_range,
     row_span,
+    within,
 )
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
@@ -144,6 +146,7 @@ def add_occluder(
 @wp.func
 def add_outline(
     pose: wp.vec4,
+    forward: wp.vec2,
     length: float,
     width: float,
     offset: float,
@@ -162,7 +165,6 @@ def add_outline(
 ) -> int:
     """Append the outline of another robot's body, sampled at ``spacing`` or finer."""
     count = start
-    forward = wp.vec2(wp.cos(pose[3]), wp.sin(pose[3]))
     left = wp.vec2(-forward[1], forward[0])
     center = wp.vec2(pose[0], pose[1]) + offset * forward
     along = wp.max(2, int(wp.ceil(length / spacing)))
@@ -272,6 +274,7 @@ def add_body(
     robots: Robots,
     other: int,
     pose: wp.vec4,
+    forward: wp.vec2,
     at: wp.vec2,
     spread: float,
     origin: wp.vec3,
@@ -294,7 +297,7 @@ def add_body(
     if planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
         return start
     return add_outline(
-        pose, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
+        pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
         origin, radius, cos_beam, planar, e, i, start, bins, direction, limit,
     )  # fmt: skip
 
@@ -311,6 +314,8 @@ def _collect_occluders(
     active: wp.array(dtype=wp.int32),
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    # Scratch in:
+    facing: wp.array2d(dtype=wp.vec2),
     # Scratch out:
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
@@ -354,12 +359,15 @@ def _collect_occluders(
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     for other in range(pose.shape[1]):
-        there = center[e, other] - origin
-        if other != i and wp.length(there) <= radius + robots.length[e, other] + robots.width[e, other]:
-            count = add_body(
-                maps, m, robots, other, pose[e, other], wp.vec2(there[0], there[1]), spread, origin, radius,
-                cos_beam, planar, e, i, count, bins, direction, limit,
-            )  # fmt: skip
+        if other != i:
+            there = point_xy(center[e, other]) - at
+            reach = radius + robots.length[e, other] + robots.width[e, other]
+            if within(there, reach):
+                if wp.length(center[e, other] - origin) <= reach:
+                    count = add_body(
+                        maps, m, robots, other, pose[e, other], facing[e, other], there, spread, origin, radius,
+                        cos_beam, planar, e, i, count, bins, direction, limit,
+                    )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
