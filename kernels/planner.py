@@ -9,6 +9,8 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 
 NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
 
+HALF = wp.constant(0.501)  # of length and width: no part of a body is farther from its centre
+
 
 @wp.func
 def spread(k: int, count: int, limit: float) -> float:
@@ -80,7 +82,7 @@ def gather_mates(
         there = point_xy(center[e, other])
         if within(there - here, in_range) and other != i:
             if wp.length(there - here) <= in_range:
-                if wp.length(there - middle) <= reach + robots.length[e, other] + robots.width[e, other]:
+                if wp.length(there - middle) <= reach + HALF * (robots.length[e, other] + robots.width[e, other]):
                     mates[e, i, count] = other
                     count += 1
     return count
@@ -112,7 +114,7 @@ def body_distance(
         there = point_xy(center[e, other])
         length = robots.length[e, other]
         width = robots.width[e, other]
-        if wp.length(there - at) <= 1.001 * clearance + own + length + width:
+        if within(there - at, 1.001 * clearance + own + HALF * (length + width)):
             gap = float(0.0)
             if footprint != 0:
                 gap = rectangles_gap(

@@ -117,12 +117,12 @@ class Shard:
         launch(
             visibility._collect_occluders, self.shape,
             [maps, s.map_id, 1, self.robots, running, s.pose, s.center, s.facing],
-            [s.bins, s.direction, s.limit, s.occluder_count, s.visible_count, s.error],
+            [s.bins, s.direction, s.limit, s.occluder_count, s.wall_count, s.visible_count, s.error],
         )  # fmt: skip
         launch(
             visibility._scan_free, (*self.shape, self.lanes),
             [maps, s.map_id, 1, self.robots, self.lanes, running, s.pose, s.center,
-             s.bins, s.direction, s.limit, s.occluder_count],
+             s.bins, s.direction, s.limit, s.occluder_count, s.wall_count],
             [s.viewers_free, s.visible, s.visible_count, s.error],
         )  # fmt: skip
         launch(

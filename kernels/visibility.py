@@ -10,7 +10,8 @@ Both angular tests fold into ``dot(P_f, u_o) > c_o |P_f|`` with
 Directions are cut into bins so that most points need no pairwise test. For every bin we keep the
 distance of the nearest occluder that may touch it (``near``) and of the nearest one that surely
 covers all of it (``full``). A free point nearer than ``near`` is visible, one behind ``full`` is
-masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit.
+masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit. Where only
+another robot's body may be near enough (``near`` of the static occluders is kept beside), it meets bodies only.
 
 Likewise an occluder all of whose bins are full nearer than itself decides nothing: every free point
 that it could mask is masked. So occluders are entered the nearest rows of cells first, and cells and bodies
@@ -66,6 +67,13 @@ def bin_of(x: float, y: float) -> int:
 def lower_all_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, dist: float):
     for b in range(BINS):
         bins[e, i, b] = wp.min(bins[e, i, b], dist)
+
+
+@wp.func
+def keep_walls(bins: wp.array3d(dtype=wp.float32), e: int, i: int):
+    """Keep the bins' nearest static occluders, before bodies are entered."""
+    for b in range(BINS):
+        bins[e, i, 2 * BINS + b] = bins[e, i, b]
 
 
 @wp.func
@@ -198,18 +206,26 @@ def is_masked(
     alpha2: float,
     e: int,
     i: int,
+    walls: int,
     count: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
 ) -> bool:
-    """Whether any of the ``count`` occluders masks the free point at ``delta``."""
+    """Whether any of the ``count`` occluders, the first ``walls`` of them static, masks the free point at ``delta``.
+
+    ``walls`` is 0 where there are no bodies, or static occluders and bodies are not told apart.
+    """
     b = bin_of(delta[0], delta[1])
     if dist == 0.0 or not (bins[e, i, b] - dist < alpha2):
         return False
     if bins[e, i, BINS + b] - dist < alpha2 and wp.abs(delta[2]) <= 1.0e-6 * dist:
         return True
-    for k in range(count):
+    first = int(0)
+    if walls > 0:
+        if not (bins[e, i, 2 * BINS + b] - dist < alpha2):
+            first = walls
+    for k in range(first, count):
         cd = limit[e, i, k]
         if cd[1] - dist < alpha2:
             if wp.dot(delta, direction[e, i, k]) > cd[0] * dist:
@@ -321,6 +337,7 @@ def _collect_occluders(
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
     occluder_count: wp.array2d(dtype=wp.int32),
+    wall_count: wp.array2d(dtype=wp.int32),
     visible_count: wp.array2d(dtype=wp.int32),
     error: wp.array(dtype=wp.int32),
 ):
@@ -358,12 +375,15 @@ def _collect_occluders(
                     maps, m, row, col, run, spread, origin, radius, cos_beam, cull,
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
+    walls = int(count)
     for other in range(pose.shape[1]):
         if other != i:
             there = point_xy(center[e, other]) - at
             reach = radius + robots.length[e, other] + robots.width[e, other]
             if within(there, reach):
                 if wp.length(center[e, other] - origin) <= reach:
+                    if count == walls:
+                        keep_walls(bins, e, i)
                     count = add_body(
                         maps, m, robots, other, pose[e, other], facing[e, other], there, spread, origin, radius,
                         cos_beam, planar, e, i, count, bins, direction, limit,
@@ -372,6 +392,7 @@ def _collect_occluders(
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
     occluder_count[e, i] = count
+    wall_count[e, i] = wp.where(count > walls, walls, 0)
 
 
 @wp.kernel
@@ -392,6 +413,7 @@ def _scan_free(
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
     occluder_count: wp.array2d(dtype=wp.int32),
+    wall_count: wp.array2d(dtype=wp.int32),
     # Scratch out:
     viewers_free: wp.array3d(dtype=wp.int32),
     visible: wp.array3d(dtype=wp.int32),
@@ -409,6 +431,7 @@ def _scan_free(
     heading = wp.vec3(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]), 0.0)
     origin = center[e, i]
     count = occluder_count[e, i]
+    walls = wall_count[e, i]
     at = wp.vec2(origin[0], origin[1])
     half = CELL_HALF * maps.cell_size[m]
     rows = row_range(maps, m, at, radius)
@@ -427,7 +450,7 @@ def _scan_free(
                     delta = maps.free[first + j] - origin
                     dist = wp.length(delta)
                     if dist <= radius and wp.dot(delta, heading) >= cos_fov * dist:
-                        if not is_masked(delta, dist, alpha2, e, i, count, bins, direction, limit):
+                        if not is_masked(delta, dist, alpha2, e, i, walls, count, bins, direction, limit):
                             wp.atomic_add(viewers_free, e, 0, j, VIEWER_NOW)
                             slot = wp.atomic_add(visible_count, e, i, 1)
                             if slot < visible.shape[2]:
