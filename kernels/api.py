@@ -122,6 +122,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
     limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
     counts = [wp.from_torch(zeros(1, 1)) for _ in range(3)]
+    near, near_count = wp.from_torch(zeros(1, 1, 1)), wp.from_torch(zeros(1, 1))  # nobody else is there
     views = zeros(1, 1, count)
     listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
     launch = wp.from_torch(free, dtype=wp.vec3).device
@@ -129,7 +130,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
     wp.launch(
         visibility._collect_occluders, dim=(1, 1), device=launch,
-        inputs=[maps, map_id, planar, robots, one, pose, center, facing],
+        inputs=[maps, map_id, planar, robots, one, pose, center, facing, near, near_count],
         outputs=[bins, direction, limit, *counts, error],
     )  # fmt: skip
     wp.launch(

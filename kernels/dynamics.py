@@ -6,7 +6,7 @@ car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirec
 
 import warp as wp
 
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots, point_xy, within
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -100,16 +100,60 @@ def rectangles_gap(
 
 @wp.kernel
 def _face_robots(
+    # Robots:
+    robots: Robots,
+    dt: float,
     # State in:
     active: wp.array(dtype=wp.int32),
     pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
+    center: wp.array2d(dtype=wp.vec3),
     # Scratch out:
     facing: wp.array2d(dtype=wp.vec2),
+    place: wp.array2d(dtype=wp.vec3),
 ):
-    """Note where robot (e, i) faces: every robot near it asks, and trigonometry is dear."""
+    """Note where robot (e, i) faces, for every robot near it asks, and in ``place`` a disc that it stays in this step.
+
+    ``place`` is its centre's x and y and how far from there its body may reach before or after it moves [m].
+    """
     e, i = wp.tid()
-    if active[e] != 0:
-        facing[e, i] = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+    if active[e] == 0:
+        return
+    facing[e, i] = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+    speed = wp.abs(pose[e, i][2]) + wp.abs(slip[e, i])
+    room = dt * speed + 2.0 * wp.abs(robots.center_offset[e, i]) + robots.length[e, i] + robots.width[e, i]
+    place[e, i] = wp.vec3(center[e, i][0], center[e, i][1], room)
+
+
+@wp.kernel
+def _list_near(
+    # Robots:
+    robots: Robots,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    # Scratch in:
+    place: wp.array2d(dtype=wp.vec3),
+    # Scratch out:
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
+):
+    """List the robots whose bodies may be in radar range of robot (e, i), or touch it, before or after it moves.
+
+    Planner, collisions and radar then look at these only: a large team is gone through once a step.
+    """
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    here = place[e, i]
+    reach = here[2] + wp.max(robots.radar_range[e, i], robots.threshold[e, i])
+    count = int(0)
+    for other in range(place.shape[1]):
+        there = place[e, other]
+        if within(point_xy(there - here), reach + there[2]):
+            if other != i:
+                near[e, i, count] = other
+                count += 1
+    near_count[e, i] = count
 
 
 @wp.kernel

@@ -3,13 +3,21 @@
 import warp as wp
 
 from maexp.kernels.dynamics import box_distance, curvature, heading_change, rectangle_distance, rectangles_gap
-from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span, within
+from maexp.kernels.types import (
+    HALF,
+    OMNIDIRECTIONAL,
+    ROBOTS_PER_WORD,
+    Maps,
+    Robots,
+    point_xy,
+    row_range,
+    row_span,
+    within,
+)
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
 NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
-
-HALF = wp.constant(0.501)  # of length and width: no part of a body is farther from its centre
 
 
 @wp.func
@@ -73,18 +81,20 @@ def gather_mates(
     middle: wp.vec2,
     reach: float,
     center: wp.array2d(dtype=wp.vec3),
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     mates: wp.array3d(dtype=wp.int32),
 ) -> int:
     """List the robots in radar range whose bodies come within ``reach`` of ``middle``; returns how many."""
     count = int(0)
     here = point_xy(center[e, i])
-    for other in range(center.shape[1]):
+    for k in range(near_count[e, i]):
+        other = near[e, i, k]
         there = point_xy(center[e, other])
-        if within(there - here, in_range) and other != i:
-            if wp.length(there - here) <= in_range:
-                if wp.length(there - middle) <= reach + HALF * (robots.length[e, other] + robots.width[e, other]):
-                    mates[e, i, count] = other
-                    count += 1
+        if wp.length(there - here) <= in_range:
+            if wp.length(there - middle) <= reach + HALF * (robots.length[e, other] + robots.width[e, other]):
+                mates[e, i, count] = other
+                count += 1
     return count
 
 
@@ -173,6 +183,9 @@ def _plan_dwa(
     facing: wp.array2d(dtype=wp.vec2),
     target: wp.array2d(dtype=wp.vec2),
     known_boundary: wp.array3d(dtype=wp.int32),
+    # Scratch in:
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     # Scratch:
     nearby: wp.array3d(dtype=wp.vec2),
     mates: wp.array3d(dtype=wp.int32),
@@ -221,7 +234,7 @@ def _plan_dwa(
     if count > nearby.shape[2]:
         wp.atomic_or(error, e, 4)
         count = nearby.shape[2]
-    mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, mates)
+    mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, near, near_count, mates)
     best = float(-1.0e30)
     best_k = int(0)
     for b in range(num_turns):

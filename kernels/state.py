@@ -57,6 +57,9 @@ STATE = {
 SCRATCH = {
     "mask": ("E", torch.int32, wp.int32),
     "facing": ("E N 2", torch.float32, wp.vec2),
+    "place": ("E N 3", torch.float32, wp.vec3),
+    "near": ("E N N", torch.int32, wp.int32),
+    "near_count": ("E N", torch.int32, wp.int32),
     "fresh": ("E N", torch.int32, wp.int32),
     "overlap": ("E N", torch.int32, wp.int32),
     "crashed": ("E N", torch.int32, wp.int32),

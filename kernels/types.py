@@ -106,6 +106,10 @@ class Robots:
     radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
 
 
+HALF = wp.constant(0.501)
+"""Of length and width of a body: no part of it is farther from its centre."""
+
+
 @wp.func
 def point_xy(p: wp.vec3) -> wp.vec2:
     return wp.vec2(p[0], p[1])

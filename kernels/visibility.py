@@ -22,16 +22,15 @@ square of the range. In a cloud that is not ``planar`` bins do not decide alone,
 import warp as wp
 
 from maexp.kernels.types import (
+    HALF,
     ROBOTS_PER_WORD,
     VIEWER_NOW,
     Maps,
     Robots,
     cell_center,
     floor_within,
-    point_xy,
     row_range,
     row_span,
-    within,
 )
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
@@ -332,6 +331,8 @@ def _collect_occluders(
     center: wp.array2d(dtype=wp.vec3),
     # Scratch in:
     facing: wp.array2d(dtype=wp.vec2),
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     # Scratch out:
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
@@ -376,18 +377,16 @@ def _collect_occluders(
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     walls = int(count)
-    for other in range(pose.shape[1]):
-        if other != i:
-            there = point_xy(center[e, other]) - at
-            reach = radius + robots.length[e, other] + robots.width[e, other]
-            if within(there, reach):
-                if wp.length(center[e, other] - origin) <= reach:
-                    if count == walls:
-                        keep_walls(bins, e, i)
-                    count = add_body(
-                        maps, m, robots, other, pose[e, other], facing[e, other], there, spread, origin, radius,
-                        cos_beam, planar, e, i, count, bins, direction, limit,
-                    )  # fmt: skip
+    for k in range(near_count[e, i]):
+        other = near[e, i, k]
+        there = center[e, other] - origin
+        if wp.length(there) <= 1.0001 * radius + HALF * (robots.length[e, other] + robots.width[e, other]):
+            if count == walls:
+                keep_walls(bins, e, i)
+            count = add_body(
+                maps, m, robots, other, pose[e, other], facing[e, other], wp.vec2(there[0], there[1]), spread, origin,
+                radius, cos_beam, planar, e, i, count, bins, direction, limit,
+            )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
