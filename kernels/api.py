@@ -117,10 +117,12 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     pose_t, center_t = zeros(1, 1, 4, dtype=torch.float32), zeros(1, 1, 3, dtype=torch.float32)
     pose_t[..., 3] = heading
     pose, center = wp.from_torch(pose_t, dtype=wp.vec4), wp.from_torch(center_t, dtype=wp.vec3)
-    bins = wp.from_torch(zeros(1, 1, 2 * int(visibility.BINS), dtype=torch.float32))
+    facing = wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2)  # only other robots' are read
+    bins = wp.from_torch(zeros(1, 1, 3 * int(visibility.BINS), dtype=torch.float32))
     direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
     limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
-    counts = [wp.from_torch(zeros(1, 1)) for _ in range(2)]
+    counts = [wp.from_torch(zeros(1, 1)) for _ in range(3)]
+    near, near_count = wp.from_torch(zeros(1, 1, 1)), wp.from_torch(zeros(1, 1))  # nobody else is there
     views = zeros(1, 1, count)
     listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
     launch = wp.from_torch(free, dtype=wp.vec3).device
@@ -128,13 +130,13 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
     wp.launch(
         visibility._collect_occluders, dim=(1, 1), device=launch,
-        inputs=[maps, map_id, planar, robots, one, pose, center],
+        inputs=[maps, map_id, planar, robots, one, pose, center, facing, near, near_count],
         outputs=[bins, direction, limit, *counts, error],
     )  # fmt: skip
     wp.launch(
         visibility._scan_free, dim=(1, 1, lanes), device=launch,
-        inputs=[maps, map_id, planar, robots, lanes, one, pose, center, bins, direction, limit, counts[0]],
-        outputs=[wp.from_torch(views), listed, counts[1], error],
+        inputs=[maps, map_id, planar, robots, lanes, one, pose, center, bins, direction, limit, *counts[:2]],
+        outputs=[wp.from_torch(views), listed, counts[2], error],
     )  # fmt: skip
     return views[0, 0] != 0
 

@@ -45,6 +45,9 @@ def _detect_collisions(
     # State in:
     active: wp.array(dtype=wp.int32),
     center: wp.array2d(dtype=wp.vec3),
+    # Scratch in:
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     # State in and out:
     pose: wp.array2d(dtype=wp.vec4),
     slip: wp.array2d(dtype=wp.float32),
@@ -62,8 +65,9 @@ def _detect_collisions(
     at = point_xy(center[e, i])
     theta = pose[e, i][3]
     hit = hits_boundary(maps, map_id[e], robots, e, i, at, theta, footprint)
-    for other in range(pose.shape[1]):
-        if other != i and not hit:
+    for k in range(near_count[e, i]):
+        if not hit:
+            other = near[e, i, k]
             there = point_xy(center[e, other])
             if footprint != 0:
                 gap = rectangles_gap(

@@ -6,7 +6,7 @@ car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirec
 
 import warp as wp
 
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots, point_xy, within
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -15,11 +15,6 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 def wrap_angle(theta: float) -> float:
     """Angle in [-pi, pi)."""
     return theta - 2.0 * PI * wp.floor((theta + PI) / (2.0 * PI))
-
-
-@wp.func
-def center_of(pose: wp.vec4, offset: float) -> wp.vec2:
-    return wp.vec2(pose[0] + offset * wp.cos(pose[3]), pose[1] + offset * wp.sin(pose[3]))
 
 
 @wp.func
@@ -41,14 +36,20 @@ def heading_change(kind: int, v: float, turn: float, curve: float, dt: float) ->
 
 
 @wp.func
-def rectangle_distance(p: wp.vec2, center: wp.vec2, theta: float, length: float, width: float) -> float:
-    """Distance of a point to an oriented rectangle, 0 inside."""
+def box_distance(p: wp.vec2, center: wp.vec2, ahead: wp.vec2, length: float, width: float) -> float:
+    """Distance of a point to a rectangle whose length lies along the unit vector ``ahead``, 0 inside."""
     d = p - center
-    c = wp.cos(theta)
-    s = wp.sin(theta)
+    c = ahead[0]
+    s = ahead[1]
     a = wp.max(wp.abs(c * d[0] + s * d[1]) - 0.5 * length, 0.0)
     b = wp.max(wp.abs(c * d[1] - s * d[0]) - 0.5 * width, 0.0)
     return wp.sqrt(a * a + b * b)
+
+
+@wp.func
+def rectangle_distance(p: wp.vec2, center: wp.vec2, theta: float, length: float, width: float) -> float:
+    """Distance of a point to an oriented rectangle, 0 inside."""
+    return box_distance(p, center, wp.vec2(wp.cos(theta), wp.sin(theta)), length, width)
 
 
 @wp.func
@@ -98,6 +99,64 @@ def rectangles_gap(
 
 
 @wp.kernel
+def _face_robots(
+    # Robots:
+    robots: Robots,
+    dt: float,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.vec4),
+    slip: wp.array2d(dtype=wp.float32),
+    center: wp.array2d(dtype=wp.vec3),
+    # Scratch out:
+    facing: wp.array2d(dtype=wp.vec2),
+    place: wp.array2d(dtype=wp.vec3),
+):
+    """Note where robot (e, i) faces, for every robot near it asks, and in ``place`` a disc that it stays in this step.
+
+    ``place`` is its centre's x and y and how far from there its body may reach before or after it moves [m].
+    """
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    facing[e, i] = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+    speed = wp.abs(pose[e, i][2]) + wp.abs(slip[e, i])
+    room = dt * speed + 2.0 * wp.abs(robots.center_offset[e, i]) + robots.length[e, i] + robots.width[e, i]
+    place[e, i] = wp.vec3(center[e, i][0], center[e, i][1], room)
+
+
+@wp.kernel
+def _list_near(
+    # Robots:
+    robots: Robots,
+    # State in:
+    active: wp.array(dtype=wp.int32),
+    # Scratch in:
+    place: wp.array2d(dtype=wp.vec3),
+    # Scratch out:
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
+):
+    """List the robots whose bodies may be in radar range of robot (e, i), or touch it, before or after it moves.
+
+    Planner, collisions and radar then look at these only: a large team is gone through once a step.
+    """
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    here = place[e, i]
+    reach = here[2] + wp.max(robots.radar_range[e, i], robots.threshold[e, i])
+    count = int(0)
+    for other in range(place.shape[1]):
+        there = place[e, other]
+        if within(point_xy(there - here), reach + there[2]):
+            if other != i:
+                near[e, i, count] = other
+                count += 1
+    near_count[e, i] = count
+
+
+@wp.kernel
 def _move_robots(
     # Robots:
     robots: Robots,
@@ -111,6 +170,8 @@ def _move_robots(
     slip: wp.array2d(dtype=wp.float32),
     center: wp.array2d(dtype=wp.vec3),
     path_length: wp.array2d(dtype=wp.float32),
+    # Scratch out:
+    facing: wp.array2d(dtype=wp.vec2),
 ):
     """Clamp the controls to the robot's limits and move it by one local step."""
     e, i = wp.tid()
@@ -141,5 +202,7 @@ def _move_robots(
             velocity = velocity * (limit / speed)
         slip[e, i] = velocity[1]
         pose[e, i] = wp.vec4(x, y, velocity[0], old[3])
-    at = center_of(pose[e, i], robots.center_offset[e, i])
-    center[e, i] = wp.vec3(at[0], at[1], 0.0)
+    offset = robots.center_offset[e, i]
+    ahead = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
+    facing[e, i] = ahead
+    center[e, i] = wp.vec3(pose[e, i][0] + offset * ahead[0], pose[e, i][1] + offset * ahead[1], 0.0)

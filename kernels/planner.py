@@ -2,8 +2,18 @@
 
 import warp as wp
 
-from maexp.kernels.dynamics import curvature, heading_change, rectangle_distance, rectangles_gap
-from maexp.kernels.types import OMNIDIRECTIONAL, ROBOTS_PER_WORD, Maps, Robots, point_xy, row_range, row_span
+from maexp.kernels.dynamics import box_distance, curvature, heading_change, rectangle_distance, rectangles_gap
+from maexp.kernels.types import (
+    HALF,
+    OMNIDIRECTIONAL,
+    ROBOTS_PER_WORD,
+    Maps,
+    Robots,
+    point_xy,
+    row_range,
+    row_span,
+    within,
+)
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -71,18 +81,20 @@ def gather_mates(
     middle: wp.vec2,
     reach: float,
     center: wp.array2d(dtype=wp.vec3),
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     mates: wp.array3d(dtype=wp.int32),
 ) -> int:
     """List the robots in radar range whose bodies come within ``reach`` of ``middle``; returns how many."""
     count = int(0)
     here = point_xy(center[e, i])
-    for other in range(center.shape[1]):
-        if other != i:
-            there = point_xy(center[e, other])
-            if wp.length(there - here) <= in_range:
-                if wp.length(there - middle) <= reach + robots.length[e, other] + robots.width[e, other]:
-                    mates[e, i, count] = other
-                    count += 1
+    for k in range(near_count[e, i]):
+        other = near[e, i, k]
+        there = point_xy(center[e, other])
+        if wp.length(there - here) <= in_range:
+            if wp.length(there - middle) <= reach + HALF * (robots.length[e, other] + robots.width[e, other]):
+                mates[e, i, count] = other
+                count += 1
     return count
 
 
@@ -98,6 +110,7 @@ def body_distance(
     footprint: int,
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec2),
     mates: wp.array3d(dtype=wp.int32),
 ) -> float:
     """Distance from a predicted body of robot i to the nearest of the listed bodies, where they are now.
@@ -111,14 +124,14 @@ def body_distance(
         there = point_xy(center[e, other])
         length = robots.length[e, other]
         width = robots.width[e, other]
-        if wp.length(there - at) <= 1.001 * clearance + own + length + width:
+        if within(there - at, 1.001 * clearance + own + HALF * (length + width)):
             gap = float(0.0)
             if footprint != 0:
                 gap = rectangles_gap(
                     at, theta, robots.length[e, i], robots.width[e, i], there, pose[e, other][3], length, width
                 )
             else:
-                gap = rectangle_distance(at, there, pose[e, other][3], length, width)
+                gap = box_distance(at, there, facing[e, other], length, width)
             nearest = wp.min(nearest, gap)
     return nearest
 
@@ -167,8 +180,12 @@ def _plan_dwa(
     pose: wp.array2d(dtype=wp.vec4),
     slip: wp.array2d(dtype=wp.float32),
     center: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec2),
     target: wp.array2d(dtype=wp.vec2),
     known_boundary: wp.array3d(dtype=wp.int32),
+    # Scratch in:
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     # Scratch:
     nearby: wp.array3d(dtype=wp.vec2),
     mates: wp.array3d(dtype=wp.int32),
@@ -217,7 +234,7 @@ def _plan_dwa(
     if count > nearby.shape[2]:
         wp.atomic_or(error, e, 4)
         count = nearby.shape[2]
-    mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, mates)
+    mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, near, near_count, mates)
     best = float(-1.0e30)
     best_k = int(0)
     for b in range(num_turns):
@@ -249,7 +266,7 @@ def _plan_dwa(
             if not score < best:  # what is in the way can only lower it
                 d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
                 d = wp.min(d, body_distance(
-                    robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, mates))  # fmt: skip
+                    robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, facing, mates))  # fmt: skip
                 if d < clearance:
                     score += weight * wp.log(wp.max(d, NEAREST) / clearance)
                 k = a * num_turns + b

@@ -56,6 +56,10 @@ STATE = {
 }
 SCRATCH = {
     "mask": ("E", torch.int32, wp.int32),
+    "facing": ("E N 2", torch.float32, wp.vec2),
+    "place": ("E N 3", torch.float32, wp.vec3),
+    "near": ("E N N", torch.int32, wp.int32),
+    "near_count": ("E N", torch.int32, wp.int32),
     "fresh": ("E N", torch.int32, wp.int32),
     "overlap": ("E N", torch.int32, wp.int32),
     "crashed": ("E N", torch.int32, wp.int32),
@@ -67,6 +71,7 @@ SCRATCH = {
     "direction": ("E N K 3", torch.float32, wp.vec3),
     "limit": ("E N K 2", torch.float32, wp.vec2),
     "occluder_count": ("E N", torch.int32, wp.int32),
+    "wall_count": ("E N", torch.int32, wp.int32),
     "nearby": ("E N O 2", torch.float32, wp.vec2),
     "mates": ("E N N", torch.int32, wp.int32),
     "body_pixel": ("E N G", torch.int32, wp.int32),
@@ -95,7 +100,7 @@ def axis_sizes(
         "E": num_envs, "N": num_robots, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
-        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": int(TERMS), "D": 2 * int(BINS),
+        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": int(TERMS), "D": 3 * int(BINS),
     }  # fmt: skip
 
 

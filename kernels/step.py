@@ -99,6 +99,15 @@ class Shard:
                 [maps, s.map_id, s.region, s.offset, s.active], [s.goal, s.target, s.error],
             )  # fmt: skip
 
+    def look(self, launch: Callable, running: wp.array) -> None:
+        """Who is near whom in this local step, and which way robots face, in the envs where ``running`` is set."""
+        s = self.view
+        launch(
+            dynamics._face_robots, self.shape, [self.robots, self.sim.settings.dt, running, s.pose, s.slip, s.center],
+            [s.facing, s.place],
+        )  # fmt: skip
+        launch(dynamics._list_near, self.shape, [self.robots, running, s.place], [s.near, s.near_count])
+
     def plan(self, launch: Callable) -> None:
         """How to go: controls of every robot."""
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
@@ -110,7 +119,8 @@ class Shard:
             planner._plan_dwa, self.shape,
             [maps, s.map_id, robots, cfg.num_accels, cfg.num_turns, cfg.horizon, cfg.clearance_weight,
              int(cfg.footprint), int(cfg.comm_limited), cfg.dt,
-             s.active, s.collided, s.pose, s.slip, s.center, s.target, self.known("boundary"), s.nearby, s.mates],
+             s.active, s.collided, s.pose, s.slip, s.center, s.facing, s.target, self.known("boundary"), s.near,
+             s.near_count, s.nearby, s.mates],
             [s.control, s.error],
         )  # fmt: skip
 
@@ -124,11 +134,12 @@ class Shard:
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         launch(
             dynamics._move_robots, self.shape,
-            [self.robots, cfg.dt, s.active, s.collided, s.control], [s.pose, s.slip, s.center, s.path_length],
+            [self.robots, cfg.dt, s.active, s.collided, s.control],
+            [s.pose, s.slip, s.center, s.path_length, s.facing],
         )  # fmt: skip
         launch(
             collision._detect_collisions, self.shape,
-            [maps, s.map_id, self.robots, int(cfg.footprint), s.active, s.center],
+            [maps, s.map_id, self.robots, int(cfg.footprint), s.active, s.center, s.near, s.near_count],
             [s.pose, s.slip, s.collided, s.crashed],
         )  # fmt: skip
 
@@ -137,13 +148,13 @@ class Shard:
         s, maps, cfg = self.view, self.sim.maps, self.sim.settings
         launch(
             visibility._collect_occluders, self.shape,
-            [maps, s.map_id, 1, self.robots, running, s.pose, s.center],
-            [s.bins, s.direction, s.limit, s.occluder_count, s.visible_count, s.error],
+            [maps, s.map_id, 1, self.robots, running, s.pose, s.center, s.facing, s.near, s.near_count],
+            [s.bins, s.direction, s.limit, s.occluder_count, s.wall_count, s.visible_count, s.error],
         )  # fmt: skip
         launch(
             visibility._scan_free, (*self.shape, self.lanes),
             [maps, s.map_id, 1, self.robots, self.lanes, running, s.pose, s.center,
-             s.bins, s.direction, s.limit, s.occluder_count],
+             s.bins, s.direction, s.limit, s.occluder_count, s.wall_count],
             [s.viewers_free, s.visible, s.visible_count, s.error],
         )  # fmt: skip
         launch(
@@ -175,6 +186,7 @@ class Shard:
     def local_step(self, launch: Callable) -> None:
         """Plan, move, collide, scan, merge, reward, terminate (design 4.2)."""
         s, maps = self.view, self.sim.maps
+        self.look(launch, s.active)
         self.plan(launch)
         self.move(launch)
         self.scan(launch, s.active)
@@ -217,6 +229,7 @@ class Shard:
             [s.slip, s.control, s.goal, s.target, s.collided, s.crashed, s.path_length, s.milestone_path,
              s.terms, s.raw, s.episode_reward],
         )  # fmt: skip
+        self.look(launch, s.mask)
         self.scan(launch, s.mask)
         launch(observe._record_track, (envs, n), [maps, s.map_id, s.mask, s.center, s.local_step, 0], [s.track])
         launch(

@@ -106,9 +106,19 @@ class Robots:
     radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
 
 
+HALF = wp.constant(0.501)
+"""Of length and width of a body: no part of it is farther from its centre."""
+
+
 @wp.func
 def point_xy(p: wp.vec3) -> wp.vec2:
     return wp.vec2(p[0], p[1])
+
+
+@wp.func
+def within(offset: wp.vec2, radius: float) -> bool:
+    """False only for an offset longer than the radius: asked of every pair of robots before the exact root."""
+    return wp.dot(offset, offset) <= 1.0001 * radius * radius
 
 
 @wp.func

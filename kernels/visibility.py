@@ -10,7 +10,8 @@ Both angular tests fold into ``dot(P_f, u_o) > c_o |P_f|`` with
 Directions are cut into bins so that most points need no pairwise test. For every bin we keep the
 distance of the nearest occluder that may touch it (``near``) and of the nearest one that surely
 covers all of it (``full``). A free point nearer than ``near`` is visible, one behind ``full`` is
-masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit.
+masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit. Where only
+another robot's body may be near enough (``near`` of the static occluders is kept beside), it meets bodies only.
 
 Likewise an occluder all of whose bins are full nearer than itself decides nothing: every free point
 that it could mask is masked. So occluders are entered the nearest rows of cells first, and cells and bodies
@@ -21,6 +22,7 @@ square of the range. In a cloud that is not ``planar`` bins do not decide alone,
 import warp as wp
 
 from maexp.kernels.types import (
+    HALF,
     ROBOTS_PER_WORD,
     VIEWER_NOW,
     Maps,
@@ -64,6 +66,13 @@ def bin_of(x: float, y: float) -> int:
 def lower_all_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, dist: float):
     for b in range(BINS):
         bins[e, i, b] = wp.min(bins[e, i, b], dist)
+
+
+@wp.func
+def keep_walls(bins: wp.array3d(dtype=wp.float32), e: int, i: int):
+    """Keep the bins' nearest static occluders, before bodies are entered."""
+    for b in range(BINS):
+        bins[e, i, 2 * BINS + b] = bins[e, i, b]
 
 
 @wp.func
@@ -144,6 +153,7 @@ def add_occluder(
 @wp.func
 def add_outline(
     pose: wp.vec4,
+    forward: wp.vec2,
     length: float,
     width: float,
     offset: float,
@@ -162,7 +172,6 @@ def add_outline(
 ) -> int:
     """Append the outline of another robot's body, sampled at ``spacing`` or finer."""
     count = start
-    forward = wp.vec2(wp.cos(pose[3]), wp.sin(pose[3]))
     left = wp.vec2(-forward[1], forward[0])
     center = wp.vec2(pose[0], pose[1]) + offset * forward
     along = wp.max(2, int(wp.ceil(length / spacing)))
@@ -196,18 +205,26 @@ def is_masked(
     alpha2: float,
     e: int,
     i: int,
+    walls: int,
     count: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
 ) -> bool:
-    """Whether any of the ``count`` occluders masks the free point at ``delta``."""
+    """Whether any of the ``count`` occluders, the first ``walls`` of them static, masks the free point at ``delta``.
+
+    ``walls`` is 0 where there are no bodies, or static occluders and bodies are not told apart.
+    """
     b = bin_of(delta[0], delta[1])
     if dist == 0.0 or not (bins[e, i, b] - dist < alpha2):
         return False
     if bins[e, i, BINS + b] - dist < alpha2 and wp.abs(delta[2]) <= 1.0e-6 * dist:
         return True
-    for k in range(count):
+    first = int(0)
+    if walls > 0:
+        if not (bins[e, i, 2 * BINS + b] - dist < alpha2):
+            first = walls
+    for k in range(first, count):
         cd = limit[e, i, k]
         if cd[1] - dist < alpha2:
             if wp.dot(delta, direction[e, i, k]) > cd[0] * dist:
@@ -272,6 +289,7 @@ def add_body(
     robots: Robots,
     other: int,
     pose: wp.vec4,
+    forward: wp.vec2,
     at: wp.vec2,
     spread: float,
     origin: wp.vec3,
@@ -294,7 +312,7 @@ def add_body(
     if planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
         return start
     return add_outline(
-        pose, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
+        pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
         origin, radius, cos_beam, planar, e, i, start, bins, direction, limit,
     )  # fmt: skip
 
@@ -311,11 +329,16 @@ def _collect_occluders(
     active: wp.array(dtype=wp.int32),
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
+    # Scratch in:
+    facing: wp.array2d(dtype=wp.vec2),
+    near: wp.array3d(dtype=wp.int32),
+    near_count: wp.array2d(dtype=wp.int32),
     # Scratch out:
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
     occluder_count: wp.array2d(dtype=wp.int32),
+    wall_count: wp.array2d(dtype=wp.int32),
     visible_count: wp.array2d(dtype=wp.int32),
     error: wp.array(dtype=wp.int32),
 ):
@@ -353,17 +376,22 @@ def _collect_occluders(
                     maps, m, row, col, run, spread, origin, radius, cos_beam, cull,
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
-    for other in range(pose.shape[1]):
+    walls = int(count)
+    for k in range(near_count[e, i]):
+        other = near[e, i, k]
         there = center[e, other] - origin
-        if other != i and wp.length(there) <= radius + robots.length[e, other] + robots.width[e, other]:
+        if wp.length(there) <= 1.0001 * radius + HALF * (robots.length[e, other] + robots.width[e, other]):
+            if count == walls:
+                keep_walls(bins, e, i)
             count = add_body(
-                maps, m, robots, other, pose[e, other], wp.vec2(there[0], there[1]), spread, origin, radius,
-                cos_beam, planar, e, i, count, bins, direction, limit,
+                maps, m, robots, other, pose[e, other], facing[e, other], wp.vec2(there[0], there[1]), spread, origin,
+                radius, cos_beam, planar, e, i, count, bins, direction, limit,
             )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
         count = direction.shape[2]
     occluder_count[e, i] = count
+    wall_count[e, i] = wp.where(count > walls, walls, 0)
 
 
 @wp.kernel
@@ -384,6 +412,7 @@ def _scan_free(
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
     occluder_count: wp.array2d(dtype=wp.int32),
+    wall_count: wp.array2d(dtype=wp.int32),
     # Scratch out:
     viewers_free: wp.array3d(dtype=wp.int32),
     visible: wp.array3d(dtype=wp.int32),
@@ -401,6 +430,7 @@ def _scan_free(
     heading = wp.vec3(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]), 0.0)
     origin = center[e, i]
     count = occluder_count[e, i]
+    walls = wall_count[e, i]
     at = wp.vec2(origin[0], origin[1])
     half = CELL_HALF * maps.cell_size[m]
     rows = row_range(maps, m, at, radius)
@@ -419,7 +449,7 @@ def _scan_free(
                     delta = maps.free[first + j] - origin
                     dist = wp.length(delta)
                     if dist <= radius and wp.dot(delta, heading) >= cos_fov * dist:
-                        if not is_masked(delta, dist, alpha2, e, i, count, bins, direction, limit):
+                        if not is_masked(delta, dist, alpha2, e, i, walls, count, bins, direction, limit):
                             wp.atomic_add(viewers_free, e, 0, j, VIEWER_NOW)
                             slot = wp.atomic_add(visible_count, e, i, 1)
                             if slot < visible.shape[2]:

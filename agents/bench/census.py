@@ -83,7 +83,7 @@ def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, 
     s = env.simulation.tensors
     names = (
         "active driving rows plan_rows free_near free_in undecided pair_tests visible occluder_near occluders "
-        "bins_touched outline_points neighbours plan_near plan_known mates hit_near"
+        "bins_touched outline_points neighbours plan_near plan_known mates hit_near near"
     )
     counts = dict.fromkeys(names.split(), 0.0)
     if not active:
@@ -98,6 +98,7 @@ def count_robot(env: ExplorationEnv, e: int, i: int, active: bool) -> dict[str, 
     counts |= {"free_near": len(near), "free_in": inside.sum(), "visible": float(s["visible_count"][e, i])}
     counts |= count_pairs(s, e, i, free[inside] - at, env.radar_configs[i].alpha2)
     counts["occluder_near"] = len(cloud.near("occluder", at, reach)[1])
+    counts["near"] = float(s["near_count"][e, i])
     counts["occluders"] = float(s["occluder_count"][e, i])
     counts |= count_outlines(env, e, i, m, at, reach)
     counts["neighbours"] = count_neighbours(env, e, i, m)

@@ -38,17 +38,27 @@ def set_goal(c: Counts) -> Cost:
     return Cost(c["active"] * (8 + VEC2 + 2 * WORD + 2 * VEC2 + 2 * VEC2), c["active"] * 14)
 
 
+def face_robots(c: Counts) -> Cost:
+    """Sine and cosine of a heading, and the disc that a robot stays in."""
+    return Cost(c["active"] * (VEC4 + VEC3 + 4 * WORD + VEC2 + VEC3), c["active"] * (2 * TRIG + 6))
+
+
+def list_near(c: Counts) -> Cost:
+    """The discs of all robots, and the numbers of those near."""
+    return Cost(c["active"] * (VEC3 * c["robots"] + 3 * WORD) + c["near"] * WORD, c["active"] * 8 * c["others"])
+
+
 def plan_dwa(c: Counts) -> Cost:
     """List the known points in reach, then score turns x accelerations after `horizon` steps."""
     body = VEC4 + WORD + VEC3 + VEC2 + 9 * WORD  # pose, slip, centre, target, parameters
     moved = c["plan_rows"] * ROW + c["plan_near"] * VEC3 + c["plan_known"] * (WORD * c["words"] + 2 * VEC2)
-    moved += c["others"] * VEC3 + c["mates"] * (VEC4 + 2 * WORD) + VEC2
+    moved += c["near"] * (WORD + VEC3) + c["mates"] * (VEC2 + 2 * WORD) + VEC2
     step = 10 + 2 * TRIG + 4  # position, heading's sine and cosine, speed
     point = 30 + 2 * TRIG if c["footprint"] else 6  # distance of a listed point to the predicted body
-    mate = 2 * TRIG + 14  # distance to the body of another robot that may come near enough to matter
+    mate = 14 + 2 * TRIG * c["footprint"]  # distance to the body of another robot that may come near enough to matter
     candidate = (c["horizon"] - 1) * step + 4 + c["plan_known"] * point + c["mates"] * mate + 8 + TRIG
     turn = TRIG + 4 + 3 + 2 * TRIG  # curvature, first heading with sine and cosine
-    work = c["plan_near"] * 6 + c["others"] * 6 + c["turns"] * turn + c["candidates"] * candidate
+    work = c["plan_near"] * 6 + c["near"] * 6 + c["turns"] * turn + c["candidates"] * candidate
     return Cost(c["driving"] * body + moved, c["driving"] * work)
 
 
@@ -65,16 +75,16 @@ def move_robots(c: Counts) -> Cost:
 
 def detect_collisions(c: Counts) -> Cost:
     """Boundary points in the cells around the threshold, and the other centres."""
-    moved = VEC3 + VEC4 + 6 * WORD + c["hit_near"] * VEC3 + c["others"] * VEC3
-    return Cost(c["driving"] * moved, c["driving"] * 6 * (c["hit_near"] + c["others"]))
+    moved = VEC3 + VEC4 + 6 * WORD + c["hit_near"] * VEC3 + c["near"] * (WORD + VEC3)
+    return Cost(c["driving"] * moved, c["driving"] * 6 * (c["hit_near"] + c["near"]))
 
 
 def collect_occluders(c: Counts) -> Cost:
     """Distances of the occluders near, directions and half-widths of those in range, and their bins."""
     bins = 2 * int(BINS) * WORD
-    moved = c["rows"] * ROW + c["occluder_near"] * (VEC3 + WORD) + c["others"] * (VEC4 + 3 * WORD)
+    moved = c["rows"] * ROW + c["occluder_near"] * (VEC3 + WORD) + c["near"] * (VEC4 + VEC2 + 4 * WORD)
     moved += c["occluders"] * (VEC3 + VEC2) + bins
-    work = 8 * c["occluder_near"] + 30 * c["outline_points"] + c["others"] * (2 * TRIG + 10)
+    work = 8 * c["occluder_near"] + 30 * c["outline_points"] + c["near"] * 10
     work += c["occluders"] * (6 + 40) + 4 * c["bins_touched"]  # c_o, both edges in diamond angle; then two minima a bin
     return Cost(c["active"] * moved, work)
 
@@ -175,6 +185,8 @@ def start_env(c: Counts) -> Cost:
 
 FORMULAS: dict[str, Callable[[Counts], Cost]] = {
     "_set_goal": set_goal,
+    "_face_robots": face_robots,
+    "_list_near": list_near,
     "_plan_dwa": plan_dwa,
     "_plan_direct": plan_direct,
     "_move_robots": move_robots,
