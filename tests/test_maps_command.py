@@ -116,6 +116,9 @@ def test_a_folder_passes_over_images_that_a_yaml_names_hidden_files_and_earlier_
     runs = [file.parent for file in folder.rglob("report.csv")]
     assert len(runs) == 2
     assert len(find_files(runs[0].relative_to(folder))) == 8, "an earlier run can be asked for: 4 maps, 4 pictures"
+    for name in ("here", "there"):
+        assert main(["maps", "import", ".", f"hydra.run.dir={name}"]) == 1
+        assert "4 of 7 files became maps, 3 were refused." in capsys.readouterr().out
 
 
 def test_a_folder_of_good_files_and_its_settings(tmp_path, capsys):

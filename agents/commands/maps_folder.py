@@ -19,6 +19,7 @@ from maexp.envs.importing.occupancy import find_image
 
 YAMLS = (".yaml", ".yml")
 IMAGES = tuple(suffix for suffix in GRIDS if suffix not in YAMLS)
+REPORT = "report.csv"
 RUNS = "outputs"  # where runs write, as in conf/run.yaml
 OTHER_ARRAYS = ("obstacles", "obstacle", "boundary", "boundaries")  # of a triple, read with its free points
 
@@ -49,13 +50,14 @@ class Row:
 def find_files(folder: Path) -> list[Path]:
     """The files below `folder` that can be maps: an image goes with the yaml that names it, or has its name.
 
-    Hidden files and what earlier runs left under outputs/ are passed over.
+    Hidden files and what earlier runs left are passed over.
 
     Raises:
         UserError: there are none.
     """
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in _suffixes())
-    files = [file for file in files if not _is_hidden(file, folder)]
+    results = [report.parent for report in folder.rglob(REPORT) if report.parent != folder and _is_ours(report)]
+    files = [file for file in files if not _is_hidden(file, folder) and not set(results) & set(file.parents)]
     yamls = [file for file in files if file.suffix.lower() in YAMLS]
     beside = {file.with_suffix("") for file in yamls}
     named = {image for file in yamls if (image := find_image(file)) is not None}
@@ -75,6 +77,12 @@ def _is_hidden(file: Path, folder: Path) -> bool:
     return file.resolve().is_relative_to(runs) and not place.is_relative_to(runs)
 
 
+def _is_ours(report: Path) -> bool:
+    """Whether a run of this command wrote it."""
+    with open(report, encoding="utf-8", errors="replace") as file:
+        return file.readline().strip() == ",".join(field.name for field in fields(Row))
+
+
 def _suffixes() -> tuple[str, ...]:
     return (*GRIDS, *CLOUDS, *POINTS)
 
@@ -85,7 +93,7 @@ def run(folder: Path, where: Path, options: dict[str, Any]) -> int:
     for file in files:
         rows.append(_import(file, folder, where, options))
         print(rows[-1].line(), flush=True)
-        _write_csv(rows, where / "report.csv")
+        _write_csv(rows, where / REPORT)
         _write_markdown(rows, where / "report.md")
     refused = sum(row.result == "refused" for row in rows)
     print(f"{len(rows) - refused} of {len(rows)} files became maps, {refused} were refused.")
