@@ -7,6 +7,9 @@ from typing import Any
 
 import warp as wp
 
+KNOWN = wp.config.version.startswith("1.19.")
+"""Whether this is a Warp whose way of calling CPU kernels (nowhere documented) is the one below."""
+
 
 @cache
 def arguments_struct(types: tuple[type, ...]) -> type[ctypes.Structure]:
@@ -27,7 +30,7 @@ class RecordedLaunch:
         self.kernel = kernel
         self.command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
         self.call: Any = None
-        if device.is_cpu and self.command.block_dim == 1:
+        if KNOWN and device.is_cpu and self.command.block_dim == 1:
             bounds, *arguments = self.command.params
             packed = arguments_struct(tuple(type(one) for one in arguments))(*arguments)
             self.call = partial(self.command.hooks.forward, ctypes.byref(bounds), ctypes.byref(packed))
