@@ -25,7 +25,7 @@ from maexp.kernels.assignment import FORBIDDEN, assign_targets
 
 DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
 STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
-SIGHT = 1.5  # goals for plain DWA lie at most so many radar ranges away
+SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 REGION_COUNT = 64
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
 LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
