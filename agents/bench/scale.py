@@ -78,7 +78,8 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> None:
                 progress.show(progress.done + 1, f"{name} {value}")
     report = {}
     for name in chosen:
-        report[name] = {"rows": rows[name], "worst_over_linear": worst_over_linear(rows[name], AXES[name].size)}
+        worst, base = worst_over_linear(rows[name], AXES[name].size)
+        report[name] = {"rows": rows[name], "worst_over_linear": worst, "worst_from": base["value"]}
         print_axis(name, report[name])
         draw_axis(AXES[name], rows[name], where / f"scale_{name}.png")
     write_report(where / "bench_scale.json", "bench_scale", cfg.device, {"tolerance": TOLERANCE, "axes": report})
@@ -133,11 +134,14 @@ def large_maze(cells: int) -> PointCloudMap:
     return build_maze(0, scenario="maze_small", cells=cells, corridor=5, wall=1, resolution=1.0)
 
 
-def worst_over_linear(rows: list[dict], size: str) -> float:
-    """The largest (cost ratio) / (size ratio) of any value over a smaller one: 1 is linear, less is better."""
+def worst_over_linear(rows: list[dict], size: str) -> tuple[float, dict]:
+    """The largest (cost ratio) / (size ratio) of any value over a smaller one: 1 is linear, less is better; and the
+    row of the smaller one."""
     pairs = [(small, large) for k, large in enumerate(rows) for small in rows[:k]]
-    return max((ratio(large, small, "seconds_per_local_step") / ratio(large, small, size) for small, large in pairs),
-               default=1.0)  # fmt: skip
+    shares = [
+        (ratio(large, small, "seconds_per_local_step") / ratio(large, small, size), small) for small, large in pairs
+    ]
+    return max(shares, key=lambda pair: pair[0], default=(1.0, rows[0]))
 
 
 def ratio(large: dict, small: dict, name: str) -> float:
@@ -146,7 +150,7 @@ def ratio(large: dict, small: dict, name: str) -> float:
 
 def print_axis(name: str, measured: dict) -> None:
     """The table of an axis, and whether the cost is linear at most."""
-    rows, axis, worst = measured["rows"], AXES[name], measured["worst_over_linear"]
+    rows, axis = measured["rows"], AXES[name]
     cells = [
         [
             f"{row[axis.size]:g}",
@@ -160,9 +164,16 @@ def print_axis(name: str, measured: dict) -> None:
         ]
         for row in rows
     ]
-    verdict = "linear at most" if worst <= TOLERANCE else "FASTER THAN LINEAR"
-    title = f"{axis.title}: {verdict} (at worst {worst:.2f} times its share of a smaller one)"
-    print_table(title, [name, *COLUMNS], cells)
+    print_table(describe_growth(axis, measured), [name, *COLUMNS], cells)
+
+
+def describe_growth(axis: Axis, measured: dict) -> str:
+    """From end to end, and from the value on which a larger one costs most beside its share."""
+    rows, worst = measured["rows"], measured["worst_over_linear"]
+    cost, size = ratio(rows[-1], rows[0], "seconds_per_local_step"), ratio(rows[-1], rows[0], axis.size)
+    verdict = "linear at most" if worst <= TOLERANCE else f"FASTER THAN LINEAR from {measured['worst_from']} on"
+    return (f"{axis.title}: {size:.3g} times the size costs {cost:.3g} times as much; "
+            f"{verdict} (at worst {worst:.2f} times its share of a smaller one)")  # fmt: skip
 
 
 def draw_axis(axis: Axis, rows: list[dict], path: Path) -> None:
