@@ -29,8 +29,10 @@ from maexp.kernels.types import (
     Robots,
     cell_center,
     floor_within,
+    point_xy,
     row_range,
     row_span,
+    within,
 )
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
@@ -159,6 +161,36 @@ def add_occluder(
 
 
 @wp.func
+def outline_point(
+    index: int, along: int, across: int, center: wp.vec2, forward: wp.vec2, length: float, width: float
+) -> wp.vec3:
+    """Point ``index``, up to twice round, of the outline of a body."""
+    half = along + across
+    k = wp.where(index >= 2 * half, index - 2 * half, index)
+    side = wp.where(k >= half, -1.0, 1.0)
+    k = wp.where(k >= half, k - half, k)
+    lengthwise = k < along
+    part = wp.where(lengthwise, float(k), float(k - along)) / wp.where(lengthwise, float(along), float(across))
+    a = side * wp.where(lengthwise, -0.5 + part, 0.5)  # position on the outline, in lengths and widths from the centre
+    b = side * wp.where(lengthwise, -0.5, -0.5 + part)
+    p = center + a * length * forward + b * width * wp.vec2(-forward[1], forward[0])
+    return wp.vec3(p[0], p[1], 0.0)
+
+
+@wp.func
+def nearest_outline(at: wp.vec2, forward: wp.vec2, length: float, width: float, along: int, across: int) -> int:
+    """Index of a point of an outline near to what lies at ``at`` from its centre."""
+    a = wp.dot(at, forward) / length
+    b = wp.dot(at, wp.vec2(-forward[1], forward[0])) / width
+    half = along + across
+    k = int((wp.clamp(a, -0.5, 0.5) + 0.5) * float(along) + 0.5)
+    if wp.abs(a) > wp.abs(b):
+        k = along + int((wp.clamp(b, -0.5, 0.5) + 0.5) * float(across) + 0.5)
+        return wp.where(a > 0.0, k, half + along + half - k)
+    return wp.where(b < 0.0, k, half + along - k)
+
+
+@wp.func
 def add_outline(
     pose: wp.vec4,
     forward: wp.vec2,
@@ -181,23 +213,17 @@ def add_outline(
 ) -> int:
     """Append the outline of another robot's body, sampled at ``spacing`` or finer."""
     count = start
-    left = wp.vec2(-forward[1], forward[0])
     center = wp.vec2(pose[0], pose[1]) + offset * forward
     along = wp.max(2, int(wp.ceil(length / spacing)))
     across = wp.max(2, int(wp.ceil(width / spacing)))
     rho = wp.min(radius_max, wp.max(length / float(along), width / float(across)) * 0.70710678)
-    for k in range(along + across):
-        a = 0.5  # position on the outline, in lengths and widths from the centre
-        b = 0.5
-        if k < along:
-            a = -0.5 + float(k) / float(along)
-            b = -0.5
-        else:
-            b = -0.5 + float(k - along) / float(across)
-        p = center + a * length * forward + b * width * left
-        q = center - a * length * forward - b * width * left
-        dp = wp.vec3(p[0] - origin[0], p[1] - origin[1], 0.0)
-        dq = wp.vec3(q[0] - origin[0], q[1] - origin[1], 0.0)
+    nearest = nearest_outline(wp.vec2(origin[0], origin[1]) - center, forward, length, width, along, across)
+    total = 2 * (along + across)
+    for j in range(along + across):
+        dp = outline_point(nearest - j + total, along, across, center, forward, length, width) - origin
+        dq = outline_point(nearest + 1 + j, along, across, center, forward, length, width) - origin
+        dp[2] = 0.0
+        dq[2] = 0.0
         sp = shadow(dp, rho, cos_beam, spread)
         sq = shadow(dq, rho, cos_beam, spread)
         count = add_occluder(dp, sp, radius, cull, e, i, count, bins, direction, limit)
@@ -320,7 +346,7 @@ def add_body(
     dist = wp.length(at)
     half = 0.501 * wp.sqrt(length * length + width * width)
     reach = half + wp.max(0.36 * wp.max(length, width), spread * (dist + half))
-    if planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
+    if dist > 1.0001 * radius + half or planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
         return start
     return add_outline(
         pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
@@ -390,12 +416,12 @@ def _collect_occluders(
     walls = int(count)
     for k in range(near_count[e, i]):
         other = near[e, i, k]
-        there = center[e, other] - origin
-        if wp.length(there) <= 1.0001 * radius + HALF * (robots.length[e, other] + robots.width[e, other]):
+        there = point_xy(center[e, other] - origin)
+        if within(there, radius + HALF * (robots.length[e, other] + robots.width[e, other])):
             if count == walls:
                 keep_walls(bins, e, i)
             count = add_body(
-                maps, m, robots, other, pose[e, other], facing[e, other], wp.vec2(there[0], there[1]), origin,
+                maps, m, robots, other, pose[e, other], facing[e, other], there, origin,
                 radius, cos_beam, spread, planar, e, i, count, bins, direction, limit,
             )  # fmt: skip
     if count > direction.shape[2]:
