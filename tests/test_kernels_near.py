@@ -12,8 +12,8 @@ from maexp.envs import ExplorationEnv, PlannerConfig, RadarConfig, RobotConfig
 
 pytestmark = pytest.mark.kernels
 
-SHAPES = [  # large and slow; small and so fast that a step is what counts; thresholds beyond what a radar reaches
-    {"kind": "ackermann", "length": 2.4, "width": 0.3, "wheelbase": 2.4, "max_speed": 0.5, "collision_threshold": 0.2},
+SHAPES = [  # long, turning about its rear; small and fast, so that a step counts; thresholds beyond a radar's reach
+    {"kind": "ackermann", "length": 2.4, "width": 0.3, "wheelbase": 2.4, "max_speed": 9.0, "collision_threshold": 0.2},
     {"kind": "omnidirectional", "length": 0.2, "width": 0.1, "max_speed": 30.0, "collision_threshold": 0.1},
     {"kind": "differential", "length": 0.2, "width": 0.2, "max_speed": 0.1, "collision_threshold": 1.6},
     {"kind": "differential", "length": 0.2, "width": 0.1, "max_speed": 25.0, "collision_threshold": 0.1},
@@ -74,9 +74,11 @@ def bound(env: ExplorationEnv, before: dict[str, np.ndarray], i: int, j: int) ->
     """How far apart listed robots may be: what each may take up or drive through, and the reach of robot i [m]."""
 
     def room_of(k: int) -> float:
-        one = env.robot_configs[k]
-        offset = 0.5 * one.length if one.kind == "ackermann" else 0.0
-        return 0.1 * (abs(before["pose"][k, 2]) + abs(before["slip"][k])) + 2.0 * offset + one.length + one.width
+        one, way = env.robot_configs[k], 0.1 * (abs(before["pose"][k, 2]) + abs(before["slip"][k]))
+        swing = 0.0
+        if one.kind == "ackermann":  # its centre lies half a length ahead of what it turns about
+            swing = 0.5 * one.length * min(2.0, 1.001 * way * math.tan(one.max_steer) / one.wheelbase)
+        return way + swing + 0.501 * (one.length + one.width)
 
     return max(env.radar_configs[i].range, env.robot_configs[i].collision_threshold) + room_of(i) + room_of(j)
 
