@@ -6,7 +6,7 @@ car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirec
 
 import warp as wp
 
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots, point_xy, within
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, HALF, PI, Robots, point_xy, within
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -121,7 +121,11 @@ def _face_robots(
         return
     facing[e, i] = wp.vec2(wp.cos(pose[e, i][3]), wp.sin(pose[e, i][3]))
     speed = wp.abs(pose[e, i][2]) + wp.abs(slip[e, i])
-    room = dt * speed + 2.0 * wp.abs(robots.center_offset[e, i]) + robots.length[e, i] + robots.width[e, i]
+    kind = robots.kind[e, i]
+    most = robots.max_turn[e, i]
+    turn = heading_change(kind, speed, most, curvature(kind, most, robots.wheelbase[e, i]), dt)
+    swing = wp.min(2.0, 1.001 * turn) * wp.abs(robots.center_offset[e, i])  # of the centre, by that change of heading
+    room = dt * speed + swing + HALF * (robots.length[e, i] + robots.width[e, i])
     place[e, i] = wp.vec3(center[e, i][0], center[e, i][1], room)
 
 

@@ -107,11 +107,13 @@ def _draw_points(
                         word = draw_free[e, w, j]
                     else:
                         word = draw_boundary[e, w, j - free_count]
-                    first = w * ROBOTS_PER_WORD
-                    for i in range(first, wp.where(word == 0, first, wp.min(first + ROBOTS_PER_WORD, robot_count))):
-                        if (word & (1 << (i - first))) != 0:
-                            for k in range(start, stop):
-                                picture[e, i, channel, maps.point_pixel[k]] = ON
+                    bits = wp.uint32(word)
+                    while bits != wp.uint32(0):  # those that are set only: few of a large team have seen a point
+                        below = bits - wp.uint32(1)
+                        i = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~bits))
+                        for k in range(start, stop):
+                            picture[e, i, channel, maps.point_pixel[k]] = ON
+                        bits = bits & below
 
 
 @wp.kernel

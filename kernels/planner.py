@@ -91,8 +91,8 @@ def gather_mates(
     for k in range(near_count[e, i]):
         other = near[e, i, k]
         there = point_xy(center[e, other])
-        if wp.length(there - here) <= in_range:
-            if wp.length(there - middle) <= reach + HALF * (robots.length[e, other] + robots.width[e, other]):
+        if within(there - middle, reach + HALF * (robots.length[e, other] + robots.width[e, other])):
+            if wp.length(there - here) <= in_range:
                 mates[e, i, count] = other
                 count += 1
     return count

@@ -29,8 +29,10 @@ from maexp.kernels.types import (
     Robots,
     cell_center,
     floor_within,
+    point_xy,
     row_range,
     row_span,
+    within,
 )
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
@@ -38,6 +40,7 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 BINS = wp.constant(128)
 FAR = wp.constant(1.0e30)
 BIN_MARGIN = wp.constant(1.0e-4)  # in diamond angle; far above float32 error of the exact test
+LEAST_SINE = wp.constant(0.01)  # below it that of the angle whose cosine is tested differs by more than rounding
 CELL_HALF = wp.constant(0.709)  # half the diagonal of a cell in edges, with room for rounding
 WORTH_A_TEST = wp.constant(6)  # free points of a cell from which on it pays to ask first whether it is hidden
 WORTH_AN_OCCLUDER = wp.constant(2)  # occluders from which on it does
@@ -50,11 +53,7 @@ def diamond_angle(x: float, y: float) -> float:
     if total == 0.0:
         return 0.0
     p = y / total
-    if x < 0.0:
-        return 2.0 - p
-    if y < 0.0:
-        return 4.0 + p
-    return p
+    return wp.where(x < 0.0, 2.0 - p, wp.where(y < 0.0, 4.0 + p, p))
 
 
 @wp.func
@@ -76,9 +75,11 @@ def keep_walls(bins: wp.array3d(dtype=wp.float32), e: int, i: int):
 
 
 @wp.func
-def sector(x: float, y: float, c: float) -> wp.vec2:
-    """First and last diamond angle (the last up to 8) of the directions within acos(c) of the unit vector (x, y)."""
-    s = wp.sqrt(wp.max(1.0 - c * c, 0.0))
+def sector(x: float, y: float, c: float, s: float) -> wp.vec2:
+    """First and last diamond angle (the last up to 8) of the directions within an angle of the vector (x, y).
+
+    ``c`` and ``s`` are the cosine and sine of the angle.
+    """
     start = diamond_angle(c * x + s * y, c * y - s * x)
     stop = diamond_angle(c * x - s * y, c * y + s * x)
     if stop < start - BIN_MARGIN:
@@ -87,12 +88,8 @@ def sector(x: float, y: float, c: float) -> wp.vec2:
 
 
 @wp.func
-def cover_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, u: wp.vec3, c: float, dist: float) -> bool:
-    """Enter an occluder of direction ``u`` and angular half-width acos(c); False where all its bins are full before."""
-    if c < 0.0 or wp.abs(u[2]) > 1.0e-6:
-        lower_all_bins(bins, e, i, dist)
-        return True
-    edges = sector(u[0], u[1], c)
+def cover_bins(bins: wp.array3d(dtype=wp.float32), e: int, i: int, edges: wp.vec2, dist: float) -> bool:
+    """Enter an occluder between two diamond angles; False where all its bins are full before."""
     scale = float(BINS) / 4.0
     full_from = (edges[0] + BIN_MARGIN) * scale
     full_to = (edges[1] - BIN_MARGIN) * scale
@@ -113,7 +110,7 @@ def is_hidden(bins: wp.array3d(dtype=wp.float32), e: int, i: int, x: float, y: f
     if size >= dist * 0.9999:
         return False
     s = size / dist
-    edges = sector(x / dist, y / dist, wp.sqrt(1.0 - s * s))
+    edges = sector(x, y, wp.sqrt(1.0 - s * s), s)
     scale = float(BINS) / 4.0
     for b in range(int(wp.floor((edges[0] - BIN_MARGIN) * scale)), int(wp.floor((edges[1] + BIN_MARGIN) * scale)) + 1):
         if bins[e, i, BINS + (b & (BINS - 1))] > near:
@@ -122,11 +119,23 @@ def is_hidden(bins: wp.array3d(dtype=wp.float32), e: int, i: int, x: float, y: f
 
 
 @wp.func
+def shadow(delta: wp.vec3, rho: float, cos_beam: float, spread: float) -> wp.vec4:
+    """Of an occluder at ``delta`` from the sensor: cosine of its angular half-width, distance, and `sector`."""
+    dist = wp.length(delta)
+    s = wp.min(1.0, rho / dist)
+    c = wp.min(cos_beam, wp.sqrt(1.0 - s * s))
+    sine = wp.max(s, spread)
+    if sine < LEAST_SINE:
+        sine = wp.sqrt(wp.max(1.0 - c * c, 0.0))
+    edges = sector(delta[0], delta[1], c, sine)
+    return wp.vec4(c, dist, edges[0], edges[1])
+
+
+@wp.func
 def add_occluder(
     delta: wp.vec3,
-    rho: float,
+    cast: wp.vec4,
     radius: float,
-    cos_beam: float,
     cull: int,
     e: int,
     i: int,
@@ -135,19 +144,50 @@ def add_occluder(
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
 ) -> int:
-    """Append an occluder at ``delta`` from the sensor if it is in range and matters; returns the new count."""
-    dist = wp.length(delta)
+    """Append an occluder at ``delta`` that casts a `shadow` if it is in range and matters; returns the new count."""
+    c = cast[0]
+    dist = cast[1]
     if dist > radius or dist == 0.0:
         return count
-    s = wp.min(1.0, rho / dist)
-    c = wp.min(cos_beam, wp.sqrt(1.0 - s * s))
     u = delta / dist
-    if not cover_bins(bins, e, i, u, c, dist) and cull != 0:
+    if c < 0.0 or wp.abs(u[2]) > 1.0e-6:
+        lower_all_bins(bins, e, i, dist)
+    elif not cover_bins(bins, e, i, wp.vec2(cast[2], cast[3]), dist) and cull != 0:
         return count
     if count < direction.shape[2]:
         direction[e, i, count] = u
         limit[e, i, count] = wp.vec2(c, dist)
     return count + 1
+
+
+@wp.func
+def outline_point(
+    index: int, along: int, across: int, center: wp.vec2, forward: wp.vec2, length: float, width: float
+) -> wp.vec3:
+    """Point ``index``, up to twice round, of the outline of a body."""
+    half = along + across
+    k = wp.where(index >= 2 * half, index - 2 * half, index)
+    side = wp.where(k >= half, -1.0, 1.0)
+    k = wp.where(k >= half, k - half, k)
+    lengthwise = k < along
+    part = wp.where(lengthwise, float(k), float(k - along)) / wp.where(lengthwise, float(along), float(across))
+    a = side * wp.where(lengthwise, -0.5 + part, 0.5)  # position on the outline, in lengths and widths from the centre
+    b = side * wp.where(lengthwise, -0.5, -0.5 + part)
+    p = center + a * length * forward + b * width * wp.vec2(-forward[1], forward[0])
+    return wp.vec3(p[0], p[1], 0.0)
+
+
+@wp.func
+def nearest_outline(at: wp.vec2, forward: wp.vec2, length: float, width: float, along: int, across: int) -> int:
+    """Index of a point of an outline near to what lies at ``at`` from its centre."""
+    a = wp.dot(at, forward) / length
+    b = wp.dot(at, wp.vec2(-forward[1], forward[0])) / width
+    half = along + across
+    k = int((wp.clamp(a, -0.5, 0.5) + 0.5) * float(along) + 0.5)
+    if wp.abs(a) > wp.abs(b):
+        k = along + int((wp.clamp(b, -0.5, 0.5) + 0.5) * float(across) + 0.5)
+        return wp.where(a > 0.0, k, half + along + half - k)
+    return wp.where(b < 0.0, k, half + along - k)
 
 
 @wp.func
@@ -162,6 +202,7 @@ def add_outline(
     origin: wp.vec3,
     radius: float,
     cos_beam: float,
+    spread: float,
     cull: int,
     e: int,
     i: int,
@@ -172,29 +213,21 @@ def add_outline(
 ) -> int:
     """Append the outline of another robot's body, sampled at ``spacing`` or finer."""
     count = start
-    left = wp.vec2(-forward[1], forward[0])
     center = wp.vec2(pose[0], pose[1]) + offset * forward
     along = wp.max(2, int(wp.ceil(length / spacing)))
     across = wp.max(2, int(wp.ceil(width / spacing)))
     rho = wp.min(radius_max, wp.max(length / float(along), width / float(across)) * 0.70710678)
-    for k in range(2 * (along + across)):
-        a = 0.5  # position on the outline, in lengths and widths from the centre
-        b = 0.5
-        if k < along:
-            a = -0.5 + float(k) / float(along)
-            b = -0.5
-        elif k < along + across:
-            b = -0.5 + float(k - along) / float(across)
-        elif k < 2 * along + across:
-            a = 0.5 - float(k - along - across) / float(along)
-        else:
-            a = -0.5
-            b = 0.5 - float(k - 2 * along - across) / float(across)
-        p = center + a * length * forward + b * width * left
-        count = add_occluder(
-            wp.vec3(p[0] - origin[0], p[1] - origin[1], 0.0),
-            rho, radius, cos_beam, cull, e, i, count, bins, direction, limit,
-        )  # fmt: skip
+    nearest = nearest_outline(wp.vec2(origin[0], origin[1]) - center, forward, length, width, along, across)
+    total = 2 * (along + across)
+    for j in range(along + across):
+        dp = outline_point(nearest - j + total, along, across, center, forward, length, width) - origin
+        dq = outline_point(nearest + 1 + j, along, across, center, forward, length, width) - origin
+        dp[2] = 0.0
+        dq[2] = 0.0
+        sp = shadow(dp, rho, cos_beam, spread)
+        sq = shadow(dq, rho, cos_beam, spread)
+        count = add_occluder(dp, sp, radius, cull, e, i, count, bins, direction, limit)
+        count = add_occluder(dq, sq, radius, cull, e, i, count, bins, direction, limit)
     return count
 
 
@@ -249,10 +282,10 @@ def add_cells(
     row: int,
     col: int,
     run: int,
-    spread: float,
     origin: wp.vec3,
     radius: float,
     cos_beam: float,
+    spread: float,
     cull: int,
     e: int,
     i: int,
@@ -274,11 +307,15 @@ def add_cells(
         if is_hidden(bins, e, i, at[0], at[1], half + width, dist - half):
             return count
     first = maps.occluder_begin[m]
-    for j in range(first + begin, first + end):
-        count = add_occluder(
-            maps.occluder[j] - origin, maps.occluder_radius[j], radius, cos_beam, cull,
-            e, i, count, bins, direction, limit,
-        )  # fmt: skip
+    for j in range(first + begin, first + end, 2):
+        k = wp.min(j + 1, first + end - 1)
+        delta = maps.occluder[j] - origin
+        delta2 = maps.occluder[k] - origin
+        cast = shadow(delta, maps.occluder_radius[j], cos_beam, spread)
+        cast2 = shadow(delta2, maps.occluder_radius[k], cos_beam, spread)
+        count = add_occluder(delta, cast, radius, cull, e, i, count, bins, direction, limit)
+        if k > j:
+            count = add_occluder(delta2, cast2, radius, cull, e, i, count, bins, direction, limit)
     return count
 
 
@@ -291,10 +328,10 @@ def add_body(
     pose: wp.vec4,
     forward: wp.vec2,
     at: wp.vec2,
-    spread: float,
     origin: wp.vec3,
     radius: float,
     cos_beam: float,
+    spread: float,
     planar: int,
     e: int,
     i: int,
@@ -309,11 +346,11 @@ def add_body(
     dist = wp.length(at)
     half = 0.501 * wp.sqrt(length * length + width * width)
     reach = half + wp.max(0.36 * wp.max(length, width), spread * (dist + half))
-    if planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
+    if dist > 1.0001 * radius + half or planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
         return start
     return add_outline(
         pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
-        origin, radius, cos_beam, planar, e, i, start, bins, direction, limit,
+        origin, radius, cos_beam, spread, planar, e, i, start, bins, direction, limit,
     )  # fmt: skip
 
 
@@ -373,19 +410,19 @@ def _collect_occluders(
             run = run_length(maps.occluder_cell, base, span, WORTH_AN_OCCLUDER, cull)
             for col in range(span[0], span[1] + 1, run):
                 count = add_cells(
-                    maps, m, row, col, run, spread, origin, radius, cos_beam, cull,
+                    maps, m, row, col, run, origin, radius, cos_beam, spread, cull,
                     e, i, count, bins, direction, limit,
                 )  # fmt: skip
     walls = int(count)
     for k in range(near_count[e, i]):
         other = near[e, i, k]
-        there = center[e, other] - origin
-        if wp.length(there) <= 1.0001 * radius + HALF * (robots.length[e, other] + robots.width[e, other]):
+        there = point_xy(center[e, other] - origin)
+        if within(there, radius + HALF * (robots.length[e, other] + robots.width[e, other])):
             if count == walls:
                 keep_walls(bins, e, i)
             count = add_body(
-                maps, m, robots, other, pose[e, other], facing[e, other], wp.vec2(there[0], there[1]), spread, origin,
-                radius, cos_beam, planar, e, i, count, bins, direction, limit,
+                maps, m, robots, other, pose[e, other], facing[e, other], there, origin,
+                radius, cos_beam, spread, planar, e, i, count, bins, direction, limit,
             )  # fmt: skip
     if count > direction.shape[2]:
         wp.atomic_or(error, e, 4)
