@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from maexp.kernels import merge, visibility
+from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
 
 
@@ -118,7 +119,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     pose_t[..., 3] = heading
     pose, center = wp.from_torch(pose_t, dtype=wp.vec4), wp.from_torch(center_t, dtype=wp.vec3)
     facing = wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2)  # only other robots' are read
-    bins = wp.from_torch(zeros(1, 1, 3 * int(visibility.BINS), dtype=torch.float32))
+    bins = wp.from_torch(zeros(1, 1, 3 * int(BINS), dtype=torch.float32))
     direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
     limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
     counts = [wp.from_torch(zeros(1, 1)) for _ in range(3)]

@@ -11,8 +11,8 @@ import torch
 import warp as wp
 
 from maexp.kernels.reward import TERMS
+from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Robots
-from maexp.kernels.visibility import BINS
 
 # name: (axes, torch dtype, Warp dtype). Axes: E envs, N robots, W words of 32 robots, F free and B boundary points
 # of the largest map; H, P, Q are W, F, B where communication is limited and 1 elsewhere; T track length,

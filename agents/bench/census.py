@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from maexp.envs import ExplorationEnv
+from maexp.kernels.shadows import BINS
 from maexp.kernels.types import PIXELS
-from maexp.kernels.visibility import BINS
 
 SAMPLE = 64  # robots that are looked at one by one
 _BINS = int(BINS)

@@ -16,8 +16,8 @@ not how busy the machine is.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from maexp.kernels.shadows import BINS
 from maexp.kernels.types import REGIONS
-from maexp.kernels.visibility import BINS
 
 WORD, VEC2, VEC3, VEC4 = 4, 8, 12, 16
 TRIG = 10
@@ -39,8 +39,8 @@ def set_goal(c: Counts) -> Cost:
 
 
 def face_robots(c: Counts) -> Cost:
-    """Sine and cosine of a heading, and the disc that a robot stays in."""
-    return Cost(c["active"] * (VEC4 + VEC3 + 4 * WORD + VEC2 + VEC3), c["active"] * (2 * TRIG + 6))
+    """Sine and cosine of a heading, and the disc that a robot stays in: a tangent says how far it may turn."""
+    return Cost(c["active"] * (VEC4 + VEC3 + 7 * WORD + VEC2 + VEC3), c["active"] * (3 * TRIG + 16))
 
 
 def list_near(c: Counts) -> Cost:
@@ -136,7 +136,7 @@ def draw_points(c: Counts) -> Cost:
     flags = share * c["map_points"] * WORD + known * (2 * WORD + WORD * c["words"])
     viewers = known * pixels * (2 * WORD + c["points_per_pixel"] * 2 * WORD)
     moved = flags + drawn * pixels * (WORD + 1) + known * pixels * (WORD + 3) + viewers
-    return Cost(moved, share * c["map_points"] + drawn * 2 + known * (c["words"] + pixels * 4))
+    return Cost(moved, share * c["map_points"] + drawn * 4 + known * (c["words"] + pixels * 4))
 
 
 def list_bodies(c: Counts) -> Cost:
