@@ -2,10 +2,9 @@
 
 A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
 All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way
-from every robot to every target. They differ in which target each robot takes. How it is approached they share:
-where the env drives by `wavefront` the goal is the target; where it drives by plain DWA, the farthest point in
-sight on the way to it, near enough to brake for. A robot that would be there before its next decision goes on into
-the unknown.
+from every robot to every target. They differ in which target each robot takes. How it is approached they share
+(`FrontierPlanner._approach`): as fast as the env's planner can be trusted with, and on into the unknown where the
+robot would be there before its next decision.
 
 Sources and tuning: docs/planners.md.
 """
@@ -187,17 +186,18 @@ class FrontierPlanner:
         """Goals [m] on the way to `target` (of cell `goal_cell`, -1 = none), float32 [E, N, 2].
 
         A robot that stopped at its target would stand there until the next decision. So goals lie beyond targets that
-        are near, `toward` what is to be seen from there, as far as the robot still gets. Plain DWA brakes too late for
-        that between walls, and for far goals altogether: there it gets a goal near enough to be braked for.
+        are near, `toward` what is to be seen from there, as far as the robot still gets. Plain DWA sees no way around
+        walls and brakes too late between them: it gets a point in sight, and off open ground one near enough to brake
+        for.
         """
         nav = self.nav
-        drive = self._drive(nav.state["pose"][..., 2].abs())
+        drive = self._drive(torch.hypot(nav.state["pose"][..., 2], nav.state["slip"]))
         gap = (target - nav.centers()).norm(dim=-1)
         left = (drive - gap).clamp_min(0.0) / toward.norm(dim=-1).clamp_min(1e-6)
         beyond = target + toward * left.unsqueeze(-1)
         if self.env.planner_config.name == "wavefront":
             return beyond
-        threshold = max(r.collision_threshold for r in self.env.robot_configs)
+        threshold = self.env.simulation.robot_tensors["threshold"]
         far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
         near = (self._drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
         near = nav.waypoints(goal_cell, target, near)
@@ -208,9 +208,9 @@ class FrontierPlanner:
 
     def _drive(self, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
-        accel = min(r.max_accel for r in self.env.robot_configs)
-        full = self.seconds * min(r.max_speed for r in self.env.robot_configs)
-        return (speed * self.seconds + 0.5 * accel * self.seconds**2).clamp(max=full)
+        robots = self.env.simulation.robot_tensors
+        drive = speed * self.seconds + 0.5 * robots["max_accel"] * self.seconds**2
+        return torch.minimum(drive, robots["max_speed"] * self.seconds)
 
     def _look_around(self) -> tuple[torch.Tensor, torch.Tensor]:
         """What is to be seen from every target, as a share of the radar's disc, float32 [E, N, K], and the middle of

@@ -83,6 +83,8 @@ BAD = {
     "both": (["evaluate", "policy=random", "checkpoint=x"], "give one of them"),
     "a policy": (["evaluate", "policy=clever"], "nearest_frontier"),
     "a checkpoint": (["evaluate", "checkpoint=nowhere"], "nowhere"),
+    "goals for controls": (["evaluate", "policy=random", "planner=direct"], "random picks goals: use planner=dwa"),
+    "goals for controls to compare": (["benchmark", "planner=direct"], "planner=direct takes controls"),
     "team sizes": (["evaluate", "policy=random", "num_robots=1,0"], "num_robots=[1, 0]"),
     "no action": (["maps"], "list, make"),
     "a scenario to make": (["maps", "make", "labyrinth"], "maze_small"),

@@ -293,6 +293,19 @@ def test_goals_lie_beyond_the_target_as_far_as_a_robot_gets(speed, drive):
     torch.testing.assert_close(goal - target, expected.unsqueeze(0), atol=1e-4, rtol=0)
 
 
+def test_how_far_goals_lie_is_each_robots_own():
+    """A slow robot, a fast one, and one that slides sideways; two seconds at 2 m/s^2."""
+    kinds = [("differential", 0.5), ("differential", 8.0), ("omnidirectional", 8.0)]
+    env = make_env(1, robot=[RobotConfig(kind=kind, max_speed=speed, max_accel=2.0) for kind, speed in kinds])
+    env.reset()
+    planner = FrontierPlanner(env, choose_nearest)
+    env.simulation.tensors["slip"][:, 2] = 3.0
+    target = planner.nav.centers()
+    goal = planner._approach(torch.zeros(1, 3, dtype=torch.long), target, torch.tensor([6.0, 0.0]).expand(1, 3, 2))
+    drive = torch.stack([torch.tensor([1.0, 4.0, 10.0]), torch.zeros(3)], -1)
+    torch.testing.assert_close(goal - target, drive.unsqueeze(0), atol=1e-4, rtol=0)
+
+
 def test_open_ground_is_where_no_known_obstacle_is_near():
     env = make_env(12, planner="dwa", maps=[make_map("indoor_small", 1)])
     env.reset()

@@ -17,7 +17,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies import POLICIES
 from maexp.agents.results import plain
-from maexp.agents.settings.checks import check_distinct, check_seed
+from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.envs.scenarios import SCENARIOS, find_scenario, split
@@ -113,6 +113,7 @@ def check_lists(cfg: Any) -> None:
         check_distinct(name, as_list(cfg[name]))
     for seed in as_list(cfg.seeds):
         check_seed(seed, "seeds")
+    check_goals(as_list(cfg.policies), cfg.planner.name)
     _check_policy_per_map(cfg)
 
 

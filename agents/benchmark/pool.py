@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from maexp.agents.benchmark.cell import finished
 from maexp.agents.benchmark.plan import Cell, cell_folder
 
 POLL = 0.5  # seconds between two looks
@@ -150,9 +151,8 @@ class WorkerPool:
                 worker.process.wait(max(0.0, end - time.monotonic()))
             except subprocess.TimeoutExpired:
                 worker.process.kill()
-            for line in worker.process.stdout:
-                if worker.cell is not None:
-                    self._note(worker, json.loads(line))
+            if worker.cell is not None and all(finished(self.where, worker.cell, suite) for suite in self.suites):
+                self.outcome.done.append(worker.cell)
 
     def _dismiss(self) -> None:
         """The end of their input ends the workers."""

@@ -18,7 +18,7 @@ from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, result_names, write_results
-from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
+from maexp.agents.settings.checks import check_counts, check_distinct, check_goals, team_sizes
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.schema import schema
 from maexp.agents.train import check_action, load_matching, write_config
@@ -61,6 +61,7 @@ def check(cfg: Any) -> None:
         if name not in POLICIES:
             raise UserError(f"policy={name} is unknown: choose one of {', '.join(POLICIES)}.")
     check_distinct("policy", policy_names(cfg))
+    check_goals(policy_names(cfg), cfg.planner.name)
     check_render(cfg)
 
 

@@ -79,8 +79,11 @@ def _is_hidden(file: Path, folder: Path) -> bool:
 
 def _is_ours(report: Path) -> bool:
     """Whether a run of this command wrote it."""
-    with open(report, encoding="utf-8", errors="replace") as file:
-        return file.readline().strip() == ",".join(field.name for field in fields(Row))
+    try:
+        with open(report, encoding="utf-8", errors="replace") as file:
+            return file.readline().strip() == ",".join(field.name for field in fields(Row))
+    except OSError:  # a folder of that name, or not ours to read
+        return False
 
 
 def _suffixes() -> tuple[str, ...]:
