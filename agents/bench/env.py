@@ -78,43 +78,66 @@ def print_latency(rows: list[dict]) -> None:
     print_table(title, ["platform", *(f"N = {size}" for size in ours)], cells)
 
 
-def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
-    """Throughput of a batch over at least ``cfg.seconds``, compile time apart.
+class Batch:
+    """A batch of teams whose throughput is measured, compile time apart.
 
-    ``seconds_per_local_step`` of the whole batch is processor time on the CPU, summed over its threads: unlike the
-    rates it does not depend on what else runs on the machine.
+    Args:
+        cfg: the settings of the point
+        env: an env with those settings
     """
-    begin = time.perf_counter()
-    torch.manual_seed(cfg.seed)
-    state = env.reset()
-    actions = [env.rand_action(state.clone())["agents", "action"] for _ in range(8)]
-    state = advance(env, state, actions[0])
-    first = time.perf_counter() - begin
-    for lap in range(WARM_LAPS):
-        state = advance(env, state, actions[lap + 1])
-    done, seconds, rates, costs = 0, 0.0, [], []
-    while seconds < cfg.seconds or len(rates) < LEAST_LAPS:
-        begin, used = time.perf_counter(), time.process_time()
-        steps, state = advance_counted(env, state, actions[len(rates) % 8])
-        lap, used = time.perf_counter() - begin, time.process_time() - used
-        done, seconds = done + steps, seconds + lap
-        rates.append(steps * env.num_robots / lap)
-        costs.append((used if env.device.type == "cpu" else lap) / max(steps, 1))
-    threads = len(env.simulation.shards)
-    rate = done * env.num_robots / seconds
-    return describe_point(env, cfg) | {
-        "threads": threads,
-        "robot_local_steps_per_second": rate,
-        "robot_local_steps_per_second_and_thread": rate / threads,
-        "median_of_laps": statistics.median(rates),
-        "seconds_per_local_step": statistics.median(costs) * env.num_envs,
-        "macro_steps_per_second": env.num_envs * len(rates) / seconds,
-        "laps": len(rates),
-        "seconds": seconds,
-        "first_step_seconds": first,
-        "memory_per_env": bytes_per_env(env),
-        "collided_at_end": env.simulation.tensors["collided"].float().mean().item(),
-    }
+
+    def __init__(self, cfg: Any, env: ExplorationEnv):
+        self.cfg, self.env = cfg, env
+        begin = time.perf_counter()
+        torch.manual_seed(cfg.seed)
+        self.state = env.reset()
+        self.actions = [env.rand_action(self.state.clone())["agents", "action"] for _ in range(8)]
+        self.state = advance(env, self.state, self.actions[0])
+        self.first = time.perf_counter() - begin
+        for lap in range(WARM_LAPS):
+            self.state = advance(env, self.state, self.actions[lap + 1])
+        self.done, self.seconds = 0, 0.0
+        self.rates: list[float] = []
+        self.costs: list[float] = []
+
+    def run(self, seconds: float, laps: int) -> None:
+        """Macro steps until that many seconds were measured in all, and that many laps."""
+        while self.seconds < seconds or len(self.rates) < laps:
+            begin, used = time.perf_counter(), time.process_time()
+            steps, self.state = advance_counted(self.env, self.state, self.actions[len(self.rates) % 8])
+            lap, used = time.perf_counter() - begin, time.process_time() - used
+            self.done, self.seconds = self.done + steps, self.seconds + lap
+            self.rates.append(steps * self.env.num_robots / lap)
+            self.costs.append((used if self.env.device.type == "cpu" else lap) / max(steps, 1))
+
+    def summary(self) -> dict:
+        """What was measured.
+
+        ``seconds_per_local_step`` of the whole batch is processor time on the CPU, summed over its threads: unlike
+        the rates it does not depend on what else runs on the machine.
+        """
+        env, threads = self.env, len(self.env.simulation.shards)
+        rate = self.done * env.num_robots / self.seconds
+        return describe_point(env, self.cfg) | {
+            "threads": threads,
+            "robot_local_steps_per_second": rate,
+            "robot_local_steps_per_second_and_thread": rate / threads,
+            "median_of_laps": statistics.median(self.rates),
+            "seconds_per_local_step": statistics.median(self.costs) * env.num_envs,
+            "macro_steps_per_second": env.num_envs * len(self.rates) / self.seconds,
+            "laps": len(self.rates),
+            "seconds": self.seconds,
+            "first_step_seconds": self.first,
+            "memory_per_env": bytes_per_env(env),
+            "collided_at_end": env.simulation.tensors["collided"].float().mean().item(),
+        }
+
+
+def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
+    """Throughput of a batch over at least ``cfg.seconds``."""
+    batch = Batch(cfg, env)
+    batch.run(cfg.seconds, LEAST_LAPS)
+    return batch.summary()
 
 
 def measure_latency(cfg: Any, maps: list, macro_steps: int = 10) -> float:

@@ -33,6 +33,7 @@ from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
+from maexp.kernels.launches import RecordedLaunch
 from maexp.kernels.types import PIXELS, REGIONS
 
 TEAM_SIZES = [4]
@@ -58,7 +59,7 @@ class Step:
 
     stage: str
     kernel: str
-    command: wp.Launch
+    command: RecordedLaunch
     outputs: list[wp.array]
 
 
@@ -121,7 +122,10 @@ def load_modules(device: torch.device) -> dict[str, float]:
 
 
 def measure_kernels(env: ExplorationEnv, cfg: Any) -> list[dict]:
-    """One row per kernel and stage of the first shard, at a moment some macro steps into the first episodes."""
+    """One row per kernel and stage of the first shard, at a moment some macro steps into the first episodes.
+
+    A launch takes all envs of the shard at once; a run goes through them block by block, with warmer caches.
+    """
     torch.manual_seed(cfg.seed)
     state = env.reset()
     for _ in range(WARM):
@@ -155,8 +159,7 @@ def record_steps(env: ExplorationEnv, shard: Any) -> list[Step]:
     stage = STAGES[0]
 
     def launch(kernel, dim, inputs, outputs):
-        command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=shard.device, record_cmd=True)
-        steps.append(Step(stage, kernel.key, command, outputs))
+        steps.append(Step(stage, kernel.key, RecordedLaunch(kernel, dim, inputs, outputs, shard.device), outputs))
 
     shard.set_goals(launch)
     if shard.wavefront is not None:

@@ -14,8 +14,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from maexp.agents.bench.env import measure_batch
-from maexp.agents.bench.shared import print_table, write_report
+from maexp.agents.bench.env import Batch
+from maexp.agents.bench.shared import LEAST_LAPS, print_table, write_report
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.errors import UserError
 from maexp.agents.figures import save
@@ -30,6 +30,7 @@ from maexp.envs.scenarios.maze import build_maze
 TOLERANCE = 1.25
 """The cost is called linear at most while no value costs this much more than its share of a smaller one's cost."""
 
+ROUNDS = 5
 INCHES = 3.6  # width of a plot
 
 
@@ -70,12 +71,10 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     """Costs along every axis asked for; ``where/bench_scale.json``, a table and a plot for each."""
     chosen = pick_axes(cfg.axes)
     plans = {name: plan_axis(AXES[name], cfg, overrides) for name in chosen}
-    rows: dict[str, list[dict]] = {name: [] for name in chosen}
-    with Progress("measuring", sum(map(len, plans.values())), 0) as progress:
+    rows: dict[str, list[dict]] = {}
+    with Progress("measuring", (1 + ROUNDS) * sum(map(len, plans.values())), 0) as progress:
         for name, plan in plans.items():
-            for value, point in plan:
-                rows[name].append(measure_point(name, value, point))
-                progress.show(progress.done + 1, f"{name} {value}")
+            rows[name] = measure_axis(name, plan, lambda note: progress.show(progress.done + 1, note))
     report = {}
     for name in chosen:
         worst, base = worst_over_linear(rows[name], AXES[name].size)
@@ -120,13 +119,24 @@ def plan_axis(axis: Axis, cfg: Any, overrides: list[str]) -> list[tuple[int, Any
     return list(zip(values, points, strict=True))
 
 
-def measure_point(axis: str, value: int, cfg: Any) -> dict:
-    """Throughput at one point, and what a local step of the batch costs."""
-    maps = [large_maze(value)] if axis == "map" else load_maps(cfg.scenario).train
-    begin = time.perf_counter()
-    env = make_env(cfg, maps, cfg.num_robots)
-    built = time.perf_counter() - begin
-    return {"value": value} | measure_batch(cfg, env) | {"build_seconds": built}
+def measure_axis(axis: str, plan: list[tuple[int, Any]], show: Callable[[str], None]) -> list[dict]:
+    """Throughput at every point, and what a local step of the batch costs.
+
+    The points take turns, `ROUNDS` times: what else the machine does, and how fast it is just now, meets all alike.
+    """
+    batches = []
+    for value, cfg in plan:
+        maps = [large_maze(value)] if axis == "map" else load_maps(cfg.scenario).train
+        begin = time.perf_counter()
+        env = make_env(cfg, maps, cfg.num_robots)
+        built = time.perf_counter() - begin
+        batches.append((value, built, Batch(cfg, env)))
+        show(f"{axis} {value}: built")
+    for k in range(1, ROUNDS + 1):
+        for value, _, batch in batches:
+            batch.run(batch.cfg.seconds * k / ROUNDS, LEAST_LAPS * k // ROUNDS)
+            show(f"{axis} {value}")
+    return [{"value": value} | batch.summary() | {"build_seconds": built} for value, built, batch in batches]
 
 
 def large_maze(cells: int) -> PointCloudMap:
