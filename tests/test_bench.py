@@ -109,7 +109,7 @@ def test_scale_goes_along_its_axes(capsys):
     assert 0 < costs[0] * small["robot_local_steps_per_second"] < 4  # the rate counts waits, the cost does not
     assert Path("out/scale_envs.png").stat().st_size > 5000
     out = capsys.readouterr().out
-    assert f"teams in the batch: 8 times the size costs {costs[1] / costs[0]:.3g} times as much; " in out
+    assert f"teams in the batch: 8.0 times the size costs {costs[1] / costs[0]:.1f} times as much; " in out
 
 
 @pytest.mark.parametrize("words", [["axes=walls"], ["largest=0"], ["axes=map", "largest=1"], ["num_envs=2,4"]])

@@ -182,7 +182,7 @@ def describe_growth(axis: Axis, measured: dict) -> str:
     rows, worst = measured["rows"], measured["worst_over_linear"]
     cost, size = ratio(rows[-1], rows[0], "seconds_per_local_step"), ratio(rows[-1], rows[0], axis.size)
     verdict = "linear at most" if worst <= TOLERANCE else f"FASTER THAN LINEAR from {measured['worst_from']} on"
-    return (f"{axis.title}: {size:.3g} times the size costs {cost:.3g} times as much; "
+    return (f"{axis.title}: {size:,.{size < 10:d}f} times the size costs {cost:,.{cost < 10:d}f} times as much; "
             f"{verdict} (at worst {worst:.2f} times its share of a smaller one)")  # fmt: skip
 
 
