@@ -225,10 +225,12 @@ def held(workers: list[int]):
     for one in workers:
         os.kill(one, signal.SIGSTOP)
     yield
+    end = time.monotonic() + 60
+    while not all(asked_to_end(one) for one in workers) and time.monotonic() < end:
+        time.sleep(0.02)
     for one in workers:
-        while not asked_to_end(one):
-            time.sleep(0.02)
         os.kill(one, signal.SIGCONT)
+    assert time.monotonic() < end, "the workers were not told to stop"
 
 
 def asked_to_end(process: int) -> bool:
