@@ -173,8 +173,7 @@ class FrontierPlanner:
             nav=nav,
         )
         chosen = self.choose(scene).unsqueeze(-1)
-        way = travel.gather(2, chosen)
-        found = way.squeeze(-1).isfinite()
+        found = travel.gather(2, chosen).squeeze(-1).isfinite()
         self.chosen = torch.where(found.unsqueeze(-1), chosen, -1)
         self.stood = nav.centers().clone()
         goal_cell = torch.where(found, cells.gather(2, chosen).squeeze(-1), -1)

@@ -117,9 +117,9 @@ def add_body(
     length = robots.length[e, other]
     width = robots.width[e, other]
     dist = wp.length(at)
-    half = 0.501 * wp.sqrt(length * length + width * width)
+    half = HALF * wp.sqrt(length * length + width * width)
     reach = half + wp.max(0.36 * wp.max(length, width), spread * (dist + half))
-    if dist > 1.0001 * radius + half or planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half):
+    if dist > 1.0001 * radius + half or (planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half)):
         return start
     return add_outline(
         pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
