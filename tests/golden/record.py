@@ -1,7 +1,7 @@
 """Golden episodes: small rollouts of every scenario and planner with fixed actions, recorded.
 
 `python -m tests.golden.record` in the root of the source writes them anew. Do so only for a change of behaviour that is
-meant, and say in the commit what changed and why.
+meant, and say in the commit what changed and why. The settings are written out: a new default changes no record.
 """
 
 from pathlib import Path
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from maexp.envs import ExplorationEnv, PlannerConfig, make_map
+from maexp.envs import ExplorationEnv, PlannerConfig, RewardConfig, RobotConfig, make_map
 from maexp.envs.scenarios import SCENARIOS
 from maexp.envs.specs import REWARD_TERMS
 
@@ -17,6 +17,20 @@ FOLDER = Path(__file__).parent
 ROBOTS, STEPS, SEED = 3, 3, 11
 CASES = {name: (name, "dwa") for name, one in SCENARIOS.items() if one.build is not None}
 CASES |= {f"maze_small_{planner}": ("maze_small", planner) for planner in ("wavefront", "direct")}
+CLEARANCE = {"random": 3.0, "maze": 4.0, "indoor": 4.2, "outdoor": 4.2}  # factor by the first word of a scenario
+REWARD = RewardConfig(
+    explore=0.3, overlap=0.01, time=1.0, success=100.0, collision=200.0, points=60.0, events=60.0 / 7000.0,
+    time_on="uncovered",
+)  # fmt: skip
+
+
+def settings(case: str) -> dict:
+    """What the env of a case is told besides maps, sizes and seed."""
+    scenario, planner = CASES[case]
+    clearance = 2.0 if planner == "wavefront" else CLEARANCE[scenario.split("_")[0]]
+    planning = PlannerConfig(name=planner, horizon=3, clearance_factor=clearance, clearance_weight=100.0)
+    robot = RobotConfig(kind="ackermann", wheelbase=SCENARIOS[scenario].body_length)
+    return {"planner": planning, "robot": robot, "reward": REWARD}
 
 
 def play(case: str) -> dict[str, np.ndarray]:
@@ -27,8 +41,7 @@ def play(case: str) -> dict[str, np.ndarray]:
     """
     scenario, planner = CASES[case]
     maps = [make_map(scenario, index) for index in (0, 1)]
-    planning = PlannerConfig(name=planner)
-    env = ExplorationEnv(maps, num_envs=2, num_robots=ROBOTS, seed=SEED, planner=planning, num_threads=1)
+    env = ExplorationEnv(maps, num_envs=2, num_robots=ROBOTS, seed=SEED, num_threads=1, **settings(case))
     rng = np.random.default_rng(SEED)
     td = env.reset()
     rows = []
