@@ -67,18 +67,21 @@ def choose_nearest(scene: Scene) -> torch.Tensor:
 def choose_in_turn(scene: Scene, gain: torch.Tensor, cost: torch.Tensor) -> torch.Tensor:
     """Pairs in order of gain - cost; a target taken lowers the gain of others that can be seen from there.
 
-    One round per robot: it depends on the rounds before, all envs take it together (Burgard et al. 2005).
+    One round per robot: it depends on the rounds before, all envs take it together (Burgard et al. 2005). Robots
+    without a way to any target (those that have collided) are left over, and get target 0.
     """
     robots = scene.travel.shape[1]
     chosen = torch.zeros_like(scene.travel[..., 0], dtype=torch.long)
     waiting = torch.ones_like(scene.alive)
+    env = torch.arange(len(chosen), device=chosen.device)
     for _ in range(robots):
         value = torch.where(waiting.unsqueeze(-1), gain - cost, -torch.inf)
-        best = value.flatten(1).argmax(1)
+        most, best = value.flatten(1).max(1)
         robot, target = best // value.shape[2], best % value.shape[2]
-        chosen[torch.arange(len(best)), robot] = target
-        waiting[torch.arange(len(best)), robot] = False
-        here = scene.points[torch.arange(len(best)), robot, target]
+        some = most > -torch.inf  # else only those are left, and `robot` is any
+        chosen[env, robot] = torch.where(some, target, chosen[env, robot])
+        waiting[env, robot] &= ~some
+        here = scene.points[env, robot, target]
         far = (scene.points - here.view(-1, 1, 1, 2)).norm(dim=-1) / scene.nav.radar_range
         gain = gain * far.clamp(max=1.0)
     return chosen

@@ -194,6 +194,9 @@ class Places:
     def first_points(self, ahead: float):
         return self.at.unsqueeze(2) + self.ways
 
+    def grow_trees(self, samples: int, branch: float):
+        return torch.ones(len(self.at), 1, self.ways.shape[2], dtype=torch.bool)
+
 
 def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
     travel = torch.tensor(travel)
@@ -231,6 +234,26 @@ def test_choices_in_turn_spread_the_team():
     scene = scene_of(travel, points=[points])
     gain = torch.tensor([[[1.0, 0.9, 0.8]] * 2])
     assert choose_in_turn(scene, gain, scene.travel / 10.0).tolist() == [[0, 2]]  # 1 is in sight of 0
+
+
+@pytest.mark.parametrize("name", CHOICES)
+@pytest.mark.parametrize("lost", [[1], [2], [1, 2]])
+def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(name, lost):
+    """A robot that has collided has no way anywhere."""
+    points = [[40.0, 0.0], [0.0, 30.0], [-20.0, 0.0]]
+    at = torch.tensor([[[0.0, 20.0], [-9.0, 0.0], [30.0, 0.0]]])
+    travel = (at.unsqueeze(2) - torch.tensor([[points]])).norm(dim=-1)
+
+    def choose(kept):
+        ways = torch.tensor([[points]]) - at[:, kept].unsqueeze(2)
+        alive, way = torch.ones(1, 3, dtype=torch.bool), travel.clone()
+        alive[:, lost], way[:, lost] = False, INF
+        scene = scene_of(way[:, kept].tolist(), [[points] * len(kept)], alive=alive[:, kept].tolist(),
+                         nav=Places(at[:, kept].tolist(), ways))  # fmt: skip
+        return CHOICES[name](scene)[0].tolist()
+
+    whole, living = choose([0, 1, 2]), [i for i in range(3) if i not in lost]
+    assert [whole[i] for i in living] == choose(living)
 
 
 def test_force_turns_toward_the_larger_pull_and_away_from_others():
