@@ -157,7 +157,7 @@ class ExplorationEnv(EnvBase):
         if self._hook is not None:
             self._hook[0](self)
         done = self._done()
-        out = self._observe()
+        out = self.observe()
         info = out["info"]
         for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a fresh episode has made none
             keep = mask.reshape(-1, 1) == 0
@@ -183,7 +183,7 @@ class ExplorationEnv(EnvBase):
         state["episode_reward"] += reward
         done = self._done()
         state["active"] *= 1 - done["done"].reshape(-1).to(torch.int32)
-        out = self._observe()
+        out = self.observe()
         out["agents", "reward"] = reward.unsqueeze(-1)
         return out.update(done)
 
@@ -204,16 +204,24 @@ class ExplorationEnv(EnvBase):
         truncated = (state["macro_step"] >= self.macro_steps).unsqueeze(-1) & ~terminated
         return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
 
-    def _observe(self) -> TensorDict:
-        """Fresh tensors, never the simulation's own: collectors keep what they get (design 6.1)."""
+    def observe(self) -> TensorDict:
+        """What the teams see now, and info of the step just made.
+
+        Fresh tensors, never the simulation's own: collectors keep what they get.
+        """
         e, n, p, r = self.num_envs, self.num_robots, int(PIXELS), int(REGIONS)
         picture = torch.zeros((e, n, 4, p, p), dtype=torch.uint8, device=self.device)
         team = torch.zeros((e, 3, p, p), dtype=torch.uint8, device=self.device)
         pose = torch.empty((e, n, 4), device=self.device)
         grid = torch.empty((e, n, 4, r, r), device=self.device)
         self.simulation.observe(picture, team, pose, grid)
-        comm = self.simulation.tensors["comm"].clone()
-        observation = {"map": picture, "pose": pose, "grid": grid, "comm": comm}
+        state = self.simulation.tensors
+        left = 1.0 - state["macro_step"] / self.macro_steps
+        observation = {
+            "map": picture, "pose": pose, "grid": grid, "comm": state["comm"].clone(),
+            "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
+            "alive": state["collided"] == 0,
+        }  # fmt: skip
         agents = TensorDict(
             {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},
             batch_size=[e, n], device=self.device,

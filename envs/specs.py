@@ -46,6 +46,8 @@ def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
         pose=real(envs, robots, 4),
         grid=real(envs, robots, 4, regions, regions),
         comm=Binary(robots, shape=(envs, robots, robots), dtype=torch.bool, device=device),
+        time_left=Bounded(0.0, 1.0, shape=(envs, robots, 1), dtype=torch.float32, device=device),
+        alive=Binary(robots, shape=(envs, robots), dtype=torch.bool, device=device),
         shape=(envs, robots),
         device=device,
     )

@@ -302,7 +302,7 @@ class Watch:
 
     def _check_observation(self, e: int, td) -> None:
         env, life = self.env, self.lives[e]
-        seen = {name: td["agents", "observation", name].cpu().numpy() for name in ("map", "pose", "grid", "comm")}
+        seen = {name: value.cpu().numpy() for name, value in td["agents", "observation"].items()}
         team = td["team", "map"].cpu().numpy()
         at = life.old["center"][:, :2].astype(float)
         assert np.isin(seen["map"][:, :2], (0, 255)).all() and np.isin(seen["map"][:, 2], (0, 128, 255)).all()
@@ -311,6 +311,8 @@ class Watch:
         assert (np.abs(seen["pose"][:, 2:]) <= 1.0 + 1e-5).all()  # the length of two speeds is rounded
         if self.tight:
             assert (np.abs(seen["pose"][:, :2]) <= 1.0).all() and (np.abs(seen["grid"]) <= 1.0).all()
+        assert np.allclose(seen["time_left"], 1.0 - life.macro_steps / env.macro_steps, atol=1e-6)
+        assert np.array_equal(seen["alive"], life.old["collided"] == 0)
         self._check_comm(life, seen["comm"], at)
         self._check_picture(life, seen["map"], team, at)
 

@@ -75,6 +75,8 @@ def test_keys_shapes_and_types(maps):
         ("agents", "observation", "pose"): ((5, 3, 2, 4), torch.float32),
         ("agents", "observation", "grid"): ((5, 3, 2, 4, 8, 8), torch.float32),
         ("agents", "observation", "comm"): ((5, 3, 2, 2), torch.bool),
+        ("agents", "observation", "time_left"): ((5, 3, 2, 1), torch.float32),
+        ("agents", "observation", "alive"): ((5, 3, 2), torch.bool),
         ("agents", "action", "region"): ((5, 3, 2), torch.int64),
         ("agents", "action", "offset"): ((5, 3, 2, 2), torch.float32),
         ("next", "agents", "reward"): ((5, 3, 2, 1), torch.float32),
@@ -98,10 +100,10 @@ def test_info_is_blank_after_reset(maps):
 def test_history_is_not_aliased(maps):
     env = ExplorationEnv(maps[0], num_envs=2)
     td = env.rollout(4)
-    for key in ("map", "pose", "grid"):
+    for key in ("map", "pose", "grid", "time_left", "alive"):
         now, then = td["agents", "observation", key], td["next", "agents", "observation", key]
         assert torch.equal(now[:, 1:], then[:, :-1]), key
-        assert not torch.equal(now[:, 0], now[:, 1]), key
+        assert key == "alive" or not torch.equal(now[:, 0], now[:, 1]), key
     assert not torch.equal(td["next", "agents", "reward"][:, 0], td["next", "agents", "reward"][:, 1])
 
 
@@ -197,6 +199,38 @@ def test_rewards_are_the_sum_of_their_terms_and_coverage_grows(maps):
         assert (info["coverage"] >= before).all() and (info["coverage"] <= 1).all()
         before = info["coverage"]
         assert all(torch.isfinite(v.float()).all() for v in td.values(True, True))
+
+
+def test_time_left_falls_from_one_to_zero_and_partial_resets_give_it_back(maps):
+    env = ExplorationEnv(maps[0], num_envs=3, num_robots=2, local_steps=4, macro_steps=4)
+    left, td = ("agents", "observation", "time_left"), env.reset()
+    assert (td[left] == 1.0).all()
+    for want in (0.75, 0.5):
+        td = env.step(env.rand_action(td))["next"]
+        assert (td[left] == want).all()
+    td = env.reset(td.set("_reset", torch.tensor([[False], [True], [False]])))
+    assert td[left][:, 0, 0].tolist() == [0.5, 1.0, 0.5]
+    for want in ([0.25, 0.75, 0.25], [0.0, 0.5, 0.0], [0.0, 0.25, 0.0]):
+        td = env.step(env.rand_action(td))["next"]
+        assert td[left][:, 1, 0].tolist() == want
+    assert td["truncated"][:, 0].tolist() == [True, False, True]
+
+
+def test_alive_robots_are_those_that_have_not_collided(maps):
+    env = ExplorationEnv(maps[0], num_envs=4, planner=PlannerConfig(name="direct"))
+    alive, td = ("agents", "observation", "alive"), env.reset()
+    assert td[alive].all()
+    mixed = False
+    for _ in range(3):
+        td["agents", "action", "control"] = torch.tensor([1.0, 0.0]).expand(4, 3, 2).clone()
+        td = env.step(td)["next"]
+        assert torch.equal(td[alive], ~td["info", "collided"])
+        mixed |= bool((td[alive].any(-1) & ~td[alive].all(-1)).any())
+    assert mixed, "no team of which some robots had collided was looked at"
+    before = td[alive].clone()
+    td = env.reset(td.set("_reset", torch.tensor([[True], [False], [True], [False]])))
+    assert td[alive][[0, 2]].all() and torch.equal(td[alive][[1, 3]], before[[1, 3]])
+    assert not before[[1, 3]].all()
 
 
 def test_truncation_apart_from_termination(maps):
