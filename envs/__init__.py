@@ -1,5 +1,6 @@
 """Maps, scenarios and the TorchRL env."""
 
+from maexp.envs.apis import parallel_env, vector_env
 from maexp.envs.checker import check_map
 from maexp.envs.config import (
     CommConfig,
@@ -28,5 +29,7 @@ __all__ = [
     "check_map",
     "import_map",
     "make_map",
+    "parallel_env",
     "split",
+    "vector_env",
 ]

@@ -66,6 +66,18 @@ def test_own_training_loop():
     assert moved and all(state["step"] == 2 for state in moved.values())
 
 
+@pytest.mark.parametrize("page", ["pettingzoo", "gymnasium"])
+def test_other_interfaces(page, capsys):
+    pytest.importorskip(page, reason=f"THE EXTRA maexp[{page}] IS NOT INSTALLED: its page is not tested")
+    (code,) = blocks(f"docs/{page}.md", "python")
+    names = run_block(code, f"docs/{page}.md")
+    told = capsys.readouterr().out
+    if page == "pettingzoo":
+        assert names["picture"].shape[1:] == (512, 3) and "% of the place seen" in told and not names["env"].agents
+    else:
+        assert names["observations"]["map"].shape == (4, 3, 4, 125, 125) and told.count("returns of the teams") == 2
+
+
 def test_episode_files_and_recorders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run_block("\n".join(blocks("docs/viewing.md", "python")), "docs/viewing.md")

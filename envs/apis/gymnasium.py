@@ -1,0 +1,180 @@
+"""A batch of teams as Gymnasium's VectorEnv: a team acts as one agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from tensordict import TensorDict, TensorDictBase
+
+from maexp.envs.environment import ExplorationEnv
+from maexp.envs.specs import INFO_ENV
+
+from .spaces import action_space, check_kind, observation_space, to_action, to_numpy
+
+
+class TeamVectorEnv(VectorEnv):
+    """``num_envs`` teams that explore side by side, under Gymnasium's vector interface.
+
+    A team is one agent: its observation holds every robot's, its action is every robot's, its reward is the sum over
+    robots (``info["robot_reward"]``, [E, N], has the parts).
+
+    Args:
+        maps: a `PointCloudMap`, or several of which every reset chooses one.
+        num_envs: teams in the batch, E.
+        num_robots: robots of a team, N.
+        seed: key of all random numbers until ``reset(seed=...)`` gives another.
+        action: "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`.
+        autoreset_mode: when a team that is done starts anew: in the next step, in the same one, or not by itself.
+        render_mode: "rgb_array" or None.
+        settings: those of `ExplorationEnv` (radar, planner, macro_steps, ...).
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(
+        self,
+        maps,
+        num_envs: int = 1,
+        num_robots: int = 3,
+        *,
+        seed: int = 0,
+        action: str = "region_offset",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **settings,
+    ):
+        check_kind(action)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r} is unknown: choose rgb_array or None")
+        self.autoreset_mode = _mode(autoreset_mode)
+        self.env = ExplorationEnv(maps, num_envs, num_robots, seed=seed, **settings)
+        self.num_envs, self.render_mode = self.env.num_envs, render_mode
+        self.metadata = self.metadata | {
+            "autoreset_mode": self.autoreset_mode,
+            "render_fps": 10 / self.env.local_steps,
+        }
+        self._kind, self._direct = action, self.env.planner_config.name == "direct"
+        spec = self.env.observation_spec
+        robots, team = (observation_space(spec[key], 1) for key in (("agents", "observation"), "team"))
+        self._robots, self._team = (batch_space(one, self.num_envs) for one in (robots, team))
+        self.single_observation_space = spaces.Dict({**robots, "team_map": team["map"]})
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.single_action_space = action_space(action, self._direct, (self.env.num_robots,))
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._done: np.ndarray | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Start episodes: of all teams, or of those in ``options["reset_mask"]`` (bool [E]).
+
+        With a seed they are the seed's first ones, otherwise the next ones.
+        """
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
+            raise ValueError(f"seed={seed!r} must be a whole number: all teams' numbers come from it")
+        mask = (options or {}).get("reset_mask")
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any() or seed is not None:
+                raise ValueError(f"reset_mask={mask} must be bool [{self.num_envs}] with a True in it, without a seed")
+        super().reset(seed=None if seed is None else int(seed))
+        if seed is not None:
+            self.env._set_seed(seed)  # set_seed() would seed torch's own generator, too
+        if mask is None or self._done is None:
+            mask = np.ones(self.num_envs, dtype=bool)
+            self._done = mask
+        now = self._restart(mask)
+        self._done = self._done & ~mask
+        return self._observation(now), self._info(now)
+
+    def step(self, actions) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
+        """One decision of every team: observation, reward [E], terminated [E], truncated [E], info."""
+        if self._done is None:
+            raise RuntimeError("the env has no state yet: call reset() first")
+        before = self._done
+        if self.autoreset_mode is AutoresetMode.DISABLED and before.any():
+            raise RuntimeError(
+                f"teams {np.flatnonzero(before).tolist()} are done: call reset(options={{'reset_mask': ...}})"
+            )
+        action = to_action(actions, self._kind, self._direct, (self.num_envs, self.env.num_robots), self.env.device)
+        now = self.env.step(action)["next"]
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
+            now = self._start_anew(now, before)
+        terminated, truncated = (now[key].cpu().numpy().reshape(-1) for key in ("terminated", "truncated"))
+        self._done = terminated | truncated
+        reward = now["agents", "reward"].squeeze(-1).cpu().numpy()
+        observation, info = self._observation(now), self._info(now) | self._told("robot_reward", reward)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
+            observation, info = self._end_and_start(observation, info)
+        return observation, reward.sum(-1).astype(np.float64), terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Every team from above, uint8 [height, width, 3] each."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() draws nothing without render_mode="rgb_array"')
+            return None
+        if self._done is None:
+            raise RuntimeError("there is nothing to draw yet: call reset() first")
+        return tuple(self.env.render(i) for i in range(self.num_envs))
+
+    def close_extras(self, **kwargs) -> None:
+        self.env.close(raise_if_closed=False)
+
+    def _restart(self, mask: np.ndarray) -> TensorDictBase:
+        """A fresh episode for the teams in ``mask``; what all of them see then."""
+        wanted = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
+        asked = TensorDict({"_reset": wanted}, batch_size=[self.num_envs], device=self.env.device)
+        return self.env._reset(asked)  # reset() would want the last step's tensordict, only to copy it
+
+    def _start_anew(self, now: TensorDictBase, before: np.ndarray) -> TensorDictBase:
+        """``now`` with a fresh episode for the teams that were done before; the env lets such teams rest and earn 0."""
+        fresh = self._restart(before)
+        fresh["agents", "reward"] = now["agents", "reward"]
+        return fresh
+
+    def _end_and_start(self, observation: dict, info: dict) -> tuple[dict, dict]:
+        """What the next episodes look like; how the last ones ended is told under ``final_obs`` and ``final_info``."""
+        done = self._done
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done):
+            final[i] = _row(observation, i)
+        fresh = self._restart(done)
+        told = {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
+        told |= self._told("robot_reward", info["robot_reward"])
+        self._done = np.zeros_like(done)
+        return self._observation(fresh), self._info(fresh) | told
+
+    def _observation(self, now: TensorDictBase) -> dict[str, np.ndarray]:
+        robots = to_numpy(now["agents", "observation"], self._robots)
+        return robots | {"team_map": to_numpy(now["team"], self._team)["map"]}
+
+    def _info(self, now: TensorDictBase) -> dict[str, np.ndarray]:
+        """The env's ``info``: [E] of the team, [E, N] of its robots, and Gymnasium's masks of who has them."""
+        told: dict[str, np.ndarray] = {}
+        for name, value in now["info"].items():
+            array = value.cpu().numpy()
+            told |= self._told(name, array[:, 0] if name in INFO_ENV else array)
+        return told
+
+    def _told(self, name: str, value: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: value, f"_{name}": np.ones(self.num_envs, dtype=bool)}
+
+
+def _row(observation: dict, index: int) -> dict:
+    """One team's part of an observation, copied."""
+    return {
+        name: _row(value, index) if isinstance(value, dict) else value[index].copy()
+        for name, value in observation.items()
+    }
+
+
+def _mode(mode: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        known = ", ".join(one.value for one in AutoresetMode)
+        raise ValueError(f"autoreset_mode={mode!r} is unknown: choose one of {known}") from error

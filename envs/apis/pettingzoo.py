@@ -1,0 +1,171 @@
+"""One team as PettingZoo's ParallelEnv: every robot is an agent."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import logger, spaces
+from pettingzoo import ParallelEnv
+from tensordict import TensorDictBase
+
+from maexp.envs.environment import ExplorationEnv
+from maexp.envs.specs import INFO_ENV
+
+from .spaces import action_space, check_kind, observation_space, to_action, to_numpy
+
+COLLIDED = ("stay", "leave")
+
+
+class TeamParallelEnv(ParallelEnv):
+    """A team of robots that explore, under PettingZoo's interface.
+
+    Args:
+        map: a `PointCloudMap`, or several of which every reset chooses one.
+        num_robots: robots of the team, the agents ``robot_0``, ``robot_1``, ...
+        seed: key of all random numbers until ``reset(seed=...)`` gives another.
+        action: "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`.
+        collided: "stay" keeps a robot that collided among the agents until the team's episode ends: it cannot move,
+            and goes on paying for time; "leave" terminates it at once.
+        render_mode: "rgb_array" or None.
+        settings: those of `ExplorationEnv` (radar, planner, macro_steps, ...).
+
+    The episode ends for all together: terminated when coverage is reached or all have collided, truncated when the
+    macro steps are used up.
+    """
+
+    metadata = {"name": "maexp_v0", "render_modes": ["rgb_array"], "is_parallelizable": True}
+
+    def __init__(
+        self,
+        map,
+        num_robots: int = 3,
+        *,
+        seed: int = 0,
+        action: str = "region_offset",
+        collided: str = "stay",
+        render_mode: str | None = None,
+        **settings,
+    ):
+        check_kind(action)
+        if collided not in COLLIDED:
+            raise ValueError(f"collided={collided!r} is unknown: choose one of {', '.join(COLLIDED)}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r} is unknown: choose rgb_array or None")
+        self.env = ExplorationEnv(map, 1, num_robots, seed=seed, **settings)
+        self.render_mode, self.collided = render_mode, collided
+        self.metadata = self.metadata | {"render_fps": 10 / self.env.local_steps}
+        self.possible_agents = [f"robot_{i}" for i in range(self.env.num_robots)]
+        self.agents: list[str] = []
+        self._kind, self._direct = action, self.env.planner_config.name == "direct"
+        spec = self.env.observation_spec
+        self.observation_spaces = {
+            name: observation_space(spec["agents", "observation"], 2) for name in self.possible_agents
+        }
+        self.action_spaces = {name: action_space(action, self._direct) for name in self.possible_agents}
+        self.state_space = observation_space(spec["team"], 1)["map"]
+        self._team_map: np.ndarray | None = None
+
+    def observation_space(self, agent: str) -> spaces.Space:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
+        """Start the seed's first episode, or without a seed the next one; there are no options."""
+        if seed is not None:
+            self.env._set_seed(seed)  # set_seed() would seed torch's own generator, too
+        now = self.env.reset()
+        self.agents = list(self.possible_agents)
+        self._team_map = now["team", "map"][0].cpu().numpy()
+        return self._observations(now), self._infos(now)
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
+        """One decision of every agent that is left; what follows holds entries for just these."""
+        self._check_agents(actions)
+        now = self.env.step(self._action(actions))["next"]
+        robots = {name: i for i, name in enumerate(self.possible_agents) if name in self.agents}
+        reward = now["agents", "reward"][0, :, 0].tolist()
+        leaves = (now["info", "collided"][0] & (self.collided == "leave")).tolist()
+        over, out_of_time = bool(now["terminated"]), bool(now["truncated"])
+        rewards = {name: reward[i] for name, i in robots.items()}
+        terminations = {name: over or leaves[i] for name, i in robots.items()}
+        truncations = {name: out_of_time and not terminations[name] for name in robots}
+        self._team_map = now["team", "map"][0].cpu().numpy()
+        observations, infos = self._observations(now), self._infos(now)
+        self.agents = [name for name in robots if not (terminations[name] or truncations[name])]
+        return observations, rewards, terminations, truncations, infos
+
+    def state(self) -> np.ndarray:
+        """The team's map: explored, obstacle, number of robots that explored it; uint8 [3, 125, 125]."""
+        if self._team_map is None:
+            raise RuntimeError("the env has no state yet: call reset() first")
+        return self._team_map
+
+    def render(self) -> np.ndarray | None:
+        """The team from above, uint8 [height, width, 3]."""
+        if self.render_mode is None:
+            logger.warn('render() draws nothing without render_mode="rgb_array"')
+            return None
+        if self._team_map is None:
+            raise RuntimeError("there is nothing to draw yet: call reset() first")
+        return self.env.render()
+
+    def close(self) -> None:
+        if not self.env.is_closed:
+            self.env.close(raise_if_closed=False)
+
+    def _check_agents(self, actions: dict[str, Any]) -> None:
+        if not self.agents:
+            raise RuntimeError("no agents are left: call reset() first")
+        if not isinstance(actions, dict):
+            raise ValueError(f"actions is a {type(actions).__name__}: give a dict with an action for each agent")
+        missing = [name for name in self.agents if name not in actions]
+        unknown = [name for name in actions if name not in self.possible_agents]
+        if missing or unknown:
+            what = f"has no action for {missing[0]}" if missing else f"names {unknown[0]!r}, which is no agent"
+            raise ValueError(f"actions {what}: the agents are {', '.join(self.agents)}")
+
+    def _action(self, actions: dict[str, Any]) -> TensorDictBase:
+        """All robots' actions; one that has left cannot move, so any of them will do for it."""
+        space = self.action_spaces[self.possible_agents[0]]
+        if isinstance(space, spaces.Dict):
+            idle: Any = {"region": 0, "offset": np.zeros(2)}
+        else:
+            idle = 0 if isinstance(space, spaces.Discrete) else np.zeros(2)
+        given = {name: actions.get(name, idle) for name in self.possible_agents}
+        if isinstance(space, spaces.Dict):
+            for name, one in given.items():
+                if not isinstance(one, dict) or not {"region", "offset"} <= set(one):
+                    raise ValueError(f"the action of {name} is {one!r}: give a dict of region and offset")
+            together: Any = {key: _stacked(key, [one[key] for one in given.values()]) for key in space}
+        else:
+            together = _stacked("action", list(given.values()))
+        return to_action(together, self._kind, self._direct, (1, len(given)), self.env.device)
+
+    def _observations(self, now: TensorDictBase) -> dict[str, dict]:
+        values = now["agents", "observation"][0]
+        return {
+            name: to_numpy(values[i], self.observation_spaces[name])
+            for i, name in enumerate(self.possible_agents)
+            if name in self.agents
+        }
+
+    def _infos(self, now: TensorDictBase) -> dict[str, dict]:
+        """What the env's ``info`` holds of the team and of the robot, as plain numbers."""
+        team = now["info"][0].to_dict()
+        listed = {key: value.tolist() for key, value in team.items()}
+        return {
+            name: {key: value[0] if key in INFO_ENV else value[i] for key, value in listed.items()}
+            for i, name in enumerate(self.possible_agents)
+            if name in self.agents
+        }
+
+
+def _stacked(name: str, values: list) -> np.ndarray:
+    """One array [1, N, ...] of the robots' values."""
+    try:
+        return np.stack([np.asarray(one) for one in values])[None]
+    except ValueError as error:
+        raise ValueError(f"{name} has a different shape for different agents: {values}") from error
