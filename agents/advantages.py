@@ -38,19 +38,22 @@ class TeamGAE(GAE):
         return tensordict.set(self.robot_advantage, advantage.expand(*advantage.shape[:-2], robots, 1))
 
 
-def estimator_for(loss, gamma: float, lmbda: float, critic) -> GAE:
+def estimator_for(loss, gamma: float, lmbda: float, finite_horizon: bool, critic) -> GAE:
     """The estimator that fits a loss: TeamGAE where its critic values the team, else MultiAgentGAE.
 
     Args:
         loss: names the keys
         gamma: discount per macro step
         lmbda: trace decay
+        finite_horizon: nothing follows a truncated episode either; its key of terminations is then "done"
         critic: network to call, or None to read the values from the batch
     """
     kind = TeamGAE if loss.team_value else MultiAgentGAE
     estimator = kind(gamma=gamma, lmbda=lmbda, value_network=critic, deactivate_vmap=True)
     names = ("advantage", "value", "value_target", "reward")
     estimator.set_keys(**{name: getattr(loss.tensor_keys, name) for name in names})
+    if finite_horizon:
+        estimator.set_keys(terminated="done")
     return estimator
 
 
@@ -59,7 +62,8 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
     """Write values, advantages and value targets into a Collector batch.
 
     The state after step t is the state before step t + 1 unless the episode ended there, so each state is
-    valued once; only truncated ends and the last step need another look. (TorchRL values every state twice.)
+    valued once; only the last step, and truncated ends unless the horizon is finite, need another look. (TorchRL
+    values every state twice.)
 
     Args:
         loss: holds the critic and the discount
@@ -78,10 +82,11 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
 
     inputs = (MAP, POSE, GRID, COMM)
     value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
-    done, terminated = (batch["next", name].squeeze(-1) for name in ("done", "terminated"))
+    last = loss.bare_estimator.tensor_keys.terminated  # "done" where the horizon is finite
+    done, final = (batch["next", name].squeeze(-1) for name in ("done", last))
     ends = done.clone()
     ends[:, -1] = True
-    ends &= ~terminated  # what follows a termination is worth 0 and never read
+    ends &= ~final  # what follows is worth 0 and never read
     following = torch.cat((value[:, 1:], torch.zeros_like(value[:, :1])), dim=1)
     if ends.any():
         following[ends] = values(batch["next"].select(*inputs)[ends])

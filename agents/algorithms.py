@@ -20,6 +20,7 @@ class Settings:
     Attributes:
         gamma: discount per macro step
         lmbda: trace decay of the generalised advantages
+        finite_horizon: an episode that ran out of time is over: nothing that would come after it counts
         lr: learning rate of the policy
         critic_lr: learning rate of the critic
         final_lr_share: both decay linearly to this share at the end of the training
@@ -33,6 +34,7 @@ class Settings:
 
     gamma: float = number(0.99, high=1.0)
     lmbda: float = number(0.95, high=1.0)
+    finite_horizon: bool = flag(False)
     lr: float = number(7e-4, open_ends=True)
     critic_lr: float = number(1e-3, open_ends=True)
     final_lr_share: float = number(1.0, high=1.0)
@@ -178,7 +180,7 @@ class Algorithm:
         settings = settings or self.settings
         norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
         loss = self.loss(policy, critic, value_norm=norm, **settings.loss_arguments())
-        loss.setup(settings.gamma, settings.lmbda)
+        loss.setup(settings.gamma, settings.lmbda, settings.finite_horizon)
         return loss.to(next(policy.parameters()).device)
 
     def make_updater(self, loss, settings: Settings | None = None) -> Updater:
@@ -188,7 +190,7 @@ class Algorithm:
 
 def _reference(settings: Settings, **others) -> Settings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
-    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
+    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0, finite_horizon=False)
     return replace(settings, **shared, **others)
 
 

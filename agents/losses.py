@@ -53,7 +53,7 @@ class RobotValues:
 
     team_value = False
 
-    def setup(self, gamma: float, lmbda: float) -> None:
+    def setup(self, gamma: float, lmbda: float, finite_horizon: bool) -> None:
         """Name the keys and build the estimators; the bare one is told the values instead of the network."""
         self.set_keys(
             advantage=ADVANTAGE,
@@ -61,8 +61,8 @@ class RobotValues:
             value=TEAM_VALUE if self.team_value else VALUE,
             reward=REWARD,
         )
-        self.make_value_estimator(estimator_for(self, gamma, lmbda, self.critic_network))
-        self.__dict__["bare_estimator"] = estimator_for(self, gamma, lmbda, None)
+        self.make_value_estimator(estimator_for(self, gamma, lmbda, finite_horizon, self.critic_network))
+        self.__dict__["bare_estimator"] = estimator_for(self, gamma, lmbda, finite_horizon, None)
 
 
 class TeamValues(RobotValues):

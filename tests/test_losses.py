@@ -64,10 +64,15 @@ def hand_made(critic, batch, key):
 
 @pytest.mark.parametrize("name", ["ippo", "matrpo", "vdppo", "vda2c"])
 @pytest.mark.parametrize("way", ["loss", "updater"])
-def test_advantages_match_a_hand_written_gae(name, way):
-    _, critic, loss, batch = setup(name)
+@pytest.mark.parametrize("finite", [True, False])
+def test_advantages_match_a_hand_written_gae(name, way, finite):
+    """With a finite horizon nothing follows a truncated episode; a batch's end in the middle of one is no end."""
+    _, critic, loss, batch = setup(name, finite_horizon=finite)
     team = ALGORITHMS[name].critic == "mixed"
-    expected, value = hand_made(critic, batch, TEAM_VALUE if team else VALUE)
+    ended = batch.copy()
+    if finite:
+        ended["next"] = batch["next"].copy().set("terminated", batch["next", "done"])
+    expected, value = hand_made(critic, ended, TEAM_VALUE if team else VALUE)
     if way == "updater":
         out = write_advantages(loss, batch.copy(), chunk=4)
     else:

@@ -16,6 +16,7 @@ GOOD = {
     "entropy_coeff": [0], "critic_coeff": [0], "clip_value": [0, 10], "kl_coeff": [0], "damping": [0],
     "clip_epsilon": [0.01, 0.99], "backtrack_factor": [0.01, 0.99],
     "value_norm": [True, False], "normalize_advantage": [True, False], "mixer": ["vdn", "qmix"],
+    "finite_horizon": [True, False],
     **{name: [1, 7] for name in (
         "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
     )},
@@ -28,7 +29,7 @@ BAD = {
     **{name: [0, -3, 1.5, True] for name in (
         "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
     )},
-    **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage")},
+    **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage", "finite_horizon")},
 }  # fmt: skip
 EVERYWHERE = [math.nan, math.inf, -math.inf, "much", None]
 
