@@ -1,6 +1,8 @@
 """From settings to maps, environments and learners."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -10,6 +12,7 @@ from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
+from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.schema import given
 from maexp.agents.updaters import Updater
@@ -25,20 +28,27 @@ from maexp.envs import (
     make_map,
     split,
 )
-from maexp.envs.scenarios import find_scenario
+from maexp.envs.scenarios import cut_last_fifth, find_scenario
 
 
 @dataclass
 class MapSuite:
-    """The maps trained on and those of the evaluation.
+    """The maps trained on, those that choose (checkpoints, the best planner) and those of the evaluation.
 
     Attributes:
-        is_held_out: no map is in both; a user's own maps are all in both
+        is_held_out: those of the evaluation are used for nothing else; a user's own maps are used for all
+        build_validation: builds `validation` when that is first asked for
     """
 
     train: list[PointCloudMap]
     held_out: list[PointCloudMap]
     is_held_out: bool
+    build_validation: Callable[[], list[PointCloudMap]]
+
+    @cached_property
+    def validation(self) -> list[PointCloudMap]:
+        """The maps that choose; never trained on, but where a user's own maps or no others are there."""
+        return self.build_validation()
 
 
 def pick_device(name: str, setting: str = "device") -> torch.device:
@@ -73,16 +83,34 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     row = find_scenario(scenario.name)
     if row.build is None:
         maps = import_files(scenario)
-        return MapSuite(maps, maps, False)
+        return MapSuite(maps, maps, False, lambda: maps)
     if scenario.path is not None:
         raise UserError(
             f"scenario.path={scenario.path} needs scenario=pointcloud; scenario={scenario.name} builds its own maps."
         )
+    indices, validation, held_out = map_indices(scenario)
+
+    def build(chosen: list[int]) -> list[PointCloudMap]:
+        return [make_map(scenario.name, index) for index in chosen]
+
+    unseen = set(held_out).isdisjoint([*indices, *validation])
+    return MapSuite(build(indices) if train else [], build(held_out), unseen, lambda: build(validation or indices))
+
+
+def map_indices(scenario: Any) -> tuple[list[int], list[int], list[int]]:
+    """Indices of the maps that a scenario's settings train on, validate on (none: those trained on) and hold out."""
     trained_on, held_out = split(scenario.name)
-    indices = _indices("scenario.maps", scenario.maps, trained_on)
+    if scenario.held_out is not None and scenario.held_out_count is not None:
+        raise UserError("scenario.held_out and scenario.held_out_count were both given: give one of them.")
+    if scenario.held_out_count is not None:
+        check_counts(scenario, "held_out_count", prefix="scenario.")
+        held_out = range(held_out.start, held_out.start + scenario.held_out_count)
     others = _indices("scenario.held_out", scenario.held_out, held_out)
-    build = [make_map(scenario.name, index) for index in indices] if train else []
-    return MapSuite(build, [make_map(scenario.name, index) for index in others], set(indices).isdisjoint(others))
+    none = OmegaConf.is_list(scenario.validation) and not len(scenario.validation)
+    trained_on, choosing = (trained_on, []) if none else cut_last_fifth(trained_on)
+    indices = _indices("scenario.maps", scenario.maps, trained_on)
+    unused = [index for index in choosing if index not in indices and index not in others]
+    return indices, [] if none else _indices("scenario.validation", scenario.validation, unused), others
 
 
 def import_files(scenario: Any) -> list[PointCloudMap]:
@@ -98,7 +126,7 @@ def import_files(scenario: Any) -> list[PointCloudMap]:
     return maps
 
 
-def _indices(name: str, value: Any, default: range) -> list[int]:
+def _indices(name: str, value: Any, default: Iterable[int]) -> list[int]:
     if value is None:
         return list(default)
     value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value

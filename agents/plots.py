@@ -13,7 +13,7 @@ from maexp.agents.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels,
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
-    ("Coverage at the end of an episode", "%", 100, [("coverage", "training"), ("held_out_coverage", "evaluation")]),
+    ("Coverage at the end of an episode", "%", 100, [("coverage", "training"), ("validation_coverage", "validation")]),
     ("Reward of a robot", "per macro step", 1, [("reward", "total"), ("return", "return")]),
     (
         "Reward by term",

@@ -158,23 +158,23 @@ class TrainingRun:
         self.experience.update_policy_weights_()
 
     def evaluate_if_due(self) -> dict[str, float]:
-        """Coverage on held-out maps, every `evaluate_every` iterations; else NaN. The mean over team sizes."""
+        """Coverage on the validation maps, every `evaluate_every` iterations; else NaN. The mean over team sizes."""
         every = self.cfg.evaluate_every
         if not every or self.iteration % every:
-            return {"held_out_coverage": math.nan}
-        if not hasattr(self, "_held_out_envs"):
+            return {"validation_coverage": math.nan}
+        if not hasattr(self, "_validation_envs"):
             shares = divide_teams(self.cfg.num_envs, self.sizes)
             device = choose_device(self.cfg, "train_device")
-            self._held_out_envs = [
-                make_env(self.cfg, self.suite.held_out, one.num_robots, one.num_envs, device=device) for one in shares
+            self._validation_envs = [
+                make_env(self.cfg, self.suite.validation, one.num_robots, one.num_envs, device=device) for one in shares
             ]
         policy, seed = self.learner.policy, self.cfg.seed
-        results = [evaluate(policy, env, env.num_envs, seed=seed).summary() for env in self._held_out_envs]
-        return {"held_out_coverage": fmean(one["exploration_ratio"]["mean"] for one in results)}
+        results = [evaluate(policy, env, env.num_envs, seed=seed).summary() for env in self._validation_envs]
+        return {"validation_coverage": fmean(one["exploration_ratio"]["mean"] for one in results)}
 
     def keep(self, row: dict[str, float], log: MetricsLog, last: bool) -> None:
         """Save when it is time to, or when the coverage is the best so far."""
-        score = row["held_out_coverage"] if self.cfg.evaluate_every else row["coverage"]
+        score = row["validation_coverage"] if self.cfg.evaluate_every else row["coverage"]
         due = last or self.iteration % self.cfg.checkpoint_every == 0
         if due:
             log.sync()

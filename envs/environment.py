@@ -31,14 +31,11 @@ from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
 from maexp.kernels import unpack_flags
-from maexp.kernels.reset import START_CLEARANCE
+from maexp.kernels.reset import EVALUATION, START_CLEARANCE
 from maexp.kernels.state import STATE
 from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
 
 DEFAULT_MACRO_STEPS_MIN = 10
-EVALUATION = 2**30
-"""Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
-
 SWEEPS = 2.0
 """A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -275,9 +272,10 @@ class ExplorationEnv(EnvBase):
         self.simulation.tensors["episode"].fill_(-1)
 
     def set_episodes(self, ids: torch.Tensor) -> None:
-        """Let env i play evaluation episode ``ids[i]`` at the next reset: map and starts from (seed, id) alone."""
+        """Let env i play evaluation episode ``ids[i]`` at the next reset: map (they take turns) and starts from
+        (seed, id) alone."""
         self.simulation.tensors["env_id"].copy_(ids)
-        self.simulation.tensors["episode"].fill_(EVALUATION - 1)
+        self.simulation.tensors["episode"].fill_(int(EVALUATION) - 1)
 
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""

@@ -12,6 +12,8 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 TRIES = wp.constant(64)
 START_CLEARANCE = wp.constant(3.0)
 """Starts keep this many collision thresholds from the boundary and from other robots."""
+EVALUATION = wp.constant(2**30)
+"""Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
 
 
 @wp.func
@@ -55,6 +57,9 @@ def _place_team(
     key = wp.rand_init(seed[0], env_id[e])
     rng = wp.rand_init(wp.randi(key), episode[e])
     m = wp.randi(rng, 0, num_maps)
+    if episode[e] >= EVALUATION:  # evaluation takes the maps in turn, so that each is played as often as the others
+        first_map = wp.rand_init(seed[0])
+        m = (env_id[e] + (episode[e] - EVALUATION) + wp.randi(first_map, 0, num_maps)) % num_maps
     map_id[e] = m
     first = maps.free_begin[m]
     count = maps.free_begin[m + 1] - first

@@ -3,7 +3,7 @@
 import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.agents.build import load_maps, make_env, make_learner, model_settings, team_configs
+from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
 from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
 from maexp.agents.settings.compose import compose_config, group_choices, groups
@@ -110,7 +110,40 @@ def test_a_team_of_different_robots():
         team_configs(compose_config("train", ["robot.team=[{wings: 2}]"]), 3)
 
 
-@pytest.mark.parametrize("word", ["scenario.maps=[]", "scenario.maps=[-1]", "scenario.held_out=x"])
+def indices(*words: str) -> tuple[list[int], list[int], list[int]]:
+    return map_indices(compose_config("train", list(words)).scenario)
+
+
+def test_maps_that_choose_are_neither_trained_on_nor_held_out():
+    assert indices() == ([*range(51)], [*range(51, 64)], [*range(64, 80)])
+    assert indices("scenario=indoor_small") == ([*range(11)], [11, 12, 13], [14, 15, 16])
+    for name, row in SCENARIOS.items():
+        if row.build is not None:
+            train, validation, held_out = indices(f"scenario={name}")
+            assert train and validation and held_out and [*train, *validation, *held_out] == [*range(row.count)]
+    assert indices("scenario.maps=[52]", "scenario.held_out=[53]") == ([52], [51, *range(54, 64)], [53])
+    assert indices("scenario.validation=[3]", "scenario.maps=[0]")[1] == [3]
+
+
+def test_no_validation_maps_as_before_there_were_any():
+    """The maps trained on choose, as with maps of one's own."""
+    assert indices("scenario.validation=[]") == ([*range(64)], [], [*range(64, 80)])
+    suite = load_maps(compose_config("train", ["scenario.validation=[]", "scenario.maps=[1,0]"]).scenario)
+    assert [one.name for one in suite.validation] == ["maze_small_1", "maze_small_0"]
+    suite = load_maps(compose_config("train", ["scenario.validation=[7]", "scenario.maps=[1,0]"]).scenario)
+    assert [one.name for one in suite.validation] == ["maze_small_7"]
+
+
+def test_more_held_out_maps_than_the_table_has():
+    assert indices("scenario.held_out_count=50")[2] == [*range(64, 114)]
+    assert indices("scenario.held_out_count=2", "scenario=indoor_small")[2] == [14, 15]
+    with pytest.raises(UserError, match="give one of them"):
+        indices("scenario.held_out_count=2", "scenario.held_out=[70]")
+    with pytest.raises(UserError, match="scenario.held_out_count=0 must be a whole number, 1 or more"):
+        indices("scenario.held_out_count=0")
+
+
+@pytest.mark.parametrize("word", ["validation=[-1]", "maps=[]", "maps=[-1]", "held_out=x"])
 def test_bad_indices(word):
     with pytest.raises(UserError, match="must be a list of whole numbers"):
-        load_maps(compose_config("train", [word]).scenario)
+        load_maps(compose_config("train", [f"scenario.{word}"]).scenario)

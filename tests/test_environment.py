@@ -161,6 +161,26 @@ def test_evaluation_episodes_depend_on_their_number_alone(maps):
     assert not torch.equal(large.reset()[pose][0], training[pose][0]), "training must not meet the evaluation's starts"
 
 
+def test_evaluation_plays_every_map_as_often_as_the_others():
+    """Seven episodes on three maps, in any batch and where an env goes on after its first; seeds start elsewhere."""
+    three = [make_map("maze_small", index) for index in range(3)]
+    orders = set()
+    for seed in range(8):
+        large, small = (ExplorationEnv(three, num_envs=count, num_robots=1, seed=seed) for count in (7, 1))
+        large.set_episodes(torch.arange(7))
+        large.reset()
+        played = large.simulation.tensors["map_id"].tolist()
+        assert sorted(played.count(index) for index in range(3)) == [2, 2, 3]
+        orders.add(tuple(played))
+        for number in (6, 2):
+            small.set_episodes(torch.tensor([number]))
+            small.reset()
+            assert small.simulation.tensors["map_id"].item() == played[number]
+        small.reset()
+        assert small.simulation.tensors["map_id"].item() == played[3]
+    assert len(orders) == 3
+
+
 def test_state_continues_bit_for_bit(maps):
     plan = actions(3, 3, 6)
     env = ExplorationEnv(maps, num_envs=3, macro_steps=4)

@@ -66,7 +66,7 @@ def test_smoothing_is_a_mean():
 
 def test_columns_without_values_are_left_out_and_gaps_bridged(tmp_path, figures):
     gaps = ["nan", "0.5", "", "0.7", "nan", "0.9"]
-    columns = {"frames": range(6), "coverage": gaps, "held_out_coverage": ["nan"] * 6, "entropy": [""] * 6}
+    columns = {"frames": range(6), "coverage": gaps, "validation_coverage": ["nan"] * 6, "entropy": [""] * 6}
     draw_curves(write_csv(tmp_path, columns), tmp_path / "curves.png")
     (ax,) = panels(figures[0]).values()
     assert [line.get_label() for line in ax.lines] == ["training"]

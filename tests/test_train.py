@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ import torch
 
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.cli import main
-from maexp.agents.logs import read_metrics
+from maexp.agents.logs import MetricsLog, read_metrics
+from maexp.agents.settings.compose import compose_config
 
 TINY = [
     "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3", "scenario.local_steps=5",
@@ -83,7 +85,7 @@ def test_the_files_of_a_run(capsys):
     assert all(row["time_simulate"] + row["time_policy"] <= row["time_wait"] + 2e-4 for row in rows)
     assert {row["policy_lag"] for row in rows} == {0}
     assert sum(row["episodes"] for row in rows) == 3 * 2  # 6 macro steps of 3 teams, 3 to an episode
-    assert rows[1]["held_out_coverage"] > 0 and rows[0]["held_out_coverage"] != rows[0]["held_out_coverage"]
+    assert rows[1]["validation_coverage"] > 0 and rows[0]["validation_coverage"] != rows[0]["validation_coverage"]
     assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2"]
     assert (folder / "checkpoints" / "best.pt").is_file()
     assert "num_robots: 2" in (folder / "config.yaml").read_text()
@@ -93,6 +95,18 @@ def test_the_files_of_a_run(capsys):
     assert summary["run"]["maps"] == ["maze_small_70"]
     printed = capsys.readouterr().out
     assert "trained" in printed and "Next: maexp evaluate" in printed
+
+
+def test_a_run_of_an_earlier_version_goes_on_with_columns_that_it_did_not_know(tmp_path):
+    cfg = compose_config("train", []).logger
+    for kept, row in ((0, {"iteration": 1, "coverage": 0.5}), (1, {"iteration": 2, "coverage": 0.6, "new": 7.0})):
+        with closing(MetricsLog(tmp_path, cfg, kept=kept, frames=kept, config={})) as log:
+            log.write(row)
+    assert (tmp_path / "metrics.csv").read_text() == "iteration,coverage,new\n1,0.5,\n2,0.6,7.0\n"
+    with closing(MetricsLog(tmp_path, cfg, kept=2, frames=2, config={})) as log:
+        log.write({"iteration": 3, "coverage": 0.5})
+        with pytest.raises(RuntimeError, match="late was not among"):
+            log.write({"iteration": 4, "late": 1.0})
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "matrpo"])

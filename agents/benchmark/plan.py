@@ -20,7 +20,7 @@ from maexp.agents.results import plain
 from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
-from maexp.envs.scenarios import SCENARIOS, find_scenario, split
+from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 PLAN = "benchmark.json"
 SUITES = {"held_out": "held-out maps", "trained": "training maps"}
@@ -155,13 +155,13 @@ def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     if find_scenario(cell.scenario).build is None:
         return {}
     chosen: dict[str, Any] = {}
-    train, held_out = split(cell.scenario)
+    train, _ = cut_last_fifth(split(cell.scenario)[0])
     if cell.map is not None:
         chosen["scenario.maps"] = [cell.map]
     elif cfg.train_maps is not None and cfg.scenario.maps is None:
         chosen["scenario.maps"] = list(train[: cfg.train_maps])
     if cfg.test_maps is not None and cfg.scenario.held_out is None:
-        chosen["scenario.held_out"] = list(held_out[: cfg.test_maps])
+        chosen["scenario.held_out_count"] = cfg.test_maps
     return chosen
 
 

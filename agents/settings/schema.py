@@ -81,8 +81,10 @@ class ScenarioSettings:
 
     name: str = MISSING
     path: str | None = None  # the map of scenario=pointcloud, or several: a.yaml,b.pcd
-    maps: Any = None  # indices trained on; null: all but the last fifth of the table's count
-    held_out: Any = None  # indices evaluated; null: the last fifth
+    maps: Any = None  # indices trained on; null: what held_out and validation leave of the table's count
+    validation: Any = None  # indices that choose between checkpoints and planners; null: the last fifth of the rest
+    held_out: Any = None  # indices evaluated; null: the last fifth of the table's count
+    held_out_count: int | None = None  # instead: so many, from the first held-out one on, beyond the table's count too
     local_steps: int | None = None  # control steps in one decision
     macro_steps: int | None = None  # decisions in one episode
     success_coverage: float = 0.95
@@ -147,7 +149,7 @@ class TrainSettings(LearnerSettings):
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")
-    evaluate_every: int = setting(0, "iterations between two evaluations on held-out maps; 0: only at the end")
+    evaluate_every: int = setting(0, "iterations between two evaluations on validation maps; 0: none")
     collector: CollectorSettings = field(default_factory=CollectorSettings)
     logger: LoggerSettings = field(default_factory=LoggerSettings)
 
@@ -231,8 +233,8 @@ class BenchmarkSettings(LearnerSettings):
     total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for")
     iterations: int | None = setting(None, "instead: iterations of one episode of each of the num_envs teams")
     maps: Any = setting("held_out", "evaluated on held_out or trained maps, or both as maps=held_out,trained")
-    train_maps: int | None = setting(None, "train on the first so many maps; default: all but the last fifth")
-    test_maps: int | None = setting(None, "evaluate on the first so many held-out maps; default: all of them")
+    train_maps: int | None = setting(None, "train on the first so many maps; default: all that may be trained on")
+    test_maps: int | None = setting(None, "evaluate on so many held-out maps, new ones too; default: the last fifth")
     policy_per_map: Any = setting(None, "a policy for each of so many maps, as {maze: 4}; default: one for all")
     workers: int | None = setting(None, "cells at once; default: the cores, or the GPUs where there are some")
     resume: str | None = setting(None, "folder of a benchmark to go on with (its settings are kept)")

@@ -103,5 +103,11 @@ def split(name: str) -> tuple[range, range]:
     scenario = find_scenario(name)
     if scenario.count is None:
         raise ValueError(f"scenario={name!r} has no generated maps to hold out: it plays the map you bring.")
-    train = scenario.count - max(1, round(0.2 * scenario.count))
-    return range(train), range(train, scenario.count)
+    return cut_last_fifth(range(scenario.count))
+
+
+def cut_last_fifth(indices: range) -> tuple[range, range]:
+    """The first four fifths and the last, which has one index at least: held out of all maps, or of those that teams
+    are trained on for validation."""
+    first = len(indices) - max(1, round(0.2 * len(indices)))
+    return indices[:first], indices[first:]
