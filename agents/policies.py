@@ -3,8 +3,7 @@
 A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
 All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way
 from every robot to every target. They differ in which target each robot takes. How it is approached they share
-(`FrontierPlanner._approach`): as fast as the env's planner can be trusted with, and on into the unknown where the
-robot would be there before its next decision.
+(`envs/targets.py`).
 
 Sources and tuning: docs/planners.md.
 """
@@ -12,19 +11,16 @@ Sources and tuning: docs/planners.md.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 
 import torch
 from tensordict.nn import TensorDictModule
 
 from maexp.envs import ExplorationEnv
-from maexp.envs.navigation import Navigation
+from maexp.envs.targets import Scene, TargetTracker, keyed_uniform
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
 
-DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
-STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
-SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 REGION_COUNT = 64
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
 LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
@@ -32,31 +28,6 @@ RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
 REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What targets are chosen from. K targets per robot; those that are absent are infinitely far.
-
-    Attributes:
-        travel: float32 [E, N, K], way from robot to target [m].
-        points: float32 [E, N, K, 2], where the targets are [m].
-        size: float32 [E, N, K], frontier cells behind each.
-        gain: float32 [E, N, K], unknown cells in radar range and sight of each, as a share of the radar's disc.
-        alive: bool [E, N], robots that still move.
-        nav: the env's grids.
-    """
-
-    travel: torch.Tensor
-    points: torch.Tensor
-    size: torch.Tensor
-    gain: torch.Tensor
-    alive: torch.Tensor
-    nav: Navigation
-
-    def spread(self, per_row: torch.Tensor) -> torch.Tensor:
-        """[E, R, K] of what is known -> [E, N, K] of the robots."""
-        return per_row.expand(-1, self.travel.shape[1], -1)
 
 
 def choose_nearest(scene: Scene) -> torch.Tensor:
@@ -150,120 +121,18 @@ class FrontierPlanner:
     """
 
     def __init__(self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor]):
-        self.env, self.choose, self.nav = env, choose, Navigation(env)
-        self.seconds = 0.1 * env.local_steps
-        shape = (env.num_envs, env.num_robots)
-        self.dwell = torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=env.device)
-        self.chosen = torch.full((*shape, 1), -1, device=env.device)
-        self.stood = torch.zeros((*shape, 2), device=env.device)
+        self.choose, self.tracker = choose, TargetTracker(env)
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
-        nav = self.nav
-        nav.update()
-        cells = nav.target.expand(-1, self.env.num_robots, -1)
-        points = nav.points(cells.clamp_min(0))
-        travel = self._give_up(nav.travel(), points)
-        gain, middle = self._look_around()
-        travel = _prefer(travel, gain >= LEAST_GAIN)
-        scene = Scene(
-            travel=travel,
-            points=points,
-            size=nav.size.expand(-1, self.env.num_robots, -1).float(),
-            gain=gain,
-            alive=nav.alive(),
-            nav=nav,
-        )
+        scene = self.tracker.look()
+        scene = replace(scene, travel=_prefer(scene.travel, scene.gain >= LEAST_GAIN))
         chosen = self.choose(scene).unsqueeze(-1)
-        found = travel.gather(2, chosen).squeeze(-1).isfinite()
-        self.chosen = torch.where(found.unsqueeze(-1), chosen, -1)
-        self.stood = nav.centers().clone()
-        goal_cell = torch.where(found, cells.gather(2, chosen).squeeze(-1), -1)
-        target = torch.where(found.unsqueeze(-1), nav.points(goal_cell.clamp_min(0)), self._roam())
-        toward = middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
-        return nav.to_action(self._approach(goal_cell, target, torch.where(found.unsqueeze(-1), toward, 0.0)))
-
-    def _approach(self, goal_cell: torch.Tensor, target: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
-        """Goals [m] on the way to `target` (of cell `goal_cell`, -1 = none), float32 [E, N, 2].
-
-        A robot that stopped at its target would stand there until the next decision. So goals lie beyond targets that
-        are near, `toward` what is to be seen from there, as far as the robot still gets. Plain DWA sees no way around
-        walls and brakes too late between them: it gets a point in sight, and off open ground one near enough to brake
-        for.
-        """
-        nav = self.nav
-        drive = self._drive(torch.hypot(nav.state["pose"][..., 2], nav.state["slip"]))
-        gap = (target - nav.centers()).norm(dim=-1)
-        left = (drive - gap).clamp_min(0.0) / toward.norm(dim=-1).clamp_min(1e-6)
-        beyond = target + toward * left.unsqueeze(-1)
-        if self.env.planner_config.name == "wavefront":
-            return beyond
-        threshold = self.env.simulation.robot_tensors["threshold"]
-        far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
-        near = (self._drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
-        near = nav.waypoints(goal_cell, target, near)
-        is_open = nav.leads_through_open_ground(far)
-        at_target = (far - target).norm(dim=-1) <= nav.cell_of_env().view(-1, 1)
-        far = torch.where(at_target.unsqueeze(-1), beyond, far)
-        return torch.where(is_open.unsqueeze(-1), far, near)
-
-    def _drive(self, speed: torch.Tensor) -> torch.Tensor:
-        """How far robots get in a macro step [m], from their speeds [m/s]."""
-        robots = self.env.simulation.robot_tensors
-        drive = speed * self.seconds + 0.5 * robots["max_accel"] * self.seconds**2
-        return torch.minimum(drive, robots["max_speed"] * self.seconds)
-
-    def _look_around(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """What is to be seen from every target, as a share of the radar's disc, float32 [E, N, K], and the middle of
-        it, from the target [m], float32 [E, N, K, 2]."""
-        nav, robots = self.nav, self.env.num_robots
-        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        area, middle = nav.look_around(nav.radar_range)
-        return (area / disc.view(-1, 1, 1)).expand(-1, robots, -1), middle.expand(-1, robots, -1, -1)
-
-    def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
-        each robot those that it got stuck on the way to."""
-        nav = self.nav
-        near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
-        fresh = nav.state["macro_step"] == 0
-        self.dwell[fresh], self.chosen[fresh] = 0, -1
-        beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near)
-        self.dwell += beside.any(1, keepdim=True) if nav.rows == 1 else beside
-        stuck = (nav.centers() - self.stood).norm(dim=-1, keepdim=True) < STUCK * nav.clearance
-        stuck = stuck & (self.chosen >= 0) & nav.alive().unsqueeze(-1)
-        self.dwell.scatter_add_(2, self.chosen.clamp_min(0), stuck.to(torch.int32))
-        kept = travel.masked_fill(self.dwell >= DWELL, torch.inf)
-        # Nothing else left: try them all once more.
-        again = ~kept.isfinite().flatten(1).any(1)
-        self.dwell[again] = 0
-        return torch.where(again.view(-1, 1, 1), travel, kept)
-
-    def _roam(self) -> torch.Tensor:
-        """Where robots without a target go [m]: anywhere, [E, N, 2]."""
-        m = self.nav.state["map_id"].long()
-        lower, upper = self.nav.lower[m].unsqueeze(1), self.nav.upper[m].unsqueeze(1)
-        return lower + keyed_uniform(self.env, 2) * (upper - lower)
-
-
-def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
-    """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone: no generator's
-    state, and the same for env i in any batch."""
-    state = env.simulation.tensors
-    robots = torch.arange(env.num_robots * count, device=env.device).view(1, env.num_robots, count)
-    key = torch.zeros((env.num_envs, 1, 1), dtype=torch.int64, device=env.device)
-    for part in (*(state[name].view(-1, 1, 1) for name in ("seed", "env_id", "episode", "macro_step")), robots):
-        key = _mix(key + part)
-    return ((key >> 40) & 0xFFFFFF).float() / float(1 << 24)
-
-
-def _mix(x: torch.Tensor) -> torch.Tensor:
-    """Finaliser of splitmix64 (Steele et al. 2014) on int64, which wraps as uint64 does."""
-    x = x + (0x9E3779B97F4A7C15 - (1 << 64))
-    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * (0xBF58476D1CE4E5B9 - (1 << 64))
-    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * (0x94D049BB133111EB - (1 << 64))
-    return x ^ ((x >> 31) & ((1 << 33) - 1))
+        found = scene.travel.gather(2, chosen).isfinite()
+        cell = scene.spread(scene.nav.target).gather(2, chosen)
+        toward = scene.middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
+        return self.tracker.take(torch.where(found, chosen, -1).squeeze(-1), cell.squeeze(-1), toward)
 
 
 def _prefer(travel: torch.Tensor, worth: torch.Tensor) -> torch.Tensor:

@@ -7,12 +7,12 @@ envs at once, on the env's device, without a loop over envs or robots.
 from __future__ import annotations
 
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import warp as wp
 
-from maexp.envs.environment import ExplorationEnv
 from maexp.envs.nav_grid import bank_nav_grids
 from maexp.kernels import targets
 from maexp.kernels.frontier import mark_frontier
@@ -21,6 +21,9 @@ from maexp.kernels.known_grid import KnownGrids, PassableGrids
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
+
+if TYPE_CHECKING:
+    from maexp.envs.environment import ExplorationEnv
 
 BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 OPEN_GROUND = 1.2  # places with so many clearances of room around are open: DWA pays nothing for being there

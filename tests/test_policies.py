@@ -163,13 +163,13 @@ def test_goals_under_dwa_are_in_sight_and_in_reach():
     reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill; no place of these corridors is open ground
     for _ in range(3):
         td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
-        centers = planner.nav.centers().clone()
-        passable = planner.nav.passable.passable.numpy().copy()
+        centers = planner.tracker.nav.centers().clone()
+        passable = planner.tracker.nav.passable.passable.numpy().copy()
         td = env.step(td)["next"]
         goal = env.simulation.tensors["goal"]
         assert ((goal - centers).norm(dim=-1) <= reach + 1e-3).float().mean() > 0.9
         for e in range(4):
-            w = int(planner.nav.width[planner.nav.state["map_id"][e]])
+            w = int(planner.tracker.nav.width[planner.tracker.nav.state["map_id"][e]])
             for i in range(3):
                 a, b = centers[e, i].numpy(), goal[e, i].numpy()
                 line = a + np.linspace(0.2, 1.0, 20)[:, None] * (b - a)
@@ -204,7 +204,8 @@ def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
     size = torch.ones_like(travel) if size is None else torch.tensor(size)
     alive = torch.ones(travel.shape[:2], dtype=torch.bool) if alive is None else torch.tensor(alive)
     gain = torch.ones_like(travel)
-    return Scene(travel, points, size, gain, alive, nav or Places(np.zeros((*travel.shape[:2], 2), np.float32)))
+    nav = nav or Places(np.zeros((*travel.shape[:2], 2), np.float32))
+    return Scene(travel, points, size, gain, torch.zeros_like(points), alive, nav)
 
 
 INF = float("inf")
@@ -272,34 +273,40 @@ def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_le
     env.reset()
     env.simulation.tensors["macro_step"].fill_(1)
     planner = FrontierPlanner(env, choose_nearest)
-    planner.nav.update()
-    here = planner.nav.centers().unsqueeze(2)
-    travel = torch.full((1, 1, planner.nav.num_blocks), INF)
+    planner.tracker.nav.update()
+    here = planner.tracker.nav.centers().unsqueeze(2)
+    travel = torch.full((1, 1, planner.tracker.nav.num_blocks), INF)
     travel[..., :2] = torch.tensor([0.5, 20.0])
-    points = here.expand(-1, -1, planner.nav.num_blocks, -1).clone()
+    points = here.expand(-1, -1, planner.tracker.nav.num_blocks, -1).clone()
     points[..., 1, :] += 20.0
-    kept = [planner._give_up(travel, points)[0, 0, :2].tolist() for _ in range(4)]
+    kept = []
+    for step in range(1, 5):
+        env.simulation.tensors["macro_step"].fill_(step)
+        for _ in range(2):  # looking twice counts once
+            given = planner.tracker._give_up(travel, points)[0, 0, :2].tolist()
+        kept.append(given)
     assert kept == [[0.5, 20.0], [0.5, 20.0], [INF, 20.0], [INF, 20.0]]
     travel[..., 1] = INF
-    assert planner._give_up(travel, points)[0, 0, 0] == 0.5
+    assert planner.tracker._give_up(travel, points)[0, 0, 0] == 0.5
 
 
 def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
     env = make_env(1, num_robots=2)
     env.reset()
     planner = FrontierPlanner(env, choose_nearest)
-    planner.nav.update()
-    travel = torch.full((1, 2, planner.nav.num_blocks), INF)
+    planner.tracker.nav.update()
+    travel = torch.full((1, 2, planner.tracker.nav.num_blocks), INF)
     travel[..., :2] = torch.tensor([9.0, 20.0])
     points = torch.full((*travel.shape, 2), 1000.0)
-    env.simulation.tensors["macro_step"].fill_(1)
-    for _ in range(3):
-        planner.chosen, planner.stood = torch.zeros((1, 2, 1), dtype=torch.long), planner.nav.centers().clone()
-        planner.stood[0, 1, 0] -= 1.0  # the second robot has moved
-        kept = planner._give_up(travel, points)
+    state = planner.tracker.state
+    for step in range(1, 4):
+        env.simulation.tensors["macro_step"].fill_(step)
+        state["chosen"], state["stood"] = torch.zeros_like(state["chosen"]), planner.tracker.nav.centers().clone()
+        state["stood"][0, 1, 0] -= 1.0  # the second robot has moved
+        kept = planner.tracker._give_up(travel, points)
     assert kept[0, :, :2].tolist() == [[INF, 20.0], [9.0, 20.0]]
     env.simulation.tensors["macro_step"].fill_(0)
-    assert planner._give_up(travel, points)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
+    assert planner.tracker._give_up(travel, points)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
 
 
 @pytest.mark.parametrize("speed, drive", [(0.0, 4.0), (3.0, 10.0), (8.0, 16.0)])
@@ -310,8 +317,9 @@ def test_goals_lie_beyond_the_target_as_far_as_a_robot_gets(speed, drive):
     planner = FrontierPlanner(env, choose_nearest)
     env.simulation.tensors["pose"][..., 2] = speed
     gap = torch.tensor([2.0, 9.0, 30.0])
-    target = planner.nav.centers() + torch.stack([torch.zeros(3), gap], -1)
-    goal = planner._approach(torch.zeros(1, 3, dtype=torch.long), target, torch.tensor([6.0, 0.0]).expand(1, 3, 2))
+    target = planner.tracker.nav.centers() + torch.stack([torch.zeros(3), gap], -1)
+    toward = torch.tensor([6.0, 0.0]).expand(1, 3, 2)
+    goal = planner.tracker._approach(torch.zeros(1, 3, dtype=torch.long), target, toward)
     expected = torch.stack([(drive - gap).clamp_min(0.0), torch.zeros(3)], -1)
     torch.testing.assert_close(goal - target, expected.unsqueeze(0), atol=1e-4, rtol=0)
 
@@ -323,8 +331,9 @@ def test_how_far_goals_lie_is_each_robots_own():
     env.reset()
     planner = FrontierPlanner(env, choose_nearest)
     env.simulation.tensors["slip"][:, 2] = 3.0
-    target = planner.nav.centers()
-    goal = planner._approach(torch.zeros(1, 3, dtype=torch.long), target, torch.tensor([6.0, 0.0]).expand(1, 3, 2))
+    target = planner.tracker.nav.centers()
+    toward = torch.tensor([6.0, 0.0]).expand(1, 3, 2)
+    goal = planner.tracker._approach(torch.zeros(1, 3, dtype=torch.long), target, toward)
     drive = torch.stack([torch.tensor([1.0, 4.0, 10.0]), torch.zeros(3)], -1)
     torch.testing.assert_close(goal - target, drive.unsqueeze(0), atol=1e-4, rtol=0)
 
@@ -355,13 +364,13 @@ def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, d
     env = make_env(2, planner="dwa", maps=[make_map(scenario, 0)])
     env.reset()
     planner = FrontierPlanner(env, choose_nearest)
-    nav = planner.nav
+    nav = planner.tracker.nav
     nav.update()
     cell, x = float(nav.cell_size[0]), torch.tensor([1.0, 0.0])
     near = (nav.centers() / cell).round() * cell  # the robot's own place, as the middle of a cell
     cells = ((near - nav.origin[0]) / cell).floor().long()
     cells = cells[..., 1] * int(nav.width[0]) + cells[..., 0]
-    beyond = planner._approach(cells, nav.points(cells), (6.0 * x).expand(2, 3, 2)) - nav.points(cells)
+    beyond = planner.tracker._approach(cells, nav.points(cells), (6.0 * x).expand(2, 3, 2)) - nav.points(cells)
     is_open = nav.leads_through_open_ground(nav.centers())
     assert is_open.any() == (drive > 0.0)
     torch.testing.assert_close(beyond, drive * is_open.unsqueeze(-1) * x, atol=1e-4, rtol=0)

@@ -1,0 +1,186 @@
+"""Frontier targets of all teams, shared by the classical planners and by a learned choice: what there is to choose
+from, which targets are given up, and how a chosen one is approached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+
+from maexp.envs.navigation import Navigation
+
+if TYPE_CHECKING:
+    from maexp.envs.environment import ExplorationEnv
+
+DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
+STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
+SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What targets are chosen from. K targets per robot; those that are absent are infinitely far.
+
+    Attributes:
+        travel: float32 [E, N, K], way from robot to target [m].
+        points: float32 [E, N, K, 2], where the targets are [m].
+        size: float32 [E, N, K], frontier cells behind each.
+        gain: float32 [E, N, K], unknown cells in radar range and sight of each, as a share of the radar's disc.
+        middle: float32 [E, N, K, 2], the middle of those, from the target [m].
+        alive: bool [E, N], robots that still move.
+        nav: the env's grids.
+    """
+
+    travel: torch.Tensor
+    points: torch.Tensor
+    size: torch.Tensor
+    gain: torch.Tensor
+    middle: torch.Tensor
+    alive: torch.Tensor
+    nav: Navigation
+
+    def spread(self, per_row: torch.Tensor) -> torch.Tensor:
+        """[E, R, K] of what is known -> [E, N, K] of the robots."""
+        return per_row.expand(-1, self.travel.shape[1], -1)
+
+
+class TargetTracker:
+    """The targets of an env's teams, with a memory of those that led nowhere.
+
+    Args:
+        env: gives the grids; only read.
+
+    Attributes:
+        state: tensors that later decisions depend on: ``dwell`` [E, N, K], ``chosen`` [E, N, 1] (-1 = none),
+            ``stood`` [E, N, 2] [m], ``counted`` [E], the macro step that `dwell` was last counted in.
+    """
+
+    def __init__(self, env: ExplorationEnv):
+        self.env, self.nav = env, Navigation(env)
+        self.seconds = 0.1 * env.local_steps
+        shape, device = (env.num_envs, env.num_robots), env.device
+        self.state = {
+            "dwell": torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=device),
+            "chosen": torch.full((*shape, 1), -1, device=device),
+            "stood": torch.zeros((*shape, 2), device=device),
+            "counted": torch.full((env.num_envs,), -1, dtype=torch.int32, device=device),
+        }
+
+    def look(self) -> Scene:
+        """Bring everything up to date with the env, and give up what led nowhere (once a macro step)."""
+        nav, robots = self.nav, self.env.num_robots
+        nav.update()
+        points = nav.points(nav.target.expand(-1, robots, -1).clamp_min(0))
+        travel = self._give_up(nav.travel(), points)
+        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
+        area, middle = nav.look_around(nav.radar_range)
+        return Scene(
+            travel=travel,
+            points=points,
+            size=nav.size.expand(-1, robots, -1).float(),
+            gain=(area / disc.view(-1, 1, 1)).expand(-1, robots, -1),
+            middle=middle.expand(-1, robots, -1, -1),
+            alive=nav.alive(),
+            nav=nav,
+        )
+
+    def take(
+        self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Remember a choice and turn it into goals.
+
+        Args:
+            chosen: int64 [E, N], the target of each robot; -1 = none: it drives anywhere.
+            cell: int64 [E, N], where that is; any where there is none.
+            toward: float32 [E, N, 2], the middle of what is to be seen from there, from the target [m].
+
+        Returns:
+            region int64 [E, N] and offset float32 [E, N, 2].
+        """
+        nav, found = self.nav, chosen >= 0
+        self.state["chosen"] = chosen.unsqueeze(-1).clone()
+        cell = torch.where(found, cell, -1)
+        target = torch.where(found.unsqueeze(-1), nav.points(cell.clamp_min(0)), self._roam())
+        return nav.to_action(self._approach(cell, target, torch.where(found.unsqueeze(-1), toward, 0.0)))
+
+    def drive(self, speed: torch.Tensor) -> torch.Tensor:
+        """How far robots get in a macro step [m], from their speeds [m/s]."""
+        robots = self.env.simulation.robot_tensors
+        drive = speed * self.seconds + 0.5 * robots["max_accel"] * self.seconds**2
+        return torch.minimum(drive, robots["max_speed"] * self.seconds)
+
+    def speed(self) -> torch.Tensor:
+        """Of every robot [m/s], float32 [E, N]."""
+        return torch.hypot(self.nav.state["pose"][..., 2], self.nav.state["slip"])
+
+    def _approach(self, goal_cell: torch.Tensor, target: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
+        """Goals [m] on the way to `target` (of cell `goal_cell`, -1 = none), float32 [E, N, 2].
+
+        A robot that stopped at its target would stand there until the next decision. So goals lie beyond targets that
+        are near, `toward` what is to be seen from there, as far as the robot still gets. Plain DWA sees no way around
+        walls and brakes too late between them: it gets a point in sight, and off open ground one near enough to brake
+        for.
+        """
+        nav = self.nav
+        drive = self.drive(self.speed())
+        gap = (target - nav.centers()).norm(dim=-1)
+        left = (drive - gap).clamp_min(0.0) / toward.norm(dim=-1).clamp_min(1e-6)
+        beyond = target + toward * left.unsqueeze(-1)
+        if self.env.planner_config.name == "wavefront":
+            return beyond
+        threshold = self.env.simulation.robot_tensors["threshold"]
+        far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
+        near = (self.drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
+        near = nav.waypoints(goal_cell, target, near)
+        is_open = nav.leads_through_open_ground(far)
+        at_target = (far - target).norm(dim=-1) <= nav.cell_of_env().view(-1, 1)
+        far = torch.where(at_target.unsqueeze(-1), beyond, far)
+        return torch.where(is_open.unsqueeze(-1), far, near)
+
+    def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
+        each robot those that it got stuck on the way to."""
+        nav, s = self.nav, self.state
+        step = nav.state["macro_step"]
+        fresh, due = step == 0, step != s["counted"]
+        s["dwell"][fresh], s["chosen"][fresh] = 0, -1
+        due = (due | fresh).view(-1, 1, 1)
+        near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
+        beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near) & due
+        s["dwell"] += beside.any(1, keepdim=True) if nav.rows == 1 else beside
+        stuck = (nav.centers() - s["stood"]).norm(dim=-1, keepdim=True) < STUCK * nav.clearance
+        stuck = stuck & (s["chosen"] >= 0) & nav.alive().unsqueeze(-1) & due
+        s["dwell"].scatter_add_(2, s["chosen"].clamp_min(0), stuck.to(torch.int32))
+        s["stood"] = torch.where(due, nav.centers(), s["stood"])
+        s["counted"] = step.clone()
+        kept = travel.masked_fill(s["dwell"] >= DWELL, torch.inf)
+        # Nothing else left: try them all once more.
+        again = ~kept.isfinite().flatten(1).any(1)
+        s["dwell"][again] = 0
+        return torch.where(again.view(-1, 1, 1), travel, kept)
+
+    def _roam(self) -> torch.Tensor:
+        """Where robots without a target go [m]: anywhere, [E, N, 2]."""
+        m = self.nav.state["map_id"].long()
+        lower, upper = self.nav.lower[m].unsqueeze(1), self.nav.upper[m].unsqueeze(1)
+        return lower + keyed_uniform(self.env, 2) * (upper - lower)
+
+
+def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
+    """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone: no generator's
+    state, and the same for env i in any batch."""
+    state = env.simulation.tensors
+    robots = torch.arange(env.num_robots * count, device=env.device).view(1, env.num_robots, count)
+    key = torch.zeros((env.num_envs, 1, 1), dtype=torch.int64, device=env.device)
+    for part in (*(state[name].view(-1, 1, 1) for name in ("seed", "env_id", "episode", "macro_step")), robots):
+        key = _mix(key + part)
+    return ((key >> 40) & 0xFFFFFF).float() / float(1 << 24)
+
+
+def _mix(x: torch.Tensor) -> torch.Tensor:
+    """Finaliser of splitmix64 (Steele et al. 2014) on int64, which wraps as uint64 does."""
+    x = x + (0x9E3779B97F4A7C15 - (1 << 64))
+    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * (0xBF58476D1CE4E5B9 - (1 << 64))
+    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * (0x94D049BB133111EB - (1 << 64))
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
