@@ -29,6 +29,7 @@ from maexp.envs import (
     split,
 )
 from maexp.envs.scenarios import cut_last_fifth, find_scenario
+from maexp.envs.starts import STARTS, read_starts
 
 
 @dataclass
@@ -148,6 +149,7 @@ def make_env(
     scenario = cfg.scenario
     robot, radar = team_configs(cfg, num_robots)
     settings = {"device": pick_device(cfg.device), "num_threads": cfg.num_threads} | others
+    settings.setdefault("starts", choose_starts(cfg, num_robots))
     return ExplorationEnv(
         maps,
         num_envs=num_envs or cfg.num_envs,
@@ -165,6 +167,16 @@ def make_env(
         success_coverage=scenario.success_coverage,
         **settings,
     )
+
+
+def choose_starts(cfg: Any, num_robots: int) -> Any:
+    """`scenario.starts` for an env: drawn, fixed, or the poses that its file holds.
+
+    Raises:
+        ValueError: the file holds no such poses.
+    """
+    starts = cfg.scenario.starts
+    return starts if starts in STARTS else read_starts(starts, num_robots)
 
 
 def team_configs(cfg: Any, num_robots: int) -> tuple[Any, Any]:

@@ -21,7 +21,7 @@ from tensordict import TensorDictBase
 from torch.utils._pytree import tree_map_only
 from torchrl.collectors import MultiSyncCollector
 
-from maexp.agents.build import choose_device, make_env
+from maexp.agents.build import choose_device, choose_starts, make_env
 from maexp.agents.collect import Experience, TeamCollector, Teams, WorkerLost
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
@@ -43,6 +43,7 @@ class WorkerEnv:
         teams: of this worker; the number of the first keys its random numbers
         device: of the simulation and the policy
         num_threads: CPU threads of its simulation
+        starts: drawn, fixed or poses (their file may be on another machine)
     """
 
     settings: str
@@ -50,6 +51,7 @@ class WorkerEnv:
     teams: Teams
     device: torch.device
     num_threads: int
+    starts: Any
 
     def __call__(self):
         if threading.current_thread() is threading.main_thread():
@@ -61,7 +63,7 @@ class WorkerEnv:
         torch.manual_seed(int(key[0]))
         return make_env(
             cfg, maps, self.teams.num_robots, self.teams.num_envs, device=self.device,
-            first_env=self.teams.first_env, num_threads=self.num_threads,
+            first_env=self.teams.first_env, num_threads=self.num_threads, starts=self.starts,
         )  # fmt: skip
 
 
@@ -292,7 +294,8 @@ def make_workers(cfg: Any, maps: list[PointCloudMap], teams: list[Teams], policy
         groups = []
         for one in teams:
             shares = one.split(settings.workers)
-            factories = [WorkerEnv(OmegaConf.to_yaml(cfg), given, part, device, threads) for part in shares]
+            rest = device, threads, choose_starts(cfg, one.num_robots)
+            factories = [WorkerEnv(OmegaConf.to_yaml(cfg), given, part, *rest) for part in shares]
             name = "collector worker" if len(teams) == 1 else f"for teams of {one.num_robots}: collector worker"
             groups.append(start(factories, policy_there, one.num_envs * settings.steps, name))
     return WorkerExperience(groups, policy, settings.overlap)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -30,8 +29,9 @@ from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
+from maexp.envs.starts import STARTS, check_room, check_starts, fixed_starts
 from maexp.kernels import unpack_flags
-from maexp.kernels.reset import EVALUATION, START_CLEARANCE
+from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
 from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
 
@@ -59,6 +59,8 @@ class ExplorationEnv(EnvBase):
         success_coverage: coverage that ends an episode as a success.
         num_threads: CPU threads of the simulation; results do not depend on it.
         first_env: number of the first env in the random keys, where several processes share one batch of envs.
+        starts: "drawn" anew at every reset; "fixed": drawn once for each map, from (seed, map) alone, and kept; or
+            poses, as for `set_starts`.
 
     Raises:
         ValueError: a setting is out of its range (named, with its value).
@@ -87,6 +89,7 @@ class ExplorationEnv(EnvBase):
         success_coverage: float = 0.95,
         num_threads: int | None = None,
         first_env: int = 0,
+        starts: str | np.ndarray | torch.Tensor = "drawn",
     ):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
         if not maps:
@@ -135,6 +138,12 @@ class ExplorationEnv(EnvBase):
         self.simulation = build_simulation(self, seed, threads if self.device.type == "cpu" else 1)
         self.simulation.tensors["env_id"] += int(first_env)
         self._hook: tuple[Callable, int] | None = None
+        self._fixed = isinstance(starts, str) and starts == "fixed"
+        self._fix_starts()
+        if not isinstance(starts, str):
+            self.set_starts(starts)
+        elif starts not in STARTS:
+            raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
         direct = self.planner_config.name == "direct"
         self.observation_spec = observation_spec(num_envs, num_robots, self.device)
         self.action_spec = action_spec(num_envs, num_robots, direct, self.device)
@@ -270,6 +279,27 @@ class ExplorationEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.simulation.tensors["seed"].fill_(int(seed or 0) & 0x7FFFFFFF)
         self.simulation.tensors["episode"].fill_(-1)
+        self._fix_starts()
+
+    def set_starts(self, poses: np.ndarray | torch.Tensor | Sequence | None) -> None:
+        """Where the robots stand at every following reset; None: drawn anew, or "fixed" if the env was made so.
+
+        Args:
+            poses: centre x, y [m] and heading [rad] of every robot, float [N, 3] for all envs or [E, N, 3].
+
+        Raises:
+            ValueError: of another shape, not finite, in a wall or on top of another robot, on any of the env's maps.
+        """
+        given = self.simulation.tensors["starts"]
+        if poses is None:
+            given.fill_(torch.inf)
+        else:
+            given.copy_(torch.from_numpy(check_starts(self, poses)))
+
+    def _fix_starts(self) -> None:
+        if self._fixed:
+            fixed = fixed_starts(self, int(self.simulation.tensors["seed"]))
+            self.simulation.map_starts.copy_(torch.from_numpy(fixed))
 
     def set_episodes(self, ids: torch.Tensor) -> None:
         """Let env i play evaluation episode ``ids[i]`` at the next reset: map (they take turns) and starts from
@@ -284,6 +314,8 @@ class ExplorationEnv(EnvBase):
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
+        if "starts" not in state_dict:  # of before November 2026, when all were drawn
+            state_dict = state_dict | {"starts": torch.full_like(own["starts"], torch.inf)}
         wrong = [n for n in STATE if n not in state_dict or state_dict[n].shape != own[n].shape]
         if wrong:
             raise ValueError(
@@ -292,6 +324,7 @@ class ExplorationEnv(EnvBase):
             )
         for name in STATE:
             own[name].copy_(state_dict[name])
+        self._fix_starts()
 
     # Looking in
 
@@ -363,25 +396,6 @@ def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
     area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
     swept = 3 * scenario.max_speed * 0.1 * scenario.local_steps * scenario.radar_range
     return max(DEFAULT_MACRO_STEPS_MIN, math.ceil(SWEEPS * area / swept))
-
-
-def check_room(m: PointCloudMap, thresholds: list[float]) -> None:
-    """MapError unless the team fits: every start ``3 * threshold`` from the boundary and from the others."""
-    need = float(START_CLEARANCE) * max(thresholds)
-    far = cKDTree(m.boundary).query(m.free)[0] if len(m.boundary) else np.full(len(m.free), np.inf)
-    candidates = m.free[far >= need]
-    room = 0
-    tree = cKDTree(candidates) if len(candidates) else None
-    free = np.ones(len(candidates), dtype=bool)
-    while room < len(thresholds) and free.any():
-        start = int(np.argmax(free))
-        free[tree.query_ball_point(candidates[start], need)] = False
-        room += 1
-    if room < len(thresholds):
-        raise MapError(
-            f"map {m.name} has room for {room} of num_robots={len(thresholds)} robots with {need:g} m of clearance: "
-            "use fewer robots, a smaller robot.collision_threshold or a larger map"
-        )
 
 
 def _device(device) -> torch.device:

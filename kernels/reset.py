@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 
 TRIES = wp.constant(64)
 START_CLEARANCE = wp.constant(3.0)
-"""Starts keep this many collision thresholds from the boundary and from other robots."""
+"""Drawn starts keep this many collision thresholds from the boundary and from other robots."""
 EVALUATION = wp.constant(2**30)
 """Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
 
@@ -31,6 +31,22 @@ def start_is_free(
     return True
 
 
+@wp.func
+def put_robot(
+    e: int,
+    i: int,
+    at: wp.vec2,
+    theta: float,
+    robots: Robots,
+    pose: wp.array2d(dtype=wp.vec4),
+    center: wp.array2d(dtype=wp.vec3),
+):
+    """Robot i stands with its centre at ``at``."""
+    back = robots.center_offset[e, i]
+    pose[e, i] = wp.vec4(at[0] - back * wp.cos(theta), at[1] - back * wp.sin(theta), 0.0, theta)
+    center[e, i] = wp.vec3(at[0], at[1], 0.0)
+
+
 @wp.kernel
 def _place_team(
     # Map:
@@ -43,13 +59,16 @@ def _place_team(
     mask: wp.array(dtype=wp.int32),
     env_id: wp.array(dtype=wp.int32),
     episode: wp.array(dtype=wp.int32),
+    starts: wp.array2d(dtype=wp.vec3),  # [env, robot] x, y [m], heading [rad]; inf: those of the map
+    map_starts: wp.array2d(dtype=wp.vec3),  # [map, robot] the same; inf: drawn
     # State out:
     map_id: wp.array(dtype=wp.int32),
     pose: wp.array2d(dtype=wp.vec4),
     center: wp.array2d(dtype=wp.vec3),
     error: wp.array(dtype=wp.int32),
 ):
-    """Draw the map of a new episode and a start for every robot: clear of walls and of the others, any heading."""
+    """Draw the map of a new episode and, where none is given, a start for every robot: clear of walls and of the
+    others, any heading."""
     e = wp.tid()
     if mask[e] == 0:
         return
@@ -63,6 +82,14 @@ def _place_team(
     map_id[e] = m
     first = maps.free_begin[m]
     count = maps.free_begin[m + 1] - first
+    given = wp.isfinite(starts[e, 0])
+    if given or wp.isfinite(map_starts[m, 0]):
+        for i in range(pose.shape[1]):
+            start = map_starts[m, i]
+            if given:
+                start = starts[e, i]
+            put_robot(e, i, wp.vec2(start[0], start[1]), start[2], robots, pose, center)
+        return
     for i in range(pose.shape[1]):
         point = int(-1)
         for _try in range(TRIES):
@@ -80,10 +107,7 @@ def _place_team(
         if point < 0:
             wp.atomic_or(error, e, 2)
             point = first
-        p = point_xy(maps.free[point])
-        back = robots.center_offset[e, i]
-        pose[e, i] = wp.vec4(p[0] - back * wp.cos(theta), p[1] - back * wp.sin(theta), 0.0, theta)
-        center[e, i] = wp.vec3(p[0], p[1], 0.0)
+        put_robot(e, i, point_xy(maps.free[point]), theta, robots, pose, center)
 
 
 @wp.kernel

@@ -22,6 +22,7 @@ STATE = {
     "map_id": ("E", torch.int32, wp.int32),
     "env_id": ("E", torch.int32, wp.int32),
     "episode": ("E", torch.int32, wp.int32),
+    "starts": ("E N 3", torch.float32, wp.vec3),  # x, y, heading of following resets; inf: those of the map
     "active": ("E", torch.int32, wp.int32),
     "local_step": ("E", torch.int32, wp.int32),
     "macro_step": ("E", torch.int32, wp.int32),

@@ -221,7 +221,8 @@ class Shard:
         )  # fmt: skip
         launch(
             reset._place_team, envs,
-            [maps, self.sim.num_maps, self.robots, s.seed, s.mask, s.env_id, s.episode],
+            [maps, self.sim.num_maps, self.robots, s.seed, s.mask, s.env_id, s.episode, s.starts,
+             self.sim.map_starts_view],
             [s.map_id, s.pose, s.center, s.error],
         )  # fmt: skip
         launch(
@@ -323,6 +324,9 @@ class Simulation:
         self.nav_grids, self.nav_cells = nav or (None, 0)
         self.team_bits = int(settings.draw_known and not settings.comm_limited)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
+        self.tensors["starts"].fill_(torch.inf)
+        self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, device=self.device)
+        self.map_starts_view = wp.from_torch(self.map_starts, dtype=wp.vec3)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
         self.tensors["seed"].fill_(seed & 0x7FFFFFFF)
         self.tensors["episode"].fill_(-1)

@@ -8,9 +8,11 @@ from hydra.errors import HydraException, OverrideParseException
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.schema import schema
+from maexp.envs.starts import STARTS
 
 PATHS = (
-    "scenario.path", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir", "hydra.sweep.dir"
+    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir",
+    "hydra.sweep.dir",
 )  # fmt: skip
 LISTS = {
     "train": ("num_robots",),
@@ -66,6 +68,8 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
     if name in PATHS and value not in ("", "null") and not _is_quoted(value):
         if multirun and "," in value and not Path(value).exists():
             return f"{name}={value}"
+        if name == "scenario.starts" and value not in STARTS:  # kept with the run, as the next
+            value = str(Path(value).expanduser().absolute())
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
             value = ",".join(str(Path(one).expanduser().absolute()) for one in split_paths(value))
         return f"{name}={quote(value)}"

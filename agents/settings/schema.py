@@ -87,6 +87,7 @@ class ScenarioSettings:
     held_out_count: int | None = None  # instead: so many, from the first held-out one on, beyond the table's count too
     local_steps: int | None = None  # control steps in one decision
     macro_steps: int | None = None  # decisions in one episode
+    starts: str = "drawn"  # anew at every reset; fixed: once for each map; or a .csv or .npy file of x, y, heading
     success_coverage: float = 0.95
     collision: str = "centre"  # or footprint
     importing: ImportSettings = field(default_factory=ImportSettings)
