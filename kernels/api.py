@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from maexp.kernels import merge, visibility
+from maexp.kernels.launches import lanes_on
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
 
@@ -127,7 +128,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     views = zeros(1, 1, count)
     listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
     launch = wp.from_torch(free, dtype=wp.vec3).device
-    lanes = 1 if launch.is_cpu else 4096
+    lanes = lanes_on(launch, 4096)
     map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
     wp.launch(
         visibility._collect_occluders, dim=(1, 1), device=launch,

@@ -19,6 +19,8 @@ from functools import partial
 import torch
 import warp as wp
 
+from maexp.kernels.launches import lanes_on
+
 STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
 DIAGONAL = 14  # weight of a step to a diagonal neighbour
 UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them still fit in int32
@@ -241,7 +243,7 @@ class DistanceSearch:
             width, height: int32 [grids], cells of each grid along x and y.
         """
         items = self.distance.shape[0]
-        lanes = 1 if self.distance.device.is_cpu else 256
+        lanes = lanes_on(self.distance.device, 256)
         launch(_clear_distance, (items, lanes), [self.stop, lanes], [self.distance])
         launch(
             _flood_distance, items,

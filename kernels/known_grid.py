@@ -9,6 +9,7 @@ import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
+from maexp.kernels.launches import lanes_on
 from maexp.kernels.planner import is_known
 from maexp.kernels.types import Maps
 
@@ -179,11 +180,6 @@ def _close_cells(
                             passable[row, v * w + u] = value
 
 
-def lanes_on(device: wp.Device) -> int:
-    """Threads that share a row of cells: one on the CPU, where a thread costs more than a cell."""
-    return 1 if device.is_cpu else 256
-
-
 class KnownGrids:
     """Grids of a run of envs, painted from the flags of seen points.
 
@@ -212,7 +208,7 @@ class KnownGrids:
         self.maps, self.grids, self.map_id = maps, grids, map_id
         self.free_flags, self.boundary_flags = free_flags, boundary_flags
         self.rows_per_env = rows_per_env
-        self.lanes = lanes_on(map_id.device)
+        self.lanes = lanes_on(map_id.device, 256)
         rows = map_id.shape[0] * rows_per_env
         self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=map_id.device)
         self.grid_of_row = wp.zeros(rows, dtype=wp.int32, device=map_id.device)

@@ -11,6 +11,15 @@ KNOWN = wp.config.version.startswith("1.19.")
 """Whether this is a Warp whose way of calling CPU kernels (nowhere documented) is the one below."""
 
 
+CPU_LANES = 1
+"""Threads that share the work of a robot or a row on the CPU, where a thread costs more than an item."""
+
+
+def lanes_on(device: wp.Device, most: int) -> int:
+    """Threads that share the work of a robot or a row."""
+    return CPU_LANES if device.is_cpu else most
+
+
 @cache
 def arguments_struct(types: tuple[type, ...]) -> type[ctypes.Structure]:
     """The C struct in which a CPU kernel takes arguments of these types."""

@@ -17,7 +17,7 @@ import warp as wp
 
 from maexp.kernels import collision, dynamics, merge, observe, planner, reset, reward, visibility
 from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.launches import RecordedLaunch
+from maexp.kernels.launches import RecordedLaunch, lanes_on
 from maexp.kernels.state import SCRATCH, STATE, allocate, memory_per_env, robots_struct, warp_views
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import Wavefront
@@ -57,7 +57,7 @@ class Shard:
         self.view = warp_views(sim.tensors, first, last)
         self.robots = robots_struct(sim.robot_tensors, first, last)
         self.shape = (last - first, sim.sizes["N"])
-        self.lanes = 1 if self.device.is_cpu else 32
+        self.lanes = lanes_on(self.device, 32)
 
     @cached_property
     def wavefront(self) -> Wavefront | None:
@@ -266,7 +266,7 @@ class Shard:
         free, boundary = s.seen_free, s.seen_boundary
         if self.sim.settings.draw_known and self.sim.settings.comm_limited:
             free, boundary = s.known_free, s.known_boundary
-        lanes = 1 if self.device.is_cpu else 1024
+        lanes = lanes_on(self.device, 1024)
         launch(
             observe._draw_points, dim=(self.shape[0], lanes),
             inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, lanes,
