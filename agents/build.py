@@ -1,6 +1,6 @@
 """From settings to maps, environments and learners."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -11,9 +11,9 @@ from omegaconf import OmegaConf
 from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
 from maexp.agents.errors import UserError
-from maexp.agents.model import PRESETS
-from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
+from maexp.agents.settings.resolved import algorithm_settings, model_settings
 from maexp.agents.settings.schema import given
 from maexp.agents.updaters import Updater
 from maexp.envs import (
@@ -26,9 +26,8 @@ from maexp.envs import (
     RewardConfig,
     RobotConfig,
     make_map,
-    split,
 )
-from maexp.envs.scenarios import cut_last_fifth, find_scenario
+from maexp.envs.scenarios import find_scenario
 from maexp.envs.starts import STARTS, read_starts
 
 
@@ -98,22 +97,6 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     return MapSuite(build(indices) if train else [], build(held_out), unseen, lambda: build(validation or indices))
 
 
-def map_indices(scenario: Any) -> tuple[list[int], list[int], list[int]]:
-    """Indices of the maps that a scenario's settings train on, validate on (none: those trained on) and hold out."""
-    trained_on, held_out = split(scenario.name)
-    if scenario.held_out is not None and scenario.held_out_count is not None:
-        raise UserError("scenario.held_out and scenario.held_out_count were both given: give one of them.")
-    if scenario.held_out_count is not None:
-        check_counts(scenario, "held_out_count", prefix="scenario.")
-        held_out = range(held_out.start, held_out.start + scenario.held_out_count)
-    others = _indices("scenario.held_out", scenario.held_out, held_out)
-    none = OmegaConf.is_list(scenario.validation) and not len(scenario.validation)
-    trained_on, choosing = (trained_on, []) if none else cut_last_fifth(trained_on)
-    indices = _indices("scenario.maps", scenario.maps, trained_on)
-    unused = [index for index in choosing if index not in indices and index not in others]
-    return indices, [] if none else _indices("scenario.validation", scenario.validation, unused), others
-
-
 def import_files(scenario: Any) -> list[PointCloudMap]:
     """The maps of scenario=pointcloud: `scenario.path` names a file, or several with commas between them."""
     from maexp.envs.importing import import_map
@@ -125,17 +108,6 @@ def import_files(scenario: Any) -> list[PointCloudMap]:
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
     return maps
-
-
-def _indices(name: str, value: Any, default: Iterable[int]) -> list[int]:
-    if value is None:
-        return list(default)
-    value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
-    indices = [value] if isinstance(value, int) else value
-    good = isinstance(indices, list) and indices and all(type(one) is int and one >= 0 for one in indices)
-    if not good:
-        raise UserError(f"{name}={value} must be a list of whole numbers, 0 or more, as [0,1,2].")
-    return indices
 
 
 def make_env(
@@ -213,20 +185,9 @@ class Learner:
     updater: Updater
 
 
-def model_settings(cfg: Any):
-    """The ModelConfig of the settings: a preset with some values replaced."""
-    from dataclasses import replace
-
-    preset = cfg.model.preset or "small"
-    if preset not in PRESETS:
-        raise UserError(f"model.preset={preset} is unknown: choose one of {', '.join(PRESETS)}.")
-    return replace(PRESETS[preset], **given(cfg.model, "preset"))
-
-
 def make_learner(cfg: Any, env: ExplorationEnv) -> Learner:
     """Policy, critic and updater of the settings, for the specs of `env`."""
     row = find_algorithm(cfg.algorithm.name)
-    settings = row.configure(cfg.algorithm.preset or "default", **given(cfg.algorithm, "name", "preset"))
-    model = model_settings(cfg)
+    settings, model = algorithm_settings(cfg), model_settings(cfg)
     policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
     return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))

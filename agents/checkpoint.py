@@ -75,8 +75,16 @@ def _is_ours(state: Any) -> bool:
     """Whether a file holds the kinds of values that `maexp train` puts there."""
     if not isinstance(state, dict) or any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
         return False
-    words, weights = state["overrides"], state["policy"].values()
-    return all(isinstance(word, str) for word in words) and all(torch.is_tensor(weight) for weight in weights)
+    words, weights = [*state["overrides"], *state.get("followers", ())], state["policy"].values()
+    if not all(isinstance(word, str) for word in words) or not all(torch.is_tensor(weight) for weight in weights):
+        return False
+    return "settings" not in state or _has_names(state["settings"])
+
+
+def _has_names(settings: Any) -> bool:
+    """Whether settings of a run tell its scenario and planner."""
+    groups = [settings.get(name) for name in ("scenario", "planner")] if isinstance(settings, dict) else [None]
+    return all(isinstance(group, dict) and isinstance(group.get("name"), str) for group in groups)
 
 
 def find_checkpoint(place: str | Path) -> tuple[Path, dict]:

@@ -114,7 +114,9 @@ def overview() -> str:
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
     from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
+    from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
+    from maexp.agents.settings.resolved import without_hydra
 
     verb = VERBS[name]
     flags, rest = split_flags(words)
@@ -132,34 +134,29 @@ def run_verb(name: str, words: list[str]) -> int:
         from maexp.agents.commands.sweep import run_sweep
 
         return run_sweep(name, overrides)
-    prepared = home.prepare(overrides)
-    cfg = _compose(name, prepared)
+    recipe = home.prepare(overrides)
+    composed = compose_recipe(name, recipe)
+    cfg = without_hydra(composed)
     if {"-c", "--cfg"} & set(flags):
-        from omegaconf import OmegaConf
-
-        print(OmegaConf.to_yaml(_settings(cfg)), end="")
+        print_settings(cfg)
         return 0
-    home.check(_settings(cfg))
+    home.check(cfg)
     chosen = find_override(overrides, "hydra.run.dir") is not None
-    folder = home.folder(overrides, partial(claim_folder, cfg.hydra.run.dir, chosen))
+    folder = home.folder(overrides, partial(claim_folder, composed.hydra.run.dir, chosen))
     try:
-        return home.run(_settings(cfg), folder, without(prepared, "hydra", "resume", "checkpoint"))
+        return home.run(cfg, folder, without(recipe.words, "hydra", "resume", "checkpoint"))
     except UserError:
         remove_if_empty(folder)
         raise
 
 
-def _compose(name: str, overrides: list[str]) -> Any:
-    from maexp.agents.settings.compose import compose_config
+def print_settings(cfg: Any) -> None:
+    """All settings with the values that they come to, as --cfg job asks for."""
+    from maexp.agents.errors import blame_input
+    from maexp.agents.settings.resolved import resolve, to_yaml
 
-    return compose_config(name, overrides)
-
-
-def _settings(cfg: Any) -> Any:
-    """The settings without Hydra's own."""
-    from omegaconf import OmegaConf
-
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    with blame_input():
+        print(to_yaml(resolve(cfg)), end="")
 
 
 def _check_flags(name: str, flags: list[str]) -> None:

@@ -1,11 +1,11 @@
 """What a run found: summary.json and results.json, and the table on the terminal."""
 
 import subprocess
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -27,11 +27,6 @@ COLUMNS = {
 }
 
 
-def plain(cfg: Any) -> dict:
-    """Settings as plain containers."""
-    return OmegaConf.to_container(cfg, resolve=True)
-
-
 def describe_run(cfg: Any, maps: list, seconds: float) -> dict:
     """What was run: scenario, maps, seed, commit, versions."""
     return {
@@ -46,6 +41,7 @@ def describe_run(cfg: Any, maps: list, seconds: float) -> dict:
     }
 
 
+@cache
 def find_commit() -> str | None:
     """The commit of the source folder, None for an installed package."""
     here = Path(__file__).resolve().parent

@@ -7,23 +7,24 @@ import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Any
-
-from omegaconf import OmegaConf
 
 from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
+from maexp.agents.files import write_text
 from maexp.agents.logs import MetricsLog
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
-from maexp.agents.results import plain
+from maexp.agents.results import find_commit
 from maexp.agents.settings.checks import check_counts, team_sizes
-from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.compose import compose_config, settings_of
+from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
 
 BACKENDS = ("single", "processes", "ray")
 
@@ -34,7 +35,7 @@ def train(run: "TrainingRun") -> None:
     On the CPU a run that is stopped and resumed gives bit for bit what an uninterrupted one gives.
     """
     cfg, learner, experience = run.cfg, run.learner, run.experience
-    log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, frames=run.frames, config=plain(cfg))
+    log = MetricsLog(run.folder, cfg.logger, kept=run.iteration, frames=run.frames, config=run.settings)
     with (
         closing(log),
         ending(experience),
@@ -97,6 +98,16 @@ class TrainingRun:
                 run.restore(saved)
         return run
 
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """All settings with the values that they come to."""
+        return resolve(self.cfg, self.suite.train)
+
+    @cached_property
+    def followers(self) -> list[str]:
+        """The settings that no word had set and that the scenario supplied."""
+        return find_followers(compose_config("train", self.overrides))
+
     @property
     def sizes(self) -> list[int]:
         """The team sizes, one or several."""
@@ -119,6 +130,9 @@ class TrainingRun:
         """Write a checkpoint of this moment."""
         state = {
             "overrides": self.overrides,
+            "settings": self.settings,
+            "followers": self.followers,
+            "commit": find_commit(),
             "iteration": self.iteration,
             "best": self.best,
             "average": self.average,
@@ -261,7 +275,7 @@ def check_action(saved: dict, cfg: Any) -> None:
     Raises:
         UserError: one of the two planners is `direct`, the other not.
     """
-    trained = compose_config("train", saved["overrides"]).planner.name
+    trained = settings_of(saved)["planner.name"]
     if (trained == "direct") != (cfg.planner.name == "direct"):
         raise UserError(
             f"The checkpoint was trained with planner={trained} and planner={cfg.planner.name} takes another action: "
@@ -326,7 +340,8 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def write_config(cfg: Any, folder: Path, verb: str, overrides: list[str]) -> None:
-    """config.yaml: the command as a comment, then all settings that it came to."""
+def write_config(settings: dict, folder: Path, verb: str, overrides: list[str]) -> None:
+    """config.yaml: the command and the commit as comments, then all settings with their values."""
     command = f"# maexp {verb} {' '.join(overrides)}".rstrip()
-    (folder / "config.yaml").write_text(f"{command}\n{OmegaConf.to_yaml(cfg)}")
+    commit = f"# commit {find_commit()}\n" if find_commit() else ""
+    write_text(folder / "config.yaml", f"{command}\n{commit}{to_yaml(settings)}")

@@ -39,7 +39,7 @@ CELLS = [Cell("maze_small", policy, seed) for seed in (0, 1) for policy in ("vor
 
 
 def settings(*words: str):
-    return compose_settings("benchmark", prepare(make_overrides("benchmark", list(words))))
+    return compose_settings("benchmark", prepare(make_overrides("benchmark", list(words))).words)
 
 
 @pytest.fixture(scope="module")

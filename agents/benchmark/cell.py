@@ -78,7 +78,7 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
     if cell.trains:
         saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
         run = TrainingRun.build(settings, folder, words, saved)
-        write_config(settings, folder, "train", words)
+        write_config(run.settings, folder, "train", words)
         train(run)
         if run.stopped:
             return False

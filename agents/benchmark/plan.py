@@ -16,10 +16,10 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies import POLICIES
-from maexp.agents.results import plain
 from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
+from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 PLAN = "benchmark.json"
@@ -136,7 +136,7 @@ def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
     """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
     words = [f"scenario={cell.scenario}", f"seed={cell.seed}"]
     words += [f"algorithm={cell.policy}"] if cell.trains else []
-    usual, ours = (_flatten({name: node[name] for name in SECTIONS}) for node in (_train_defaults(), plain(cfg)))
+    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_train_defaults(), plain(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
     changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
     if not cell.trains:
@@ -181,8 +181,7 @@ def cell_config(cfg: Any, cell: Cell) -> tuple[Any, list[str]]:
 
 def compose_settings(verb: str, overrides: list[str]) -> Any:
     """The settings of a verb without Hydra's own."""
-    composed = compose_config(verb, overrides)
-    return OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    return without_hydra(compose_config(verb, overrides))
 
 
 def render(value: Any) -> str:
@@ -198,16 +197,6 @@ def render(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ",".join(render(one) for one in value) + "]"
     return quote(str(value))
-
-
-def _flatten(node: dict, prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in node.items():
-        if isinstance(value, dict) and value:
-            flat |= _flatten(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
 
 
 # The folder
@@ -242,7 +231,7 @@ def read_plan(place: str | Path) -> dict:
 def shared_settings(cfg: Any) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
-    return {name: value for name, value in _flatten(plain(cfg) | whole).items() if not _is_free(name)}
+    return {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
 
 
 def _is_free(name: str) -> bool:

@@ -9,13 +9,14 @@ from typing import Any
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.overrides import move_sweeps
+from maexp.agents.settings.runs import Recipe
 
 ONE_VALUE = ("action", "seconds", "baseline", "largest", "device", "hydra")
 
 
-def prepare(overrides: list[str]) -> list[str]:
+def prepare(overrides: list[str]) -> Recipe:
     """Settings given several values go to `sweep`; their first value stands in their place."""
-    return move_sweeps(overrides, ONE_VALUE)
+    return Recipe(move_sweeps(overrides, ONE_VALUE))
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:

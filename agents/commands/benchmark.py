@@ -28,6 +28,8 @@ from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress, duration
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.resolved import resolve
+from maexp.agents.settings.runs import Recipe
 from maexp.agents.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130
@@ -37,15 +39,15 @@ ALSO = {"scenario": "scenarios", "algorithm": "algorithms", "policy": "policies"
 """Names that the other verbs have for one value."""
 
 
-def prepare(overrides: list[str]) -> list[str]:
+def prepare(overrides: list[str]) -> Recipe:
     """For resume=FOLDER: that benchmark's overrides, then the new ones."""
     overrides = [_rename(word) for word in overrides]
     place = find_override(overrides, "resume")
     if place is None:
-        return overrides
+        return Recipe(overrides)
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a benchmark goes on in its own folder.")
-    return read_plan(place)["overrides"] + overrides
+    return Recipe(read_plan(place)["overrides"] + overrides)
 
 
 def _rename(word: str) -> str:
@@ -102,7 +104,7 @@ def run_locked(cfg: Any, where: Path, overrides: list[str]) -> int:
     confirm(cfg, expected)
     kept = without(overrides, "workers", "confirm", "report", "estimate")
     write_plan(where, cfg, kept)
-    write_config(cfg, where, "benchmark", overrides)
+    write_config(resolve(cfg), where, "benchmark", overrides)
     pool = WorkerPool(where, kept, suites, workers, gpus)
     print(f"everything goes to {short(where)}", flush=True)
     with stop_on_signals() as stop, BenchmarkProgress(where, cells, todo, expected) as progress:

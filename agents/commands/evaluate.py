@@ -19,15 +19,16 @@ from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, result_names, write_results
 from maexp.agents.settings.checks import check_counts, check_distinct, check_goals, team_sizes
-from maexp.agents.settings.overrides import find_override, without
-from maexp.agents.settings.schema import schema
+from maexp.agents.settings.overrides import find_override
+from maexp.agents.settings.resolved import resolve
+from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.train import check_action, load_matching, write_config
 
 PICTURES = 4
 
 
-def prepare(overrides: list[str]) -> list[str]:
-    """For checkpoint=RUN: the run's overrides as far as they matter here, then the new ones."""
+def prepare(overrides: list[str]) -> Recipe:
+    """For checkpoint=RUN: the run's settings as far as they matter here, then the new ones."""
     place = find_override(overrides, "checkpoint")
     policy = find_override(overrides, "policy")
     if place is not None and policy is not None:
@@ -35,17 +36,8 @@ def prepare(overrides: list[str]) -> list[str]:
     if place is None and policy is None:
         raise UserError("Nothing to evaluate: give checkpoint=RUN or policy=nearest_frontier.")
     if place is None:
-        return overrides
-    return settings_of_run(place, overrides, "evaluate")
-
-
-def settings_of_run(place: str, overrides: list[str], verb: str, *drop: str) -> list[str]:
-    """The overrides of a run of maexp train that `verb` has settings for, less those in `drop`, then `overrides`."""
-    kept = find_checkpoint(place)[1]["overrides"]
-    names = [word.partition("=")[0].lstrip("+~") for word in kept]
-    foreign = [name for name in names if name.split(".")[0] not in schema(verb).__dataclass_fields__]
-    chosen = [word.partition("=")[0] for word in overrides if "." not in word.partition("=")[0]]
-    return without(kept, *foreign, *drop, *chosen) + overrides
+        return Recipe(overrides)
+    return continue_run(*find_checkpoint(place), overrides, "evaluate")
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
@@ -81,7 +73,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         count = min(cfg.num_envs, cfg.episodes)
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0][0])}
-    write_config(cfg, where, "evaluate", overrides)
+    write_config(resolve(cfg, maps), where, "evaluate", overrides)
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
     report(cfg, results, suite, where / "results.json")
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")

@@ -11,6 +11,7 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
+from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.schema import given
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
@@ -22,8 +23,8 @@ UNUSABLE = 1
 FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy"
 
 
-def prepare(overrides: list[str]) -> list[str]:
-    return overrides
+def prepare(overrides: list[str]) -> Recipe:
+    return Recipe(overrides)
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:

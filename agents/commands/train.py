@@ -11,30 +11,31 @@ from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.errors import UserError
 from maexp.agents.logs import check_logger
 from maexp.agents.settings.checks import check_counts, team_sizes
-from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.overrides import find_override
+from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
 
-def prepare(overrides: list[str]) -> list[str]:
-    """For resume=RUN: that run's overrides, then the new ones."""
+def prepare(overrides: list[str]) -> Recipe:
+    """For resume=RUN: that run's settings, then the new ones."""
     place = find_override(overrides, "resume")
     if place is None:
-        return overrides
+        return Recipe(overrides)
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
-    return without(_resumable(place)["overrides"], "hydra") + overrides
+    return continue_run(*_resumable(place), overrides, "train")
 
 
-def _resumable(place: str) -> dict:
-    """The state to go on with; UserError where something a run needs is missing."""
+def _resumable(place: str) -> tuple[Path, dict]:
+    """The checkpoint and the state to go on with; UserError where something a run needs is missing."""
     path, saved = find_checkpoint(place)
     missing = [name for name in NEEDED if name not in saved]
     if missing:
         raise UserError(f"{path} holds no {missing[0]}: no run can go on from it, maexp evaluate may play its policy.")
-    return saved
+    return path, saved
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
@@ -60,9 +61,9 @@ def check(cfg: Any) -> None:
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
-    saved = _resumable(cfg.resume) if cfg.resume else None
+    saved = _resumable(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
-    write_config(cfg, where, "train", overrides)
+    write_config(training.settings, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
           f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}", flush=True)  # fmt: skip
     train(training)

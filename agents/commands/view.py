@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.build import import_files, load_maps, make_env
-from maexp.agents.commands.evaluate import bind, load_policy, settings_of_run
+from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.commands.evaluate import bind, load_policy
 from maexp.agents.commands.run_folder import remove_if_empty, short
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
+from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import given
 from maexp.envs import PointCloudMap, import_map, make_map
 from maexp.envs.render import percent
@@ -29,15 +31,17 @@ ENDINGS = (".png", ".html")
 MOST_EPISODES = 2**31  # their numbers are 32-bit integers
 
 
-def prepare(overrides: list[str]) -> list[str]:
+def prepare(overrides: list[str]) -> Recipe:
     """The place to view by what it is: a scenario's name, or a run, whose own settings come first."""
     place = find_override(overrides, "place")
     if place in SCENARIOS and not Path(place).exists():
-        return [f"scenario={place}", *without(overrides, "place")]
+        return Recipe([f"scenario={place}", *without(overrides, "place")])
     if place is not None and is_run(Path(place)):
         overrides = [*without(overrides, "place"), f"checkpoint={quote(place)}"]
     run = find_override(overrides, "checkpoint")
-    return overrides if run is None else settings_of_run(run, without(overrides, "place"), "view", "num_envs")
+    if run is None:
+        return Recipe(overrides)
+    return continue_run(*find_checkpoint(run), without(overrides, "place"), "view", "num_envs")
 
 
 def is_run(place: Path) -> bool:

@@ -3,6 +3,7 @@
 import difflib
 import re
 from importlib import resources
+from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -12,6 +13,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_seed
+from maexp.agents.settings.legacy import old_defaults
+from maexp.agents.settings.overrides import without
+from maexp.agents.settings.resolved import flatten, plain
+from maexp.agents.settings.runs import Recipe
 
 KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
 
@@ -33,6 +38,32 @@ def groups() -> list[str]:
     """Names of the groups of `conf/`."""
     folder = resources.files("maexp.conf")
     return sorted(one.name for one in folder.iterdir() if one.is_dir() and not one.name.startswith("_"))
+
+
+def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
+    """The composed settings of a verb, with the values of a run in their places.
+
+    Raises:
+        UserError: the same as of `compose_config`; a value of the run that this version does not know.
+    """
+    cfg = compose_config(verb, [*recipe.defaults, *recipe.words])
+    for name, value in recipe.values.items():
+        try:
+            OmegaConf.update(cfg, name, value)
+        except OmegaConfBaseException as error:
+            raise UserError(
+                f"{recipe.source} holds {name}={value}, which this version of MAexp does not know: "
+                "use the version that wrote it, as its config.yaml names it."
+            ) from error
+    return cfg
+
+
+def settings_of(saved: dict) -> dict[str, Any]:
+    """The values of a run of `maexp train` by their full names, however old its checkpoint is."""
+    if "settings" in saved:
+        return flatten(saved["settings"])
+    words = without(saved["overrides"], "hydra")
+    return flatten(plain(compose_config("train", [*old_defaults(words), *words])))
 
 
 def compose_config(verb: str, overrides: list[str]) -> DictConfig:

@@ -1,0 +1,153 @@
+"""The values that settings come to: what is null in the composed settings is filled in from where it comes."""
+
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+
+from maexp.agents.algorithms import Settings, find_algorithm
+from maexp.agents.errors import UserError
+from maexp.agents.model import PRESETS, ModelConfig
+from maexp.agents.settings.indices import map_indices
+from maexp.agents.settings.schema import given
+from maexp.envs.config import (
+    CommConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    complete_planner,
+    complete_radar,
+    complete_robot,
+)
+from maexp.envs.environment import default_macro_steps
+from maexp.envs.importing.options import ImportOptions
+from maexp.envs.scenarios import Scenario, find_scenario
+
+FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig}
+"""Groups with settings that the scenario supplies where they are null."""
+PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
+
+
+def plain(cfg: Any) -> dict:
+    """Settings as plain containers, without Hydra's own."""
+    return OmegaConf.to_container(without_hydra(cfg), resolve=True)
+
+
+def without_hydra(cfg: Any) -> Any:
+    """The settings without Hydra's own."""
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+
+
+def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
+    """All settings with the values that they come to; what does not apply is absent, so that nothing is null.
+
+    Args:
+        cfg: the settings of a verb
+        maps: those that are played; without them, what scenario=pointcloud takes from its maps is absent
+
+    Raises:
+        ValueError: a value out of its range.
+    """
+    settings = plain(cfg)
+    if "scenario" in settings and "scenarios" not in settings:  # a benchmark has many; each cell writes its own
+        row = find_scenario(maps[0].scenario if maps else cfg.scenario.name)
+        known = maps is not None or row.build is not None
+        settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
+        if known:
+            settings["robot"] |= _resolve_robot(cfg, row)
+            settings["radar"] = asdict(complete_radar(RadarConfig(**given(cfg.radar)), row))
+            settings["planner"] = _resolve_planner(cfg, row)
+        settings["reward"] = asdict(RewardConfig(**given(cfg.reward)))
+        settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
+        settings["comm"] = asdict(CommConfig(**given(cfg.comm)))
+        settings["algorithm"] = {"name": cfg.algorithm.name} | asdict(algorithm_settings(cfg))
+        settings["model"] = asdict(model_settings(cfg))
+    return _without_null(settings)
+
+
+def _resolve_scenario(scenario: Any, row: Scenario, maps: list | None) -> dict[str, Any]:
+    settings = {"local_steps": scenario.local_steps or row.local_steps}
+    fallback = default_macro_steps(maps, row) if maps and not row.macro_steps else row.macro_steps
+    settings["macro_steps"] = scenario.macro_steps or fallback
+    if find_scenario(scenario.name).build is None:
+        return settings | {"importing": asdict(ImportOptions(**given(scenario.importing)))}
+    settings["maps"], settings["validation"], held_out = map_indices(scenario)
+    settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
+    return settings | {"importing": None}
+
+
+def plain_value(value: Any) -> Any:
+    """A list of OmegaConf as a list."""
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+
+
+def _resolve_robot(cfg: Any, row: Scenario) -> dict[str, Any]:
+    """The robot, and each entry of `robot.team` with all its values."""
+    robot, radar = given(cfg.robot, "team"), given(cfg.radar)
+    team = []
+    for entry in plain_value(cfg.robot.team) or []:
+        own = {name: value for name, value in entry.items() if name != "radar"}
+        seen = complete_radar(RadarConfig(**(radar | entry.get("radar", {}))), row)
+        team.append(asdict(complete_robot(RobotConfig(**(robot | own)), row)) | {"radar": asdict(seen)})
+    return asdict(complete_robot(RobotConfig(**robot), row)) | {"team": team or None}
+
+
+def _resolve_planner(cfg: Any, row: Scenario) -> dict[str, Any]:
+    planner = asdict(complete_planner(PlannerConfig(**given(cfg.planner)), row))
+    return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(cfg.planner.name, ())}
+
+
+def algorithm_settings(cfg: Any) -> Settings:
+    """The settings of the algorithm: those of its preset with some values replaced."""
+    row = find_algorithm(cfg.algorithm.name)
+    return row.configure(cfg.algorithm.preset or "default", **given(cfg.algorithm, "name", "preset"))
+
+
+def model_settings(cfg: Any) -> ModelConfig:
+    """The sizes of the networks: those of a preset with some values replaced."""
+    preset = cfg.model.preset or "small"
+    if preset not in PRESETS:
+        raise UserError(f"model.preset={preset} is unknown: choose one of {', '.join(PRESETS)}.")
+    return replace(PRESETS[preset], **given(cfg.model, "preset"))
+
+
+def find_followers(cfg: Any) -> list[str]:
+    """Names of the settings that are null and follow the scenario, as radar.range."""
+    names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
+    for group, kind in FOLLOWERS.items():
+        names += [f"{group}.{one.name}" for one in fields(kind) if one.default is None]
+    found = [name for name in names if OmegaConf.select(cfg, name) is None]
+    return found + ["robot.team"] * bool(cfg.robot.team)
+
+
+def _without_null(node: dict) -> dict:
+    clean = {name: _without_null(value) if isinstance(value, dict) else value for name, value in node.items()}
+    return {name: value for name, value in clean.items() if value is not None and value != {}}
+
+
+def flatten(node: dict, prefix: str = "") -> dict[str, Any]:
+    """{"radar": {"range": 8}} as {"radar.range": 8}."""
+    flat = {}
+    for name, value in node.items():
+        if isinstance(value, dict) and value:
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists on one line."""
+
+
+_Dumper.add_representer(
+    list, lambda dumper, value: dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=True)
+)
+
+
+def to_yaml(settings: dict) -> str:
+    """Resolved settings as the text of a config.yaml."""
+    return yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)

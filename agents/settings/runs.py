@@ -1,0 +1,107 @@
+"""What the settings of a verb are composed from: the values of a run, and the new words of the command line.
+
+- A value of the run stays unless the new words set it.
+- A group chosen anew (planner=wavefront where the run had dwa) is taken as a whole, as it is today.
+- Values that the scenario had supplied follow a new scenario; those that the run's own words had set stay.
+"""
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from maexp.agents.settings.legacy import old_defaults
+from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.resolved import flatten
+from maexp.agents.settings.schema import schema
+
+GROUPS = ("scenario", "robot", "radar", "planner", "reward", "observation", "comm", "algorithm", "model")
+SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
+BODY = ("robot.length", "robot.width")
+HELD_OUT = ("scenario.held_out", "scenario.held_out_count")  # one of the two
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What settings are composed from.
+
+    Attributes:
+        words: overrides in the order of the command line, those of a run first
+        defaults: overrides in front of these: defaults as they were when the run was started
+        values: values of that run by their full names; they replace what the words come to
+        source: the checkpoint they come from, for messages
+    """
+
+    words: list[str]
+    defaults: list[str] = field(default_factory=list)
+    values: dict[str, Any] = field(default_factory=dict)
+    source: str = ""
+
+
+def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out: str) -> Recipe:
+    """The settings of a run of `maexp train` as far as `verb` has them, then the new words.
+
+    Args:
+        path, saved: the checkpoint and its content
+        new: overrides of the command line
+        leave_out: settings of the run that do not matter here
+    """
+    known = schema(verb).__dataclass_fields__
+    values = flatten(saved.get("settings", {}))
+    foreign = [name for name in schema("train").__dataclass_fields__ if name not in known]
+    chosen = _chosen_anew(values, new)
+    left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
+    left_out += HELD_OUT if {*HELD_OUT} & {*_names(new)} else ()
+    kept = without(saved["overrides"], *left_out)
+    old = without(old_defaults([*saved["overrides"], *new]), *left_out)
+    if not values:
+        _warn_of_old_defaults(path, old)
+        return Recipe([*kept, *new], old)
+    unknown_then = [word for word in old if word.partition("=")[0] not in (*values, *GROUPS)]
+    gone = {*left_out, *_gone_with_the_scenario(saved, values, new, verb)}
+    if verb != "train":
+        gone |= {name for name in values if name.partition(".")[0] not in (*GROUPS, *SHARED)}
+    held = {
+        name: value
+        for name, value in values.items()
+        if not gone & {name, name.partition(".")[0]} and not _is_set(name, new)
+    }
+    return Recipe([*kept, *new], unknown_then, held, str(path))
+
+
+def _warn_of_old_defaults(path: Path, old: list[str]) -> None:
+    warnings.warn(
+        f"{path} was written by an earlier version and holds only the words of its command line: what they leave open "
+        f"is taken as it was then ({', '.join(old)})",
+        stacklevel=2,
+    )
+
+
+def _names(words: list[str]) -> list[str]:
+    """Full names of what the words set."""
+    return [one.key_or_group for one in OverridesParser.create().parse_overrides(words)]
+
+
+def _is_set(name: str, words: list[str]) -> bool:
+    return any(name == one or name.startswith(f"{one}.") for one in _names(words) if one not in GROUPS)
+
+
+def _chosen_anew(values: dict[str, Any], new: list[str]) -> list[str]:
+    """The groups that the new words choose; a scenario or planner that the run had already is no new choice."""
+    had = {name: values.get(f"{name}.name") for name in ("scenario", "planner")}
+    return [one for one in _names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
+
+
+def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str], verb: str) -> list[str]:
+    """The run's values that followed what the new words change."""
+    followers, names = saved.get("followers", []), _names(new)
+    place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
+    if place != values["scenario.name"] or "scenario.path" in names:
+        return followers
+    gone = [one for one in followers if one.startswith("planner.") and "planner.name" in names]
+    gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*BODY, "robot.team"} & {*names}))
+    if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode
+        gone += ["scenario.macro_steps"] * ("scenario.macro_steps" in followers)
+    return gone

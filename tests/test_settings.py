@@ -1,0 +1,207 @@
+"""A run says what it ran: resolved values, how a checkpoint's settings meet new words, and older checkpoints."""
+
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.build import make_env, make_learner, model_settings
+from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.cli import main
+from maexp.agents.errors import UserError
+from maexp.agents.settings import legacy
+from maexp.agents.settings.compose import compose_config, compose_recipe, settings_of
+from maexp.agents.settings.resolved import find_followers, flatten, resolve, to_yaml
+from maexp.agents.settings.runs import continue_run
+from maexp.envs import make_map
+from maexp.envs.scenarios import SCENARIOS
+
+FILE = Path("run.pt")
+BUILT = [name for name, row in SCENARIOS.items() if row.build]
+
+
+def save(*words: str, **changed: object) -> dict:
+    """What a checkpoint of a run says of its settings; `changed` stand for defaults that were others then."""
+    cfg = compose_config("train", list(words))
+    settings = resolve(cfg)
+    for name, value in changed.items():
+        group, _, key = name.partition("__")
+        settings[group][key] = value
+    return {"overrides": list(words), "settings": settings, "followers": find_followers(cfg)}
+
+
+def play(saved: dict, *new: str, verb: str = "evaluate") -> dict:
+    """The values that a verb has for a checkpoint and new words."""
+    return flatten(resolve(compose_recipe(verb, continue_run(FILE, saved, list(new), verb))))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "planner"), [*((name, "dwa") for name in BUILT), ("maze", "wavefront"), ("maze", "direct")]
+)
+def test_nothing_is_null(scenario, planner):
+    settings = flatten(resolve(compose_config("train", [f"scenario={scenario}", f"planner={planner}"])))
+    assert None not in settings.values()
+    row = SCENARIOS[scenario]
+    assert settings["radar.range"] == row.radar_range and settings["robot.max_speed"] == row.max_speed
+    assert settings["scenario.local_steps"] == row.local_steps
+    assert settings["scenario.maps"] and settings["scenario.held_out"]
+    assert ("planner.num_steering" in settings) == (planner != "direct")
+    assert ("planner.replan_steps" in settings) == (planner == "wavefront")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_algorithm_shows_its_own_settings_and_no_others(algorithm):
+    cfg = compose_config("train", [f"algorithm={algorithm}", "algorithm.lr=0.5", "model=paper"])
+    shown = resolve(cfg)
+    assert shown["algorithm"].keys() == {"name", *asdict(ALGORITHMS[algorithm].settings)}
+    assert shown["algorithm"]["lr"] == 0.5
+    assert shown["model"] == asdict(model_settings(cfg)) and shown["model"]["channels"] == 32
+
+
+def test_the_values_are_those_of_the_env_and_the_learner():
+    cfg = compose_config("train", ["num_envs=2", "robot.team=[{kind: differential, radar: {range: 3}}, {}]"])
+    maps = [make_map("maze_small", 0)]
+    env, shown = make_env(cfg, maps, 2), resolve(cfg, maps)
+    assert [one | {"radar": asdict(radar)} for one, radar in zip(
+        map(asdict, env.robot_configs), env.radar_configs, strict=True)] == shown["robot"]["team"]  # fmt: skip
+    assert shown["planner"].items() <= asdict(env.planner_config).items()
+    assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
+    assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
+    learner = make_learner(cfg, env)
+    assert {"name": "mappo"} | asdict(learner.updater.settings) == shown["algorithm"]
+
+
+def test_a_map_of_ones_own_tells_its_scenario_and_the_length_of_an_episode(tmp_path):
+    world = make_map("maze_small", 0)
+    cfg = compose_config("train", ["scenario=pointcloud", f"scenario.path={world.save(tmp_path / 'x.npz')}"])
+    assert resolve(cfg, [world])["radar"]["range"] == 10.0, "the map was built for maze_small"
+    assert "range" not in resolve(cfg)["radar"], "who has not read the map does not know"
+
+
+def test_yaml_holds_the_same_values():
+    settings = resolve(compose_config("train", ["comm.range=inf"]))
+    assert OmegaConf.to_container(OmegaConf.create(to_yaml(settings))) == settings
+
+
+# A checkpoint and new words
+
+
+def test_a_run_is_played_as_it_was_trained():
+    words = ["scenario=maze", "planner=wavefront", "reward=paper", "radar.range=8", "model.channels=8", "num_robots=2"]
+    saved = save(*words, scenario__macro_steps=7, reward__overlap=0.3, robot__wheelbase=0.7, algorithm__lr=0.25)
+    before = flatten(saved["settings"])
+    assert play(saved, "resume=x", verb="train") == before | {"resume": "x"}
+    for verb in ("evaluate", "view"):
+        after = play(saved, "checkpoint=x", verb=verb)
+        same = {name for name in before if "." in name and name.partition(".")[0] not in ("collector", "logger")}
+        assert same <= after.keys() and all(after[name] == before[name] for name in same)
+        assert after["num_robots"] == 2
+
+
+def test_new_words_win():
+    saved = save("radar.range=8", reward__overlap=0.3)
+    after = play(saved, "scenario.held_out_count=50")
+    assert after["scenario.held_out_count"] == 50 and "scenario.held_out" not in after
+    after = play(saved, "radar.range=5", "reward.overlap=0.1", "seed=3", "num_robots=6")
+    assert (after["radar.range"], after["reward.overlap"], after["seed"], after["num_robots"]) == (5.0, 0.1, 3, 6)
+
+
+def test_another_scenario_brings_its_own_values_but_not_what_the_run_had_set():
+    saved = save("scenario=maze", "robot.max_speed=3", "scenario.maps=[1]", reward__overlap=0.3, radar__range=99.0)
+    after, row = play(saved, "scenario=indoor_medium"), SCENARIOS["indoor_medium"]
+    assert after["radar.range"] == row.radar_range and after["robot.length"] == row.body_length
+    assert after["scenario.macro_steps"] == row.macro_steps and after["planner.num_steering"] == row.num_steering
+    assert after["scenario.maps"] == list(range(21)) and after["scenario.validation"] == list(range(21, 26))
+    assert after["robot.max_speed"] == 3.0, "set by the run itself"
+    assert after["reward.overlap"] == 0.3, "no matter of scenarios"
+    assert play(saved, "scenario=maze")["radar.range"] == 99.0, "the scenario that it was"
+
+
+def test_a_group_chosen_anew_is_todays():
+    saved = save("planner.horizon=5", planner__clearance_weight=7.0, planner__clearance_factor=9.0)
+    today = flatten(resolve(compose_config("train", ["planner=wavefront"])))
+    after = play(saved, "planner=wavefront")
+    assert {k: v for k, v in after.items() if k.startswith("planner.")} == {
+        k: v for k, v in today.items() if k.startswith("planner.")
+    }
+    assert play(saved, "planner=dwa")["planner.clearance_factor"] == 9.0, "the planner that it was"
+    assert play(saved, "planner.name=wavefront")["planner.clearance_factor"] == today["planner.clearance_factor"]
+
+
+def test_the_wheelbase_follows_the_body():
+    saved = save(robot__wheelbase=0.7)
+    assert play(saved)["robot.wheelbase"] == 0.7
+    assert play(saved, "robot.length=2", "robot.width=2")["robot.wheelbase"] == 2.0
+
+
+def test_what_follows_the_scenario_still_does_after_a_resumption():
+    saved = save("scenario=maze", radar__range=99.0)
+    recipe = continue_run(FILE, saved, ["resume=x", "total_frames=99"], "train")
+    assert find_followers(compose_config("train", recipe.words)) == saved["followers"]
+
+
+def test_a_value_that_is_no_longer_known_is_named():
+    saved = save(planner__patience=7)
+    with pytest.raises(UserError, match=r"run.pt holds planner.patience=7, which this version .* does not know"):
+        play(saved)
+
+
+# Older checkpoints
+
+
+def test_a_checkpoint_of_words_alone_keeps_the_defaults_of_its_time(monkeypatch):
+    old = ["planner=dwa", "reward.overlap=0.5", "radar.range=77", legacy._wheelbase]
+    monkeypatch.setattr(legacy, "OLD_DEFAULTS", old)
+    saved = {"overrides": ["radar.range=8", "scenario=indoor_small"]}
+    with pytest.warns(UserWarning, match=r"run.pt was written by .*planner=dwa, reward.overlap=0.5, radar.range=77"):
+        after = play(saved)
+    assert (after["planner.name"], after["reward.overlap"], after["radar.range"]) == ("dwa", 0.5, 8.0)
+    assert after["robot.wheelbase"] == SCENARIOS["indoor_small"].body_length
+    with pytest.warns(UserWarning, match="an earlier version"):
+        after = play(saved, "scenario=maze", "planner=wavefront")
+    assert after["robot.wheelbase"] == SCENARIOS["maze"].body_length and after["planner.name"] == "wavefront"
+    assert settings_of(saved)["reward.overlap"] == 0.5
+
+
+def test_a_setting_that_came_later_keeps_what_was_before(monkeypatch):
+    saved = save(radar__range=99.0)
+    del saved["settings"]["reward"]["time_on"]
+    monkeypatch.setattr(legacy, "OLD_DEFAULTS", ["reward.time_on=covered", "radar.range=5", "planner=wavefront"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        after = play(saved)
+    assert (after["reward.time_on"], after["radar.range"], after["planner.name"]) == ("covered", 99.0, "dwa")
+
+
+def test_old_defaults_compose_for_every_scenario():
+    for scenario in BUILT:
+        words = [f"scenario={scenario}"]
+        settings = resolve(compose_config("train", [*legacy.old_defaults(words), *words]))
+        assert settings["robot"]["wheelbase"] == SCENARIOS[scenario].body_length
+
+
+# Through the command line
+
+
+def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["num_envs=2", "num_robots=2", "scenario.maps=[0]", "scenario.held_out=[64]", "scenario.macro_steps=3"]
+    words += ["collector.steps=3", "device=cpu", "num_threads=1", "checkpoint_every=1"]
+    monkeypatch.setattr("maexp.agents.commands.train.finish", lambda done: None)
+    assert main(["train", *words, "total_frames=6", "hydra.run.dir=run"]) == 0
+    path, saved = find_checkpoint("run")
+    assert saved["settings"] == OmegaConf.to_container(OmegaConf.load("run/config.yaml"))
+    assert "null" not in Path("run/config.yaml").read_text()
+    saved["settings"]["reward"]["explore"] = 0.0  # as if the default had been another then
+    saved["settings"]["robot"]["max_speed"] = 1.0
+    torch.save(saved, path)
+    assert main(["evaluate", "checkpoint=run", "episodes=2", "hydra.run.dir=played"]) == 0
+    played = OmegaConf.load("played/config.yaml")
+    assert (played.reward.explore, played.robot.max_speed, played.scenario.macro_steps) == (0.0, 1.0, 3)
+    assert main(["train", "resume=run", "total_frames=12"]) == 0
+    assert find_checkpoint("run")[1]["settings"]["reward"]["explore"] == 0.0
+    assert find_checkpoint("run")[1]["followers"] == saved["followers"]
