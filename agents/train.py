@@ -100,8 +100,9 @@ class TrainingRun:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """All settings with the values that they come to."""
-        return resolve(self.cfg, self.suite.train)
+        """All settings with the values that they come to; the same however often the run was interrupted."""
+        settings = resolve(self.cfg, self.suite.train)
+        return {name: value for name, value in settings.items() if name != "resume"}
 
     @cached_property
     def followers(self) -> list[str]:
