@@ -34,7 +34,7 @@ class Settings:
 
     gamma: float = number(0.99, high=1.0)
     lmbda: float = number(0.95, high=1.0)
-    finite_horizon: bool = flag(False)
+    finite_horizon: bool = flag(True)
     lr: float = number(7e-4, open_ends=True)
     critic_lr: float = number(1e-3, open_ends=True)
     final_lr_share: float = number(1.0, high=1.0)

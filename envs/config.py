@@ -53,21 +53,23 @@ class PlannerConfig:
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """Weights of the reward (design 4.5).
+    """Weights of the reward (docs/concepts.md).
 
     ``points`` / |free| scales explore and overlap, ``events`` the other terms; ``events`` 0 takes
     ``points`` / |free| there too, as the paper does. ``time_on`` "uncovered" pays -(1 - coverage),
-    "covered" pays -coverage as the paper prints.
+    "covered" pays -coverage as the paper prints. ``charge_rest``: when the last robot of a team has collided,
+    the steps left in the episode are charged at once, as if it went on; else the team is spared them.
     """
 
     explore: float = 0.3
-    overlap: float = 0.01
+    overlap: float = 0.0
     time: float = 1.0
     success: float = 100.0
     collision: float = 200.0
     points: float = 60.0
     events: float = 60.0 / 7000.0
     time_on: Literal["uncovered", "covered"] = "uncovered"
+    charge_rest: bool = True
 
 
 @dataclass(frozen=True)
@@ -143,9 +145,11 @@ def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig
 def check_reward(config: RewardConfig) -> RewardConfig:
     """Every weight must be a finite number; signs are fixed by the meaning of the terms."""
     _check_choice("reward.time_on", config.time_on, ("uncovered", "covered"))
+    if not isinstance(config.charge_rest, bool):
+        raise ValueError(f"reward.charge_rest={config.charge_rest!r} must be true or false")
     for f in fields(config):
         value = getattr(config, f.name)
-        if f.name != "time_on" and not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+        if f.name not in ("time_on", "charge_rest") and not (isinstance(value, int | float) and 0.0 <= value < math.inf):
             raise ValueError(f"reward.{f.name}={value!r} must be a finite number, 0 or more")
     return config
 

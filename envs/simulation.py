@@ -72,6 +72,7 @@ def reward_weights(env) -> RewardWeights:
         setattr(weights, name, float(getattr(cfg, name)))
     weights.time_sign = 1.0 if cfg.time_on == "covered" else 0.0
     weights.goal_coverage = env.success_coverage
+    weights.horizon = env.local_steps * env.macro_steps if cfg.charge_rest else 0
     return weights
 
 

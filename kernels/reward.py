@@ -1,4 +1,4 @@
-"""Reward terms, milestones and the end of an episode (design 4.5, 4.6; paper, section III-D)."""
+"""Reward terms, milestones and the end of an episode (docs/concepts.md; paper, section III-D)."""
 
 import warp as wp
 
@@ -28,6 +28,7 @@ class RewardWeights:
     events: float  # v = events scales time, success, collision; 0: points / |free| (the paper's way)
     time_sign: float  # 0: -(1 - coverage) as in the code, 1: -coverage as the paper prints
     goal_coverage: float
+    horizon: int  # local steps of an episode, charged to the last one when all have collided; 0: they are not
 
 
 @wp.func
@@ -44,6 +45,16 @@ def add_term(
     raw[e, i, term] = raw[e, i, term] + value
 
 
+@wp.func
+def steps_charged(horizon: int, local_step: int, e: int, collided: wp.array2d(dtype=wp.int32)) -> float:
+    """Local steps that the episode would go on for after this one, if all robots have collided; else 0."""
+    left = wp.max(horizon - local_step - 1, 0)
+    for i in range(collided.shape[1]):
+        if collided[e, i] == 0:
+            left = 0
+    return float(left)
+
+
 @wp.kernel
 def _reward_robots(
     # Map:
@@ -54,16 +65,19 @@ def _reward_robots(
     active: wp.array(dtype=wp.int32),
     fresh: wp.array2d(dtype=wp.int32),
     overlap: wp.array2d(dtype=wp.int32),
+    collided: wp.array2d(dtype=wp.int32),
     crashed: wp.array2d(dtype=wp.int32),
     covered: wp.array(dtype=wp.int32),
     covered_before: wp.array(dtype=wp.int32),
+    local_step: wp.array(dtype=wp.int32),
     # Out:
     terms: wp.array3d(dtype=wp.float32),
     raw: wp.array3d(dtype=wp.float32),
 ):
     """Add this local step's reward terms of robot (e, i): weighted in ``terms``, plain in ``raw``.
 
-    ``terms`` is summed over the macro step, ``raw`` over the episode.
+    ``terms`` is summed over the macro step, ``raw`` over the episode. When the last robot has collided, the steps
+    that are left are charged at once, as if the wrecks stayed there until the end: no team gains by crashing.
     """
     e, i = wp.tid()
     if active[e] == 0:
@@ -76,11 +90,14 @@ def _reward_robots(
         v = weights.points / float(maps.free_begin[m + 1] - maps.free_begin[m])
     before = float(covered_before[e]) / total
     after = float(covered[e]) / total
-    lapse = -(1.0 - before)
+    left = float(0.0)
+    if collided[e, i] != 0 and after < weights.goal_coverage:
+        left = steps_charged(weights.horizon, local_step[e], e, collided)
+    lapse = -(1.0 - before) - left * (1.0 - after)
     if weights.time_sign != 0.0:
-        lapse = -before
+        lapse = -before - left * after
     add_term(terms, raw, e, i, EXPLORE, weights.explore * float(fresh[e, i]), w)
-    add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]), w)
+    add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
     add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
     if before < weights.goal_coverage and after >= weights.goal_coverage:
         add_term(terms, raw, e, i, SUCCESS, weights.success, v)

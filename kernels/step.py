@@ -192,7 +192,8 @@ class Shard:
         self.scan(launch, s.active)
         launch(
             reward._reward_robots, self.shape,
-            [maps, s.map_id, self.sim.weights, s.active, s.fresh, s.overlap, s.crashed, s.covered, s.covered_before],
+            [maps, s.map_id, self.sim.weights, s.active, s.fresh, s.overlap, s.collided, s.crashed, s.covered,
+             s.covered_before, s.local_step],
             [s.terms, s.raw],
         )  # fmt: skip
         launch(

@@ -218,10 +218,14 @@ class Watch:
         reached = life.coverage
         self._cover(life, now)
         w, v = cfg.points / total, cfg.events or cfg.points / len(weight)
-        lapse = -before if cfg.time_on == "covered" else before - 1.0
+        left = env.local_steps * env.macro_steps - now["local_step"] if cfg.charge_rest else 0
+        if life.coverage >= np.float32(env.success_coverage) or not now["collided"].all():
+            left = 0  # the rest is charged when the last robot has collided
+        after = life.covered / total
+        lapse = -(before + left * after) if cfg.time_on == "covered" else before - 1.0 + left * (after - 1.0)
         won = reached < np.float32(env.success_coverage) <= life.coverage
         life.terms += np.stack([
-            w * cfg.explore * fresh, -w * cfg.overlap * overlap, np.full(len(fresh), v * cfg.time * lapse),
+            w * cfg.explore * fresh, -w * cfg.overlap * overlap * (1 + left), np.full(len(fresh), v * cfg.time * lapse),
             np.full(len(fresh), v * cfg.success * won), -v * cfg.collision * (now["crashed"] != 0),
         ], axis=1)  # fmt: skip
         self.successes += int(won)

@@ -32,6 +32,11 @@ from maexp.envs import (
     make_map,
 )
 
+REWARDS = [
+    RewardConfig(overlap=0.01, charge_rest=True),
+    RewardConfig(overlap=0.0, charge_rest=True, time_on="covered"),
+    RewardConfig(overlap=0.01, charge_rest=False, events=0.0),
+]
 LONG = settings.get_current_profile_name() == "long"
 STEPS = 200 if LONG else 5
 EXAMPLES = 1_000 if LONG else 10  # each is drawn even when the time is over
@@ -114,7 +119,7 @@ def cases(draw) -> Case:
         "collision": draw(st.sampled_from(["centre", "footprint"])),
         "comm": CommConfig(range=draw(hearing), line_of_sight=draw(st.booleans())),
         "observation": ObservationConfig(map=draw(st.sampled_from(["seen", "known"]))),
-        "reward": draw(st.sampled_from([RewardConfig(), RewardConfig(events=0.0), RewardConfig(time_on="covered")])),
+        "reward": draw(st.sampled_from(REWARDS)),
         "local_steps": draw(st.integers(1, 12)),
         "macro_steps": draw(st.sampled_from([1, 3, 17, 60] if LONG else [2, 3])),
         "success_coverage": draw(st.sampled_from([0.95, 0.95, 0.3, 0.6, 1.0])),

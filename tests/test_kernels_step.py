@@ -8,7 +8,7 @@ import torch
 from oracle import dwa, motion, picture, radar, team
 from worlds import act, moment, room
 
-from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RadarConfig, RobotConfig
+from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
 
 pytestmark = pytest.mark.kernels
 
@@ -51,6 +51,7 @@ def episode(request):
     """`(env, moments)`: for each of two envs on maps of different size, the states along some local steps."""
     maps = [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2), room(11, 15, "jittered", 3)]
     settings = {"planner": PlannerConfig(num_steering=7, clearance_factor=4.0), "radar": radars()}
+    settings["reward"] = RewardConfig(overlap=0.01)
     env = ExplorationEnv(
         maps, 3, 4, seed=5, robot=robots(), local_steps=1, macro_steps=1000, success_coverage=1.0,
         num_threads=2, **settings | CASES[request.param],
@@ -250,7 +251,11 @@ def test_counts_reward_and_end(episode):
         shared = after.shared / max(int(after.covered), 1)
         np.testing.assert_allclose(shared, team.mutual_overlap(after.seen_free, weights), rtol=1e-6)
         success = before.coverage < env.success_coverage <= after.coverage
-        terms = team.reward_terms(new, overlap, before.coverage, success, after.crashed != 0, area)
+        charged = team.steps_charged(after.collided, after.coverage, after.step, 1000, env.success_coverage)
+        terms = team.reward_terms(
+            new, overlap, before.coverage, success, after.crashed != 0, area,
+            coverage_now=after.coverage, charged=charged,
+        )  # fmt: skip
         for k, name in enumerate(("explore", "overlap", "time", "success", "collision")):
             np.testing.assert_allclose(after.terms[:, k], terms[name], rtol=1e-5, atol=1e-7, err_msg=name)
         over = team.terminated(after.coverage, after.collided, env.success_coverage)

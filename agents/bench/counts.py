@@ -116,7 +116,7 @@ def merge_scan(c: Counts) -> Cost:
 
 def reward_robots(c: Counts) -> Cost:
     """Five terms, weighted and plain, read and written."""
-    return Cost(c["active"] * (6 * WORD + 5 * 4 * WORD), c["active"] * 30)
+    return Cost(c["active"] * (8 * WORD + 5 * 4 * WORD), c["active"] * 30)
 
 
 def record_track(c: Counts) -> Cost:

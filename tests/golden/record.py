@@ -20,7 +20,7 @@ CASES |= {f"maze_small_{planner}": ("maze_small", planner) for planner in ("wave
 CLEARANCE = {"random": 3.0, "maze": 4.0, "indoor": 4.2, "outdoor": 4.2}  # factor by the first word of a scenario
 REWARD = RewardConfig(
     explore=0.3, overlap=0.01, time=1.0, success=100.0, collision=200.0, points=60.0, events=60.0 / 7000.0,
-    time_on="uncovered",
+    time_on="uncovered", charge_rest=False,
 )  # fmt: skip
 
 

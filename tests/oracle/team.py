@@ -55,6 +55,19 @@ def mutual_overlap(seen, weights) -> float:
     return math.fsum(w for w, t in zip(weights, times, strict=True) if t >= 2) / total if total else 0.0
 
 
+def steps_charged(collided, coverage_now: float, local_step: int, horizon: int, success_coverage: float = 0.95) -> int:
+    """Local steps charged at once after local step number `local_step` (1 for the first).
+
+    All that are left of `horizon` where the last robot has collided and the team has not succeeded, else none.
+    """
+    if coverage_now >= success_coverage:
+        return 0
+    for hit in collided:
+        if not hit:
+            return 0
+    return max(horizon - local_step, 0)
+
+
 def reward_terms(
     new,
     overlap,
@@ -68,18 +81,24 @@ def reward_terms(
     success: float = 100.0,
     collision: float = 200.0,
     paper: bool = False,
+    coverage_now: float = 1.0,
+    charged: int = 0,
 ) -> dict[str, np.ndarray]:
     """The terms of one local step, each (N,), signed and weighted as they enter the reward (design 4.5).
 
-    succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step.
+    succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step;
+    charged: steps left that are charged too, at `coverage_now` (`steps_charged`).
     """
     w = 60.0 / num_free
     v = w if paper else 60.0 / 7000.0
     robots = len(new)
+    time, shared = -v * (1.0 - coverage_before), [-w * overlap_weight * overlap[i] for i in range(robots)]
+    for _ in range(charged):  # nobody moves any more: each step costs the same
+        time -= v * (1.0 - coverage_now)
     return {
         "explore": np.asarray([w * explore * new[i] for i in range(robots)]),
-        "overlap": np.asarray([-w * overlap_weight * overlap[i] for i in range(robots)]),
-        "time": np.asarray([-v * (1.0 - coverage_before)] * robots),
+        "overlap": np.asarray([(1 + charged) * value for value in shared]),
+        "time": np.asarray([time] * robots),
         "success": np.asarray([v * success * bool(succeeded)] * robots),
         "collision": np.asarray([-v * collision * bool(collided_now[i]) for i in range(robots)]),
     }
