@@ -187,25 +187,33 @@ class Stopwatch:
 
 
 def batch_statistics(*batches: TensorDictBase) -> dict[str, float]:
-    """What the log says about batches [envs, steps]: rewards per step, and how the episodes in them ended.
+    """What the log says about batches [envs, steps]: rewards per decision, and how the episodes in them ended.
 
-    Several batches, of teams of several sizes, count as one: every robot's step, every episode alike. Means over
-    ended episodes are NaN where none ended.
+    A robot that has collided decides nothing, yet goes on paying: what it earns counts, over the decisions of the
+    robots that drive. Several batches, of teams of several sizes, count as one: every decision, every episode alike.
+    Means over ended episodes are NaN where none ended.
     """
-    parts = [_statistics(batch) for batch in batches]
-    rewards, ends = ({name: torch.cat([part[k][name] for part in parts]) for name in parts[0][k]} for k in (0, 1))
+    decisions = sum(int(batch["agents", "observation", "alive"].sum()) for batch in batches)
+    earned = [_earned(batch) for batch in batches]
+    ends = [_ends(batch) for batch in batches]
     return {
-        **{name: value.mean().item() for name, value in rewards.items()},
-        "episodes": len(ends["coverage"]),
-        **{name: value.mean().item() for name, value in ends.items()},
+        **{name: sum(one[name] for one in earned) / max(decisions, 1) for name in earned[0]},
+        "episodes": sum(len(one["coverage"]) for one in ends),
+        **{name: torch.cat([one[name] for one in ends]).mean().item() for name in ends[0]},
     }
 
 
-def _statistics(batch: TensorDictBase) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-    """Rewards of every robot and step [n], and what became of every episode that ended [m]."""
+def _earned(batch: TensorDictBase) -> dict[str, float]:
+    """Reward and its terms, summed over all robots and steps."""
+    info = batch["next", "info"]
+    rewards = {"reward": batch["next", "agents", "reward"]}
+    rewards |= {f"reward_{term}": info[f"reward_{term}"] for term in REWARD_TERMS}
+    return {name: value.sum(dtype=torch.float64).item() for name, value in rewards.items()}
+
+
+def _ends(batch: TensorDictBase) -> dict[str, torch.Tensor]:
+    """What became of every episode that ended, [m]."""
     after, info = batch["next"], batch["next", "info"]
-    rewards = {f"reward_{term}": info[f"reward_{term}"] for term in REWARD_TERMS}
-    rewards = {"reward": after["agents", "reward"]} | rewards
     ends = {
         "coverage": info["coverage"].squeeze(-1),
         "success_rate": after["terminated"].squeeze(-1) & ~info["collided"].all(-1),
@@ -213,5 +221,4 @@ def _statistics(batch: TensorDictBase) -> tuple[dict[str, torch.Tensor], dict[st
         "path_length": info["path_length"].mean(-1),
     }
     done = after["done"].squeeze(-1)
-    flat = {name: value.reshape(-1).float() for name, value in rewards.items()}
-    return flat, {name: value[done].float() for name, value in ends.items()}
+    return {name: value[done].float() for name, value in ends.items()}

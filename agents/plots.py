@@ -14,10 +14,10 @@ from maexp.agents.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels,
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
     ("Coverage at the end of an episode", "%", 100, [("coverage", "training"), ("validation_coverage", "validation")]),
-    ("Reward of a robot", "per macro step", 1, [("reward", "total"), ("return", "return")]),
+    ("Reward of a robot", "per decision", 1, [("reward", "total"), ("return", "return")]),
     (
         "Reward by term",
-        "per macro step",
+        "per decision",
         1,
         [(f"reward_{term}", term) for term in ("explore", "overlap", "time", "success", "collision")],
     ),

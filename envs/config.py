@@ -149,7 +149,8 @@ def check_reward(config: RewardConfig) -> RewardConfig:
         raise ValueError(f"reward.charge_rest={config.charge_rest!r} must be true or false")
     for f in fields(config):
         value = getattr(config, f.name)
-        if f.name not in ("time_on", "charge_rest") and not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+        number = isinstance(value, int | float) and 0.0 <= value < math.inf
+        if f.name not in ("time_on", "charge_rest") and not number:
             raise ValueError(f"reward.{f.name}={value!r} must be a finite number, 0 or more")
     return config
 

@@ -77,10 +77,14 @@ def test_statistics_of_several_sizes_are_those_of_all_robots_and_episodes():
     ]
     torch.manual_seed(0)
     batches = [env.rollout(4, break_when_any_done=False) for env in envs]
+    alive = batches[1]["agents", "observation", "alive"]
+    alive[0, 2:, 0] = False  # as if one robot had collided: it earns without deciding
     found = batch_statistics(*batches)
     robots = [one for b in batches for one in b["next", "agents", "reward"].flatten().tolist()]
     assert len(robots) == 3 * 4 * 1 + 2 * 4 * 3
-    assert found["reward"] == pytest.approx(sum(robots) / len(robots), rel=1e-5)
+    assert found["reward"] == pytest.approx(sum(robots) / (len(robots) - 2), rel=1e-5)
+    times = [one for b in batches for one in b["next", "info", "reward_time"].flatten().tolist()]
+    assert found["reward_time"] == pytest.approx(sum(times) / (len(robots) - 2), rel=1e-5)
     ends = [b["next"][e, t] for b in batches for e, t in grid(*b.shape) if bool(b["next", "done"][e, t])]
     assert found["episodes"] == len(ends) == 3 * 2 + 2 * 1
     for name, value in (
