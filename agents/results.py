@@ -18,8 +18,10 @@ from maexp.agents.files import write_json
 PACKAGES = ("maexp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
 COLUMNS = {
     "exploration_ratio": "coverage",
+    "coverage_auc": "over time",
     "coverage_step_85": "85 % at step",
     "coverage_step_95": "95 % at step",
+    "coverage_step_95_censored": "or the limit",
     "mutual_overlap_85": "overlap",
     "success_rate": "success",
     "collisions": "collisions",

@@ -36,6 +36,8 @@ from maexp.kernels.state import STATE
 from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
 
 DEFAULT_MACRO_STEPS_MIN = 10
+LATER = {"starts": math.inf, "covered_sum": 0}
+"""State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
 SWEEPS = 2.0
 """A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -242,8 +244,11 @@ class ExplorationEnv(EnvBase):
     def _info(self) -> dict[str, torch.Tensor]:
         s = self.simulation.tensors
         total = self.simulation.map_tensors["total_weight"][s["map_id"].long()]
+        length = self.local_steps * self.macro_steps
+        area = s["covered_sum"] + (length - s["local_step"]) * s["covered"].long()
         info = {
             "coverage": (s["covered"] / total).unsqueeze(-1),
+            "coverage_auc": (area.double() / (length * total)).float().unsqueeze(-1),
             "local_steps": s["local_step"].unsqueeze(-1).clone(),
             "collided": s["collided"] != 0,
             "path_length": s["path_length"].clone(),
@@ -314,8 +319,8 @@ class ExplorationEnv(EnvBase):
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
-        if "starts" not in state_dict:  # of before November 2026, when all were drawn
-            state_dict = state_dict | {"starts": torch.full_like(own["starts"], torch.inf)}
+        earlier = {name: torch.full_like(own[name], value) for name, value in LATER.items()}
+        state_dict = earlier | dict(state_dict)
         wrong = [n for n in STATE if n not in state_dict or state_dict[n].shape != own[n].shape]
         if wrong:
             raise ValueError(

@@ -26,6 +26,7 @@ def episode_metrics(
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
     metrics = {
         "exploration_ratio": info["coverage"][:, 0],
+        "coverage_auc": info["coverage_auc"][:, 0],
         "reward_variance": info["episode_reward_raw"].std(axis=1),
         "reward_variance_scaled": info["episode_reward"].std(axis=1),
         "success_rate": (info["coverage"][:, 0] >= np.float32(success_coverage)).astype(np.float64),

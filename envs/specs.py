@@ -7,13 +7,15 @@ from maexp.kernels.types import PIXELS, REGIONS
 
 INFO_ENV = {
     "coverage": torch.float32,
+    "coverage_auc": torch.float32,
     "coverage_step_85": torch.int32,
     "coverage_step_95": torch.int32,
     "mutual_overlap_85": torch.float32,
     "mutual_overlap_95": torch.float32,
     "local_steps": torch.int32,
 }
-"""Entries of ``info`` of shape [E, 1]."""
+"""Entries of ``info`` of shape [E, 1]. ``coverage_auc``: mean coverage over the local steps of a full episode, as if
+nothing more were seen from now on."""
 
 REWARD_TERMS = ("explore", "overlap", "time", "success", "collision")
 """Order of the last axis of the kernels' reward terms."""

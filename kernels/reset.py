@@ -129,6 +129,7 @@ def _clear_env(
     # State out:
     covered: wp.array(dtype=wp.int32),
     covered_before: wp.array(dtype=wp.int32),
+    covered_sum: wp.array(dtype=wp.int64),
     shared: wp.array(dtype=wp.int32),
     local_step: wp.array(dtype=wp.int32),
     macro_step: wp.array(dtype=wp.int32),
@@ -141,6 +142,7 @@ def _clear_env(
         return
     covered[e] = 0
     covered_before[e] = 0
+    covered_sum[e] = wp.int64(0)
     shared[e] = 0
     local_step[e] = 0
     macro_step[e] = 0

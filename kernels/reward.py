@@ -119,13 +119,15 @@ def _close_step(
     # State in and out:
     active: wp.array(dtype=wp.int32),
     covered_before: wp.array(dtype=wp.int32),
+    covered_sum: wp.array(dtype=wp.int64),
     local_step: wp.array(dtype=wp.int32),
     milestone_step: wp.array2d(dtype=wp.int32),
     milestone_overlap: wp.array2d(dtype=wp.float32),
     milestone_path: wp.array3d(dtype=wp.float32),
     terminated: wp.array(dtype=wp.int32),
 ):
-    """Count the local step, note when 85 % and 95 % are reached, end the episode on success or when all collided."""
+    """Count the local step, sum up the coverage, note when 85 % and 95 % are reached, end the episode on success or
+    when all collided."""
     e = wp.tid()
     if active[e] == 0:
         return
@@ -133,6 +135,7 @@ def _close_step(
     local_step[e] = step
     coverage = float(covered[e]) / float(maps.total_weight[map_id[e]])
     covered_before[e] = covered[e]
+    covered_sum[e] = covered_sum[e] + wp.int64(covered[e])
     for k in range(2):
         mark = float(0.85)
         if k == 1:

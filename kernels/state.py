@@ -29,6 +29,7 @@ STATE = {
     "terminated": ("E", torch.int32, wp.int32),
     "covered": ("E", torch.int32, wp.int32),
     "covered_before": ("E", torch.int32, wp.int32),
+    "covered_sum": ("E", torch.int64, wp.int64),
     "shared": ("E", torch.int32, wp.int32),
     "error": ("E", torch.int32, wp.int32),
     "pose": ("E N 4", torch.float32, wp.vec4),

@@ -202,8 +202,8 @@ class Shard:
         launch(
             reward._close_step, self.shape[0],
             [maps, s.map_id, self.sim.settings.goal_coverage, s.collided, s.covered, s.shared, s.path_length],
-            [s.active, s.covered_before, s.local_step, s.milestone_step, s.milestone_overlap, s.milestone_path,
-             s.terminated],
+            [s.active, s.covered_before, s.covered_sum, s.local_step, s.milestone_step, s.milestone_overlap,
+             s.milestone_path, s.terminated],
         )  # fmt: skip
 
     def place(self, launch: Callable) -> None:
@@ -217,7 +217,7 @@ class Shard:
             launch(reset._clear_flags, f.shape, [s.mask], [f])
         launch(
             reset._clear_env, envs, [s.mask],
-            [s.covered, s.covered_before, s.shared, s.local_step, s.macro_step, s.terminated,
+            [s.covered, s.covered_before, s.covered_sum, s.shared, s.local_step, s.macro_step, s.terminated,
              s.milestone_step, s.milestone_overlap],
         )  # fmt: skip
         launch(

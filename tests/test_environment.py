@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from oracle.metrics import mean_coverage
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from maexp.envs import (
@@ -275,6 +276,38 @@ def test_success_terminates_once_and_the_rest_of_the_macro_step_is_frozen():
     torch.testing.assert_close(td["info", "reward_success"][i], torch.full((2,), 100.0 * 60.0 / 7000.0))
     assert td["info", "local_steps"][i] == td["info", "coverage_step_95"][i]
     assert not td["truncated"][i]
+
+
+@pytest.mark.parametrize("every", [None, 7])
+def test_mean_coverage_over_the_full_episode(every):
+    """Some teams are done within a macro step, and points of a map have several weights; with and without a hook."""
+    maps = [open_room(9.0), make_map("random_obstacles_adaptive", 0)]
+    env, watched = (
+        ExplorationEnv(maps, num_envs=6, num_robots=2, radar=RadarConfig(range=5.0), local_steps=10,
+                       robot=RobotConfig(collision_threshold=0.2), macro_steps=12, seed=3)
+        for _ in range(2)
+    )  # fmt: skip
+    lines = [[] for _ in range(6)]
+
+    def look(env) -> None:
+        state, totals = env.simulation.tensors, env.simulation.map_tensors["total_weight"]
+        for e, line in enumerate(lines):
+            if len(line) == int(state["local_step"][e]):  # a team that is done stands still
+                line.append(int(state["covered"][e]) / int(totals[state["map_id"][e]]))
+
+    watched.set_step_hook(look)
+    if every is not None:
+        env.set_step_hook(lambda env: None, every=every)
+    td, other, final = env.reset(), watched.reset(), torch.zeros(6)
+    for action in actions(6, 2, 12):
+        running = ~td["done"][:, 0]
+        td, other = step(env, td, action), step(watched, other, action)
+        final = torch.where(running, td["info", "coverage_auc"][:, 0], final)
+    want = [mean_coverage(line, 120) for line in lines]
+    torch.testing.assert_close(final, torch.tensor(want), atol=1e-6, rtol=0)
+    assert torch.equal(td["info", "coverage_auc"], other["info", "coverage_auc"])
+    assert min(len(line) for line in lines) < 120, "no team was done early"
+    assert any((len(line) - 1) % 10 for line in lines), "no team was done within a macro step"
 
 
 def open_room(side: float) -> PointCloudMap:

@@ -11,6 +11,11 @@ def step_reached(coverages, share: float) -> int:
     return -1
 
 
+def mean_coverage(coverages, length: int) -> float:
+    """Mean over `length` local steps; coverages[k] is the coverage after k steps, and after its last the last stays."""
+    return math.fsum(coverages[min(step, len(coverages) - 1)] for step in range(1, length + 1)) / length
+
+
 def mean_of_reached(steps) -> tuple[float, int]:
     """Mean over the episodes that got there, and how many did; nan where none did."""
     reached = [s for s in steps if s >= 0]
