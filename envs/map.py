@@ -219,8 +219,8 @@ def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:
         raise MapError(reason) from error
 
 
-def check_file(path: Path) -> None:
-    """Raises MapError unless `path` is a readable, non-empty regular file of a sane size."""
+def check_file(path: Path, most: int | None = MAX_FILE_BYTES) -> None:
+    """Raises MapError unless `path` is a readable, non-empty regular file of at most `most` bytes (None: any size)."""
     try:
         if not path.exists():
             raise MapError(f"{path} does not exist; check the path")
@@ -229,8 +229,9 @@ def check_file(path: Path) -> None:
         size = path.stat().st_size
     except OSError as error:  # a name too long, a folder that may not be entered
         raise MapError(f"{str(path)[:200]} cannot be looked up ({error.strerror}); check the path") from error
-    if not 0 < size <= MAX_FILE_BYTES:
-        raise MapError(f"{path} has {size} bytes; a map file has between 1 and {MAX_FILE_BYTES}")
+    if size == 0 or (most is not None and size > most):
+        told = "at least 1" if most is None else f"between 1 and {most}"
+        raise MapError(f"{path} has {size} bytes; a map file has {told}")
     if not os.access(path, os.R_OK):
         raise MapError(f"{path} cannot be read; change its permissions")
 

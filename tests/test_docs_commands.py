@@ -1,5 +1,6 @@
 """Every command the documentation shows is run as it stands there, made small, in a folder with the files it names."""
 
+import importlib.util
 import re
 import shlex
 import shutil
@@ -12,8 +13,12 @@ from worlds import room
 
 from maexp.agents.cli import VERBS, main
 from maexp.envs.importing.export import export_ros_map
+from maexp.envs.importing.occupancy import read_occupancy
+from maexp.envs.importing.options import ImportOptions
+from maexp.envs.importing.report import ImportReport
 
 ROOT = Path(__file__).resolve().parents[1]
+HAS_BAGS = importlib.util.find_spec("rosbags") is not None
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
 PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
@@ -120,7 +125,8 @@ def folder(tmp_path_factory) -> Path:
     """Where a reader would be: maps of their own under the names that the pages use, and a run."""
     place = tmp_path_factory.mktemp("reader")
     (place / "scans").mkdir()
-    for name in {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply)", line)} | {"scans/a.yaml"}:
+    named = {w for line in COMMANDS for w in re.findall(r"[\w/]+\.(?:yaml|pcd|npz|ply|mcap)", line)}
+    for name in named | {"scans/a.yaml"}:
         if (place / name).suffix in (".pcd", ".ply"):
             cloud = room(30, 21, spacing=0.2)
             flat = np.concatenate([cloud.free, *(cloud.obstacles + [0, 0, h] for h in np.arange(0.2, 1.4, 0.2))])
@@ -130,6 +136,8 @@ def folder(tmp_path_factory) -> Path:
             open3d.io.write_point_cloud(str(place / name), open3d.geometry.PointCloud(points))
         elif (place / name).suffix == ".yaml":
             export_ros_map(room(30, 21, spacing=0.2), place / name)
+        elif (place / name).suffix == ".mcap" and HAS_BAGS:
+            write_map(place / name, room(30, 21, spacing=0.2))
         elif (place / name).suffix == ".npz":
             room(30, 21, spacing=0.2).save(place / name)
     export_ros_map(room(8, 6, spacing=0.1), place / "cupboard.yaml")
@@ -140,6 +148,19 @@ def folder(tmp_path_factory) -> Path:
         patch.chdir(place)
         assert main(["train", *SMALLER["train"], *OWN_MAPS, "hydra.run.dir=outputs/run"]) == 0
     return place
+
+
+def write_map(path: Path, world) -> None:
+    """A recording of that map."""
+    from bag_writer import grid, write_bag
+
+    image = export_ros_map(world, path.with_suffix(".yaml"))
+    found = read_occupancy(image, ImportOptions(), ImportReport(str(image)))
+    values = np.array([-1, 0, 100])[found.labels]
+    bag = write_bag(path.with_suffix(""), [("/map", 0.0, grid(values.T, found.cell, found.origin))])
+    next(bag.glob("*.mcap")).rename(path)
+    for left in (image, image.with_suffix(".pgm")):
+        left.unlink()
 
 
 def heavy(line: str) -> bool:
@@ -159,6 +180,8 @@ def test_command(line, folder, monkeypatch, capsys):
     if "browser=true" in line:  # the page opens, and ends at once
         page = pytest.importorskip("maexp.envs.viewing.page", reason="viser is absent")
         monkeypatch.setattr(page.Page, "run", lambda page: None)
+    if ".mcap" in line and not HAS_BAGS:
+        pytest.skip("THE EXTRA maexp[rosbag] IS NOT INSTALLED: bags are not imported")
     words = small(line)
     set_stage(words)
     status = main(words)

@@ -15,12 +15,13 @@ from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.schema import given
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
+from maexp.envs.importing.bags import is_bag
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map
 from maexp.envs.scenarios import SCENARIOS, make_map
 
 UNUSABLE = 1
-FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy"
+FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy .mcap .db3 (rosbag2)"
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -52,8 +53,13 @@ def check(cfg: Any) -> None:
         raise UserError(f"out={cfg.out} must end in .png.")
     if cfg.out and not Path(cfg.out).parent.is_dir():
         raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
-    if cfg.action == "import" and Path(cfg.file).is_dir():
+    if _is_folder(cfg):
         check_folder(cfg)
+
+
+def _is_folder(cfg: Any) -> bool:
+    """Whether a folder of several files is to be imported; the folder of a bag is one map."""
+    return cfg.action == "import" and Path(cfg.file).is_dir() and not is_bag(Path(cfg.file))
 
 
 def check_folder(cfg: Any) -> None:
@@ -70,7 +76,7 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
     if cfg.action == "list":
         print_scenarios()
         return 0
-    if cfg.action == "import" and Path(cfg.file).is_dir():
+    if _is_folder(cfg):
         return run_folder(Path(cfg.file), where, import_options(cfg))
     with blame_input():
         world, imported = read_map(cfg)

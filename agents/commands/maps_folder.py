@@ -14,6 +14,7 @@ from maexp.agents.files import write_text
 from maexp.envs.checker import check_map
 from maexp.envs.importing import draw_import, import_map_with_report
 from maexp.envs.importing.api import GRIDS, POINTS
+from maexp.envs.importing.bags import BAGS, is_bag
 from maexp.envs.importing.clouds import CLOUDS
 from maexp.envs.importing.occupancy import find_image
 
@@ -55,7 +56,8 @@ def find_files(folder: Path) -> list[Path]:
     Raises:
         UserError: there are none.
     """
-    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in _suffixes())
+    files = {file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in _suffixes()}
+    files = sorted({file.parent if is_bag(file.parent) else file for file in files})  # the folder of a bag is one map
     results = [report.parent for report in folder.rglob(REPORT) if report.parent != folder and _is_ours(report)]
     files = [file for file in files if not _is_hidden(file, folder) and not set(results) & set(file.parents)]
     yamls = [file for file in files if file.suffix.lower() in YAMLS]
@@ -87,7 +89,7 @@ def _is_ours(report: Path) -> bool:
 
 
 def _suffixes() -> tuple[str, ...]:
-    return (*GRIDS, *CLOUDS, *POINTS)
+    return (*GRIDS, *CLOUDS, *POINTS, *BAGS)
 
 
 def run(folder: Path, where: Path, options: dict[str, Any]) -> int:

@@ -11,8 +11,10 @@ from maexp.envs.map import MapError, PointCloudMap, check_file
 from maexp.envs.scenarios import find_scenario
 
 from .arrays import read_npy_triple, read_npz_map
-from .clouds import CLOUDS, read_cloud
+from .bags import BAGS, bag_name, is_bag, read_bag
+from .clouds import CLOUDS, make_source, read_cloud
 from .finish import crop_grid, finish_map
+from .grid import Grid
 from .occupancy import read_occupancy
 from .options import ImportOptions, make_options
 from .report import ImportReport
@@ -26,7 +28,8 @@ def import_map(path: str | os.PathLike, options: ImportOptions | None = None, **
     """Reads a file and makes it a map a team can explore; see `ImportOptions` for what can be set by hand.
 
     Args:
-        path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .glb or .bt.
+        path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .glb, .bt, or a
+            bag of ROS: .mcap, .db3 or the folder of a rosbag2.
         options: settings; None: everything automatic.
         overrides: single settings by name, over `options`.
 
@@ -44,7 +47,8 @@ def import_map_with_report(
     path = Path(path)
     options = make_options(options, overrides)
     report = ImportReport(str(path))
-    check_file(path)
+    if not is_bag(path):
+        check_file(path)
     world = _read(path, options, report)
     world = _check(world, options, report)
     report.seconds = time.perf_counter() - begin
@@ -54,10 +58,17 @@ def import_map_with_report(
 def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointCloudMap:
     suffix = path.suffix.lower()
     name = options.name or path.stem
+    if is_bag(path):
+        found = read_bag(path, options, report)
+        name = options.name or bag_name(path)
+        if isinstance(found, Grid):
+            return _finish_grid(found, name, options, report)
+        source, scenario = make_source(path, found, options, report)
+        return finish_map(source, scenario, name, options, report)
+    if options.topic is not None:
+        raise MapError(f"topic={options.topic!r} is for bags of ROS ({', '.join(BAGS)}); {path} has no topics")
     if suffix in GRIDS:
-        grid = crop_grid(read_occupancy(path, options, report), options, report)
-        scenario = find_scenario("pointcloud" if options.scenario == "auto" else options.scenario)
-        return finish_map(GridSource(grid), scenario, name, options, report)
+        return _finish_grid(read_occupancy(path, options, report), name, options, report)
     if suffix in CLOUDS:
         source, scenario = read_cloud(path, options, report)
         return finish_map(source, scenario, name, options, report)
@@ -65,8 +76,13 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
         return read_npz_map(path, options, report)
     if suffix == ".npy":
         return read_npy_triple(path, options, report)
-    known = ", ".join((*GRIDS, *CLOUDS, *POINTS))
+    known = ", ".join((*GRIDS, *CLOUDS, *POINTS, *BAGS))
     raise MapError(f"{path}: files of type {suffix or '(none)'} cannot be imported; {known} can")
+
+
+def _finish_grid(grid: Grid, name: str, options: ImportOptions, report: ImportReport) -> PointCloudMap:
+    scenario = find_scenario("pointcloud" if options.scenario == "auto" else options.scenario)
+    return finish_map(GridSource(crop_grid(grid, options, report)), scenario, name, options, report)
 
 
 def _check(world: PointCloudMap, options: ImportOptions, report: ImportReport) -> PointCloudMap:

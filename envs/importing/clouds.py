@@ -30,7 +30,11 @@ FLOOR_SHARE = 0.7  # of what the walls enclose; where less of the floor was scan
 
 def read_cloud(path: Path, options: ImportOptions, report: ImportReport) -> tuple[Source, Scenario]:
     """The source of grids of a cloud, mesh or octree, and the scenario whose robot fits it."""
-    cloud = _read(path, options)
+    return make_source(path, _read(path, options), options, report)
+
+
+def make_source(path: Path, cloud: Cloud, options: ImportOptions, report: ImportReport) -> tuple[Source, Scenario]:
+    """The same for a cloud that was read already."""
     points = _to_metres(path, cloud, options, report)
     points, up = _set_upright(points, cloud, options, report)
     outdoor = _is_outdoor(points, cloud, options)

@@ -29,6 +29,9 @@ class ImportOptions:
         `occupied_threshold` (shares of black) overrule the yaml; `grey_walls`: pixels between the thresholds but
         darker than the grey of unknown space are obstacles; None: where they outnumber the black ones.
 
+    Bags (rosbag2): `topic`: the `OccupancyGrid` or `PointCloud2` to read; None: the only grid, or else the only cloud.
+        The two thresholds hold for grids of bags, too, as shares of 100.
+
     Clouds and meshes:
         units: of the file: "m", "cm", "mm", "ft", "us-ft", "in", or metres per unit.
         up: axis that points up: "x", "y", "z", "-x", "-y", "-z".
@@ -62,6 +65,7 @@ class ImportOptions:
     free_threshold: float | None = None
     occupied_threshold: float | None = None
     grey_walls: bool | None = None
+    topic: str | None = None
     units: str | float = "auto"
     up: str = "auto"
     level: bool | None = None
