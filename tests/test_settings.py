@@ -15,7 +15,7 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.settings import legacy
 from maexp.agents.settings.compose import compose_config, compose_recipe, settings_of
-from maexp.agents.settings.resolved import find_followers, flatten, resolve, to_yaml
+from maexp.agents.settings.resolved import algorithm_settings, find_followers, flatten, resolve, to_yaml
 from maexp.agents.settings.runs import continue_run
 from maexp.envs import make_map
 from maexp.envs.scenarios import SCENARIOS
@@ -205,3 +205,26 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     assert main(["train", "resume=run", "total_frames=12"]) == 0
     assert find_checkpoint("run")[1]["settings"]["reward"]["explore"] == 0.0
     assert find_checkpoint("run")[1]["followers"] == saved["followers"]
+
+
+# Presets
+
+
+def test_the_papers_set_up_is_the_same_for_every_verb():
+    for verb in ("train", "evaluate", "benchmark"):
+        cfg = compose_config(verb, ["preset=paper", "algorithm=vda2c"] + ["policy=random"] * (verb == "evaluate"))
+        assert (cfg.planner.name, cfg.reward.overlap, cfg.reward.events) == ("dwa", 0.01, 0.0)
+        assert algorithm_settings(cfg) == ALGORITHMS["vda2c"].reference
+    cfg = compose_config("train", ["preset=paper", "planner=wavefront", "algorithm.lr=0.5"])
+    assert (cfg.planner.name, model_settings(cfg).channels, algorithm_settings(cfg).lr) == ("wavefront", 32, 0.5)
+    assert model_settings(compose_config("train", ["preset=paper", "model=small"])).channels == 16
+
+
+def test_a_smoke_preset_is_over_at_once():
+    cfg = compose_config("train", ["preset=smoke"])
+    assert cfg.total_frames <= 2 * cfg.num_envs * cfg.collector.steps and cfg.scenario.macro_steps == 3
+
+
+def test_a_preset_does_not_change_a_run():
+    with pytest.raises(UserError, match="preset=paper stands for many settings, and those of run.pt are kept"):
+        play(save(), "preset=paper")

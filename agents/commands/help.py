@@ -16,7 +16,8 @@ def verb_help(name: str, verb: Any) -> str:
     lines += [f"  {_assign(setting, default):<26}{text}" for setting, default, text in describe(kind)]
     for group in groups():
         if group in kind.__dataclass_fields__:
-            lines += ["", f"{group}=CHOICE, and {group}.NAME=VALUE for one value of it"]
+            one_value = "" if group == "preset" else f", and {group}.NAME=VALUE for one value of it"
+            lines += ["", f"{group}=CHOICE{one_value}"]
             lines += [f"  {choice:<26}{text}" for choice, text in group_choices(group).items()]
     lines += ["", f"maexp {name} --cfg job ... prints all settings; hydra.run.dir=FOLDER moves the output."]
     if name == "train":

@@ -32,6 +32,8 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     _wheelbase,
     "collector.steps=15",
     "scenario.validation=[]",
+    "reward.charge_rest=false",
+    "algorithm.finite_horizon=false",
 ]
 
 

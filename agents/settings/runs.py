@@ -12,6 +12,7 @@ from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from maexp.agents.errors import UserError
 from maexp.agents.settings.legacy import old_defaults
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import flatten
@@ -50,8 +51,13 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     """
     known = schema(verb).__dataclass_fields__
     values = flatten(saved.get("settings", {}))
+    if preset := find_override(new, "preset"):
+        raise UserError(
+            f"preset={preset} stands for many settings, and those of {path} are kept: name the ones to change."
+        )
     foreign = [name for name in schema("train").__dataclass_fields__ if name not in known]
     chosen = _chosen_anew(values, new)
+    leave_out += ("preset",) * (verb != "train")
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
     left_out += HELD_OUT if {*HELD_OUT} & {*_names(new)} else ()
     kept = without(saved["overrides"], *left_out)

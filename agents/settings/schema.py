@@ -144,6 +144,7 @@ class LearnerSettings(EnvSettings):
 class TrainSettings(LearnerSettings):
     """`maexp train`."""
 
+    preset: str = MISSING
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
@@ -159,6 +160,7 @@ class TrainSettings(LearnerSettings):
 class EvaluateSettings(LearnerSettings):
     """`maexp evaluate`."""
 
+    preset: str = MISSING
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
     policy: Any = setting(None, f"{', '.join(POLICIES)}; several as policy=random,voronoi")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
