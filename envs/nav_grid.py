@@ -94,10 +94,20 @@ def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids
         "cell_begin": (begin.astype(np.int32), wp.int32),
         "stand_in": (np.concatenate([g.stand_in for g in grids]), wp.int32),
     }
+    counts, voids = zip(*(list_voids(g.stand_in) for g in grids), strict=True)
+    values["void_begin"] = (np.cumsum([0, *np.concatenate(counts)]).astype(np.int32), wp.int32)
+    values["voids"] = (np.concatenate(voids), wp.int32)
     stacked = NavGrids()
     for name, (array, kind) in values.items():
         setattr(stacked, name, wp.array(array, dtype=kind, device=str(torch.device(device))))
     return stacked, int(np.diff(begin).max())
+
+
+def list_voids(stand_in: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many other cells take the state of each cell, and those cells, in the order of whose state they take."""
+    voids = np.flatnonzero((stand_in >= 0) & (stand_in != np.arange(len(stand_in))))
+    voids = voids[np.argsort(stand_in[voids], kind="stable")]
+    return np.bincount(stand_in[voids], minlength=len(stand_in)), voids.astype(np.int32)
 
 
 def bank_nav_grids(bank: MapBank, device: str = "cpu") -> tuple[NavGrids, int]:

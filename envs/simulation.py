@@ -6,6 +6,7 @@ import os
 import torch
 
 from maexp.envs.nav_grid import bank_nav_grids, grid_shape
+from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.state import axis_sizes, grid_memory_per_env, memory_per_env
 from maexp.kernels.step import Settings, Simulation
@@ -130,9 +131,13 @@ def bytes_per_env(env) -> int:
     total = sum(memory_per_env(sizes(env)).values())
     if env.planner_config.name == "wavefront":
         limited, robots = env.comm_config.limited, env.num_robots
-        cells = max(width * height for width, height in map(grid_shape, env.maps))
+        shapes = [grid_shape(one) for one in env.maps]
+        cells = max(width * height for width, height in shapes)
         masks = robots if limited else len({one.collision_threshold for one in env.robot_configs})
-        total += grid_memory_per_env(cells, robots, robots if limited else 1, masks)
+        total += grid_memory_per_env(
+            cells, robots, robots if limited else 1, masks, env.bank.max_free + env.bank.max_boundary,
+            max(-(-width // 32) * height for width, height in shapes), news_capacity(cells),
+        )  # fmt: skip
     return total
 
 

@@ -6,11 +6,11 @@ Cells are numbered ``cell = iy * width + ix``. A step to a straight neighbour we
 
 Cells may be `TIGHT`, too near to obstacles for comfort: steps into them weigh `TIGHT_FACTOR` times as much.
 
-The search is Dijkstra's, exact, with four plain queues in place of a heap: cells leave in order of distance, so
-what steps of one weight (straight or diagonal, into open or tight cells) add to a queue of their own is in
-order. The nearest of the four heads is the next cell. A cell enters each queue at most once (a later step of
-the same weight is never shorter), and those for open or for tight cells only: two arrays as long as the grid,
-filled from both ends, never overflow.
+The search is Dijkstra's, exact, or where only the way to one cell is wanted A*'s, which looks in its direction first:
+the key of a cell is its distance plus the least distance that may be left. Keys are even and grow by at most 70 along
+a step, so cells wait in a ring of 64 buckets, one for every key that can occur; those of a bucket are a linked list,
+and a cell whose label drops moves to another. A* goes on until all keys up to the goal's distance are done: then all
+cells of all shortest ways to the goal have their exact distance.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,6 @@ from functools import partial
 
 import torch
 import warp as wp
-
-from maexp.kernels.launches import lanes_on
 
 STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
 DIAGONAL = 14  # weight of a step to a diagonal neighbour
@@ -34,68 +32,66 @@ TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken wh
 wp_blocked = wp.constant(wp.uint8(BLOCKED))
 wp_tight = wp.constant(wp.uint8(TIGHT))
 wp_tight_factor = wp.constant(wp.int32(TIGHT_FACTOR))
+wp_tight_straight = wp.constant(wp.int32(TIGHT_FACTOR * STRAIGHT))
+wp_tight_diagonal = wp.constant(wp.int32(TIGHT_FACTOR * DIAGONAL))
+
+BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
+wp_buckets = wp.constant(wp.int32(BUCKETS))
+wp_last_bucket = wp.constant(wp.int32(BUCKETS - 1))
 
 SKIP = -2  # as the stop of a search: leave its distances as they are
 wp_skip = wp.constant(wp.int32(SKIP))
 
 
-@wp.kernel(enable_backward=False)
-def _clear_distance(
-    # Query:
-    stop: wp.array(dtype=wp.int32),  # [item]
-    lanes: int,
-    # Out:
-    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
-):
-    item, lane = wp.tid()
-    if stop[item] != wp_skip:
-        for cell in range(lane, distance.shape[1], lanes):
-            distance[item, cell] = wp_unreached
+@wp.func
+def least_distance(x: int, y: int, end_x: int, end_y: int) -> int:
+    """Distance between two cells if nothing is in the way; 0 without an end (-1)."""
+    if end_x < 0:
+        return 0
+    dx = wp.abs(x - end_x)
+    dy = wp.abs(y - end_y)
+    return wp_straight * wp.max(dx, dy) + (wp_diagonal - wp_straight) * wp.min(dx, dy)
 
 
 @wp.func
-def _enter_cell(
-    cell: wp.int32,
-    value: wp.int32,
-    tight: wp.int32,
-    tails: wp.vec2i,
-    passable: wp.array(dtype=wp.uint8),
+def _lower_label(
+    cell: int,
+    x: int,
+    y: int,
+    value: int,
+    end: wp.vec2i,
     distance: wp.array(dtype=wp.int32),
-    queue: wp.array(dtype=wp.int32),
-):
-    """Lowers a cell's label by a step of weight `value` from `distance`, queues it; returns the new tails.
-
-    A queue holds open cells from its front and tight ones from its back: a cell is one or the other.
-    """
-    result = tails
-    if passable[cell] == wp_tight:
-        if value + tight < distance[cell]:
-            distance[cell] = value + tight
-            queue[queue.shape[0] - 1 - tails[1]] = cell
-            result = wp.vec2i(tails[0], tails[1] + 1)
-    elif value < distance[cell]:
-        distance[cell] = value
-        queue[tails[0]] = cell
-        result = wp.vec2i(tails[0] + 1, tails[1])
-    return result
-
-
-@wp.func
-def _step_cell(
-    cell: wp.int32,
-    d: wp.int32,
-    weight: wp.int32,
-    tails: wp.vec2i,
-    passable: wp.array(dtype=wp.uint8),
-    distance: wp.array(dtype=wp.int32),
-    queue: wp.array(dtype=wp.int32),
-):
-    """Enters a cell by a step of `weight` from a cell at distance `d`, if it can be entered."""
-    return _enter_cell(cell, d + weight, weight * (wp_tight_factor - 1), tails, passable, distance, queue)
+    after: wp.array(dtype=wp.int32),
+    before: wp.array(dtype=wp.int32),
+    bucket: wp.array(dtype=wp.int32),
+) -> int:
+    """Lowers a cell's label, if `value` is lower, and moves it to the bucket of its key; returns how many joined."""
+    old = distance[cell]
+    if value >= old:
+        return 0
+    distance[cell] = value
+    left = least_distance(x, y, end[0], end[1])
+    if old < wp_unreached:  # it waits in the bucket of its old key
+        ahead = after[cell]
+        behind = before[cell]
+        if behind < 0:
+            bucket[((old + left) >> 1) & wp_last_bucket] = ahead
+        else:
+            after[behind] = ahead
+        if ahead >= 0:
+            before[ahead] = behind
+    slot = ((value + left) >> 1) & wp_last_bucket
+    head = bucket[slot]
+    after[cell] = head
+    before[cell] = -1
+    if head >= 0:
+        before[head] = cell
+    bucket[slot] = cell
+    return wp.where(old < wp_unreached, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
-def _flood_distance(
+def _search_distance(
     # Grid:
     passable: wp.array2d(dtype=wp.uint8),  # [row, cell], 0 blocked, 1 open, 2 tight
     row_of_item: wp.array(dtype=wp.int32),  # [item]
@@ -104,80 +100,66 @@ def _flood_distance(
     height: wp.array(dtype=wp.int32),  # [grid]
     # Query:
     sources: wp.array2d(dtype=wp.int32),  # [item, source], -1 = none
-    stop: wp.array(dtype=wp.int32),  # [item], the search ends once this cell is settled; -1 = never; SKIP
+    stop: wp.array(dtype=wp.int32),  # [item], the cell whose distance is wanted; -1 = those of all; SKIP
     # Scratch:
-    straight_queue: wp.array2d(dtype=wp.int32),  # [item, cell]
-    diagonal_queue: wp.array2d(dtype=wp.int32),  # [item, cell]
+    next: wp.array2d(dtype=wp.int32),  # [item, cell], of its bucket's list
+    previous: wp.array2d(dtype=wp.int32),  # [item, cell]
+    buckets: wp.array2d(dtype=wp.int32),  # [item, bucket], first cell; -1 = none
+    # State in and out:
+    touched: wp.array2d(dtype=wp.int32),  # [item, 2], first and last cell with a label
     # Out:
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
 ):
     item = wp.tid()
-    stop_cell = stop[item]
-    if stop_cell == wp_skip:
+    goal = stop[item]
+    if goal == wp_skip:
         return
     row = row_of_item[item]
     w = width[grid_of_row[row]]
-    cells = w * height[grid_of_row[row]]
+    h = height[grid_of_row[row]]
     ok = passable[row]
     dist = distance[item]
-    near = straight_queue[item]
-    far = diagonal_queue[item]
-    last = near.shape[0] - 1
-    near_head = wp.vec2i(0, 0)  # of open cells, of tight cells
-    near_tail = wp.vec2i(0, 0)
-    far_head = wp.vec2i(0, 0)
-    far_tail = wp.vec2i(0, 0)
+    after = next[item]
+    before = previous[item]
+    bucket = buckets[item]
+    for cell in range(touched[item, 0], touched[item, 1] + 1):
+        dist[cell] = wp_unreached
+    for k in range(wp_buckets):
+        bucket[k] = -1
+    end = wp.vec2i(-1, -1)
+    if goal >= 0:
+        end = wp.vec2i(goal % w, goal / w)
+    lowest = wp.int32(w * h)
+    highest = wp.int32(-1)
+    waiting = wp.int32(0)
+    key = wp.int32(wp_unreached)
     for i in range(sources.shape[1]):
         source = sources[item, i]
-        if source >= 0 and source < cells:
-            if ok[source] != wp_blocked and dist[source] != 0:
-                dist[source] = 0
-                if ok[source] == wp_tight:
-                    near[last - near_tail[1]] = source
-                    near_tail = wp.vec2i(near_tail[0], near_tail[1] + 1)
-                else:
-                    near[near_tail[0]] = source
-                    near_tail = wp.vec2i(near_tail[0] + 1, near_tail[1])
-
-    level = wp.int32(0)
-    busy = wp.bool(True)
-    while busy:
-        # The nearest of four heads. A label may have dropped since the cell was queued: then another queue
-        # holds it too, and taking it here with its final label is as good.
-        d = wp_unreached
-        cell = wp.int32(-1)
-        which = wp.int32(-1)
-        if near_head[0] < near_tail[0]:
-            cell = near[near_head[0]]
-            d = dist[cell]
-            which = 0
-        if far_head[0] < far_tail[0]:
-            if dist[far[far_head[0]]] < d:
-                cell = far[far_head[0]]
-                d = dist[cell]
-                which = 1
-        if near_head[1] < near_tail[1]:
-            if dist[near[last - near_head[1]]] < d:
-                cell = near[last - near_head[1]]
-                d = dist[cell]
-                which = 2
-        if far_head[1] < far_tail[1]:
-            if dist[far[last - far_head[1]]] < d:
-                cell = far[last - far_head[1]]
-                d = dist[cell]
-                which = 3
-        if which == 0:
-            near_head = wp.vec2i(near_head[0] + 1, near_head[1])
-        elif which == 1:
-            far_head = wp.vec2i(far_head[0] + 1, far_head[1])
-        elif which == 2:
-            near_head = wp.vec2i(near_head[0], near_head[1] + 1)
+        if source >= 0 and source < w * h:
+            if ok[source] != wp_blocked:
+                waiting += _lower_label(source, source % w, source / w, 0, end, dist, after, before, bucket)
+                key = wp.min(key, least_distance(source % w, source / w, end[0], end[1]))
+                lowest = wp.min(lowest, source)
+                highest = wp.max(highest, source)
+    limit = wp.int32(2147483646)
+    while waiting > 0 and key <= limit:
+        slot = (key >> 1) & wp_last_bucket
+        cell = bucket[slot]
+        if cell < 0:
+            key += 2
         else:
-            far_head = wp.vec2i(far_head[0], far_head[1] + 1)
-        busy = which >= 0 and cell != stop_cell
-        if busy and d >= level:  # lower: settled before, through another queue
-            level = d
+            ahead = after[cell]
+            bucket[slot] = ahead
+            if ahead >= 0:
+                before[ahead] = -1
+            waiting -= 1
+            d = dist[cell]
             x = cell % w
+            y = cell / w
+            lowest = wp.min(lowest, cell)
+            highest = wp.max(highest, cell)
+            if cell == goal:
+                limit = d
             east = wp.bool(False)
             west = wp.bool(False)
             if x + 1 < w:
@@ -185,20 +167,29 @@ def _flood_distance(
             if x > 0:
                 west = ok[cell - 1] != wp_blocked
             if east:
-                near_tail = _step_cell(cell + 1, d, wp_straight, near_tail, ok, dist, near)
+                value = d + wp.where(ok[cell + 1] == wp_tight, wp_tight_straight, wp_straight)
+                waiting += _lower_label(cell + 1, x + 1, y, value, end, dist, after, before, bucket)
             if west:
-                near_tail = _step_cell(cell - 1, d, wp_straight, near_tail, ok, dist, near)
+                value = d + wp.where(ok[cell - 1] == wp_tight, wp_tight_straight, wp_straight)
+                waiting += _lower_label(cell - 1, x - 1, y, value, end, dist, after, before, bucket)
             for k in range(2):
-                beside = cell + w - 2 * w * k
-                if beside >= 0 and beside < cells:
+                v = y + 1 - 2 * k
+                if v >= 0 and v < h:
+                    beside = v * w + x
                     if ok[beside] != wp_blocked:
-                        near_tail = _step_cell(beside, d, wp_straight, near_tail, ok, dist, near)
+                        value = d + wp.where(ok[beside] == wp_tight, wp_tight_straight, wp_straight)
+                        waiting += _lower_label(beside, x, v, value, end, dist, after, before, bucket)
                         if east:
                             if ok[beside + 1] != wp_blocked:
-                                far_tail = _step_cell(beside + 1, d, wp_diagonal, far_tail, ok, dist, far)
+                                value = d + wp.where(ok[beside + 1] == wp_tight, wp_tight_diagonal, wp_diagonal)
+                                waiting += _lower_label(beside + 1, x + 1, v, value, end, dist, after, before, bucket)
                         if west:
                             if ok[beside - 1] != wp_blocked:
-                                far_tail = _step_cell(beside - 1, d, wp_diagonal, far_tail, ok, dist, far)
+                                value = d + wp.where(ok[beside - 1] == wp_tight, wp_tight_diagonal, wp_diagonal)
+                                waiting += _lower_label(beside - 1, x - 1, v, value, end, dist, after, before, bucket)
+    # Labels lie at most one row and one column beyond the cells that were left.
+    touched[item, 0] = wp.max(lowest - w - 1, 0)
+    touched[item, 1] = wp.min(highest + w + 1, w * h - 1)
 
 
 class DistanceSearch:
@@ -212,17 +203,21 @@ class DistanceSearch:
 
     Attributes:
         sources: int32 [items, num_sources], cell numbers, -1 = none. Fill before `launch`.
-        stop: int32 [items], end each search once this cell is settled (farther labels are then upper
-            bounds); -1 = search all; `SKIP` = do not search, leave the distances as they are.
+        stop: int32 [items], the one cell whose distance is wanted (other labels are upper bounds, but exact on all
+            shortest ways to it); -1 = search all; `SKIP` = do not search, leave the distances as they are.
         distance: int32 [items, cells], 10 a straight step; `UNREACHED` elsewhere.
     """
 
     def __init__(self, items: int, cells: int, num_sources: int = 1, device: str | wp.Device = "cpu"):
-        self.sources = wp.full((items, num_sources), -1, dtype=wp.int32, device=device)
-        self.stop = wp.full(items, -1, dtype=wp.int32, device=device)
-        self.distance = wp.empty((items, cells), dtype=wp.int32, device=device)
-        self.straight_queue = wp.empty((items, cells), dtype=wp.int32, device=device)
-        self.diagonal_queue = wp.empty((items, cells), dtype=wp.int32, device=device)
+        def numbers(*shape, value=0):
+            return wp.full(shape, value, dtype=wp.int32, device=device)
+
+        self.sources = numbers(items, num_sources, value=-1)
+        self.stop = numbers(items, value=-1)
+        self.distance = numbers(items, cells, value=UNREACHED)
+        self.next, self.previous = numbers(items, cells), numbers(items, cells)
+        self.buckets = numbers(items, BUCKETS)
+        self.touched = numbers(items, 2)  # cell 0 is cleared in vain once
 
     def search(
         self,
@@ -242,13 +237,10 @@ class DistanceSearch:
             grid_of_row: int32 [rows], which grid (map) a row has now.
             width, height: int32 [grids], cells of each grid along x and y.
         """
-        items = self.distance.shape[0]
-        lanes = lanes_on(self.distance.device, 256)
-        launch(_clear_distance, (items, lanes), [self.stop, lanes], [self.distance])
         launch(
-            _flood_distance, items,
+            _search_distance, self.distance.shape[0],
             [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
-            [self.straight_queue, self.diagonal_queue, self.distance],
+            [self.next, self.previous, self.buckets, self.touched, self.distance],
         )  # fmt: skip
 
 

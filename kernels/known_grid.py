@@ -2,6 +2,10 @@
 
 Rows: `rows_per_env` consecutive rows belong to one env, one row where knowledge is shared, one per robot
 where communication is limited. Cells are numbered ``iy * width + ix`` with the width of the env's map.
+
+Painting enters what has become known since the last time, and lists the cells that changed; masks follow that list.
+Knowledge only grows within an episode. A row where less is known than was painted (a new episode, a state that was
+loaded), or whose env has another map, is cleared and painted anew: nobody has to say so.
 """
 
 import numpy as np
@@ -10,8 +14,7 @@ import warp as wp
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
 from maexp.kernels.launches import lanes_on
-from maexp.kernels.planner import is_known
-from maexp.kernels.types import Maps
+from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
 wp_unknown = wp.constant(wp.uint8(UNKNOWN))
 wp_free = wp.constant(wp.uint8(FREE))
@@ -29,9 +32,9 @@ class NavGrids:
     free_cell: wp.array(dtype=wp.int32)  # cell of every free point, in the order of Maps.free
     boundary_cell: wp.array(dtype=wp.int32)  # cell of every boundary point, in the order of Maps.boundary
     cell_begin: wp.array(dtype=wp.int32)  # [M + 1], where a map's cells start in `stand_in`
-    stand_in: wp.array(
-        dtype=wp.int32
-    )  # cell whose state each takes, itself where it holds points; -1 = none
+    stand_in: wp.array(dtype=wp.int32)  # cell whose state each takes, itself where it has points; -1 = none
+    void_begin: wp.array(dtype=wp.int32)  # [all cells + 1], where the voids of a cell start in `voids`
+    voids: wp.array(dtype=wp.int32)  # cells without points of their own, by the cell whose state they take
 
 
 @wp.func
@@ -50,6 +53,12 @@ def nav_center(grids: NavGrids, m: int, cell: int) -> wp.vec2:
     return grids.origin[m] + grids.cell[m] * wp.vec2(float(cell % w) + 0.5, float(cell / w) + 0.5)
 
 
+@wp.func
+def wall_words(width: int) -> int:
+    """Words of a row of the bitmap of walls."""
+    return (width + 31) / 32
+
+
 @wp.kernel(enable_backward=False)
 def _assign_grids(
     # State in:
@@ -63,62 +72,149 @@ def _assign_grids(
 
 
 @wp.kernel(enable_backward=False)
-def _clear_known(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
-    lanes: int,
+def _begin_painting(
     # Out:
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    met: wp.array(dtype=wp.int32),  # [row]
+    news_count: wp.array(dtype=wp.int32),  # [row]
 ):
-    row, lane = wp.tid()
-    m = grid_of_row[row]
-    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
-        known[row, cell] = wp_unknown
+    row = wp.tid()
+    met[row] = 0
+    news_count[row] = 0
+
+
+@wp.func
+def enter_cell(
+    row: int,
+    cell: int,
+    w: int,
+    value: wp.uint8,
+    listed: bool,
+    known: wp.array2d(dtype=wp.uint8),
+    walls: wp.array2d(dtype=wp.int32),
+    news: wp.array2d(dtype=wp.int32),
+    news_count: wp.array(dtype=wp.int32),
+):
+    """Gives a cell a state and lists it."""
+    known[row, cell] = value
+    if value == wp_obstacle:
+        x = cell % w
+        wp.atomic_or(walls, row, cell / w * wall_words(w) + x / 32, 1 << (x % 32))
+    if listed:
+        slot = wp.atomic_add(news_count, row, 1)
+        if slot < news.shape[1]:
+            news[row, slot] = cell
 
 
 @wp.kernel(enable_backward=False)
 def _paint_points(
     # Map:
+    grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
     point_begin: wp.array(dtype=wp.int32),  # [map + 1]
     point_cell: wp.array(dtype=wp.int32),  # [points of all maps]
     # State in:
     flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row], map of what is painted
+    stale: wp.array(dtype=wp.int32),  # [row]
+    again: int,  # 0: every row; 1: rows that were cleared
     rows_per_env: int,
     value: wp.uint8,
+    shift: int,  # of this layer's points in `painted`
     lanes: int,
-    # Out:
+    # State in and out:
+    painted: wp.array2d(dtype=wp.uint8),  # [row, point]
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
+    # Out:
+    met: wp.array(dtype=wp.int32),  # [row], known points
+    total: wp.array(dtype=wp.int32),  # [row], painted points
+    news: wp.array2d(dtype=wp.int32),  # [row, slot]
+    news_count: wp.array(dtype=wp.int32),  # [row]
 ):
-    """Gives `value` to the cells of known points; with one row an env, what any robot knows counts."""
+    """Gives `value` to the cells of points known now and not yet painted, and to the voids that follow them.
+
+    With one row an env, what any robot knows counts. Obstacles come first: a cell that holds one stays one.
+    """
     row, lane = wp.tid()
     e = row / rows_per_env
     m = map_id[e]
+    if m != grid_of_row[row] or (again != 0 and stale[row] == 0):
+        return
     first = point_begin[m]
-    limited = wp.where(rows_per_env > 1, 1, 0)
+    w = grids.width[m]
+    begin = grids.cell_begin[m]
+    # Where knowledge is shared any flag counts, else the robot's own, a bit of one word.
+    robot = row % rows_per_env
+    words = wp.where(rows_per_env > 1, 1, flags.shape[1])
+    mask = wp.where(rows_per_env > 1, 1 << (robot % ROBOTS_PER_WORD), -1)
+    flag = flags[e, robot / ROBOTS_PER_WORD]
+    done = painted[row]
+    found = int(0)
+    added = int(0)
     for point in range(lane, point_begin[m + 1] - first, lanes):
-        if is_known(flags, e, row % rows_per_env, point, limited):
-            known[row, point_cell[first + point]] = value
+        seen = flag[point]
+        for k in range(1, words):
+            seen = seen | flags[e, k, point]
+        if (seen & mask) != 0:
+            found += 1
+            if done[shift + point] == wp.uint8(0):
+                done[shift + point] = wp.uint8(1)
+                added += 1
+                cell = point_cell[first + point]
+                state = known[row, cell]
+                if state == wp_unknown or (value == wp_obstacle and state != value):
+                    listed = again == 0
+                    enter_cell(row, cell, w, value, listed, known, walls, news, news_count)
+                    for k in range(grids.void_begin[begin + cell], grids.void_begin[begin + cell + 1]):
+                        enter_cell(row, grids.voids[k], w, value, listed, known, walls, news, news_count)
+    if again == 0:
+        wp.atomic_add(met, row, found)
+    wp.atomic_add(total, row, added)
 
 
 @wp.kernel(enable_backward=False)
-def _fill_voids(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
-    lanes: int,
+def _find_stale(
+    # State in:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    rows_per_env: int,
+    met: wp.array(dtype=wp.int32),  # [row]
+    capacity: int,
     # State in and out:
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    total: wp.array(dtype=wp.int32),  # [row]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    news_count: wp.array(dtype=wp.int32),  # [row]
+    # Out:
+    stale: wp.array(dtype=wp.int32),  # [row]
 ):
-    """Cells without a point of their own (a cloud is no lattice) take the state of their stand-in."""
+    """A row is stale where something painted is not known (any more), or was on another map."""
+    row = wp.tid()
+    m = map_id[row / rows_per_env]
+    stale[row] = wp.where(met[row] != total[row] or m != grid_of_row[row], 1, 0)
+    if stale[row] != 0:
+        total[row] = 0
+        grid_of_row[row] = m
+    if stale[row] != 0 or news_count[row] > capacity:
+        news_count[row] = -1
+
+
+@wp.kernel(enable_backward=False)
+def _clear_stale(
+    # State in:
+    stale: wp.array(dtype=wp.int32),  # [row]
+    lanes: int,
+    # Out:
+    painted: wp.array2d(dtype=wp.uint8),  # [row, point]
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
+):
     row, lane = wp.tid()
-    m = grid_of_row[row]
-    first = grids.cell_begin[m]
-    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
-        other = grids.stand_in[first + cell]
-        if other >= 0 and other != cell:
-            known[row, cell] = known[row, other]
+    if stale[row] != 0:
+        for point in range(lane, painted.shape[1], lanes):
+            painted[row, point] = wp.uint8(0)
+        for cell in range(lane, known.shape[1], lanes):
+            known[row, cell] = wp_unknown
+        for word in range(lane, walls.shape[1], lanes):
+            walls[row, word] = 0
 
 
 @wp.kernel(enable_backward=False)
@@ -128,19 +224,74 @@ def _open_cells(
     grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
     # State in:
     known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
     through_unknown: int,
     lanes: int,
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
+    """Masks to be drawn anew: open but for obstacles."""
     row, lane = wp.tid()
     m = grid_of_row[row]
     source = known_of_row[row]
+    if news_count[source] >= 0:
+        return
     for cell in range(lane, grids.width[m] * grids.height[m], lanes):
         state = known[source, cell]
         open = state == wp_free or (state == wp_unknown and through_unknown != 0)
         passable[row, cell] = wp.where(open, wp.uint8(1), wp.uint8(0))
+
+
+@wp.func
+def near_wall(
+    known: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int, radius: float
+) -> bool:
+    """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
+    reach = int(wp.ceil(radius))
+    found = wp.bool(False)
+    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+            if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
+                found = found or known[row, v * w + u] == wp_obstacle
+    return found
+
+
+@wp.kernel(enable_backward=False)
+def _open_news(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # State in:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
+    news_count: wp.array(dtype=wp.int32),  # [known row]
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    lanes: int,
+    # Out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    """Opens cells that have become known to be free; the next launches close those near obstacles."""
+    row, lane = wp.tid()
+    source = known_of_row[row]
+    for k in range(lane, news_count[source], lanes):
+        if known[source, news[source, k]] == wp_free:
+            passable[row, news[source, k]] = wp.uint8(1)
+
+
+@wp.func
+def close_around(
+    cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)
+):
+    """Gives `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
+    x = cell % w
+    y = cell / w
+    reach = int(wp.ceil(r))
+    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+            if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
+                if passable[row, v * w + u] != wp_blocked:
+                    passable[row, v * w + u] = value
 
 
 @wp.kernel(enable_backward=False)
@@ -150,15 +301,18 @@ def _close_cells(
     grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
     # State in:
     known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
+    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
     radius: wp.array(dtype=wp.float32),  # [mask row], distance from known obstacle cells [m]
     margin: float,  # the same, on top, in cells
     value: wp.uint8,
+    through_unknown: int,
     lanes: int,
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
-    """Gives `value` to what is not blocked and lies nearer than the radius to known obstacles.
+    """Closes the surroundings of obstacles (those that are news), and cells that have opened near older ones.
 
     Threads that write the same cell write the same.
     """
@@ -168,16 +322,19 @@ def _close_cells(
     h = grids.height[m]
     source = known_of_row[row]
     r = radius[row] / grids.cell[m] + margin
-    reach = int(wp.ceil(r))
-    for cell in range(lane, w * h, lanes):
+    if news_count[source] < 0:
+        for cell in range(lane, w * h, lanes):
+            if known[source, cell] == wp_obstacle:
+                close_around(cell, w, h, row, r, value, passable)
+    for k in range(lane, news_count[source], lanes):
+        cell = news[source, k]
         if known[source, cell] == wp_obstacle:
-            x = cell % w
-            y = cell / w
-            for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-                for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-                    if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
-                        if passable[row, v * w + u] != wp_blocked:
-                            passable[row, v * w + u] = value
+            if value == wp_blocked:
+                passable[row, cell] = wp_blocked
+            close_around(cell, w, h, row, r, value, passable)
+        elif through_unknown == 0:
+            if near_wall(known, source, cell % w, cell / w, w, h, r):
+                passable[row, cell] = value
 
 
 class KnownGrids:
@@ -192,7 +349,9 @@ class KnownGrids:
 
     Attributes:
         known: uint8 [E * rows_per_env, cells]: `UNKNOWN`, `FREE` or `OBSTACLE`.
+        walls: int32 [E * rows_per_env, words], a bit for every `OBSTACLE`; rows of cells begin with a word.
         grid_of_row: int32 [E * rows_per_env], the map of each row; set by `paint`.
+        news, news_count: cells that the last `paint` changed, and how many; -1 = any may have.
     """
 
     def __init__(
@@ -209,30 +368,56 @@ class KnownGrids:
         self.free_flags, self.boundary_flags = free_flags, boundary_flags
         self.rows_per_env = rows_per_env
         self.lanes = lanes_on(map_id.device, 256)
-        rows = map_id.shape[0] * rows_per_env
-        self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=map_id.device)
-        self.grid_of_row = wp.zeros(rows, dtype=wp.int32, device=map_id.device)
+        rows, device = map_id.shape[0] * rows_per_env, map_id.device
+        points = free_flags.shape[2] + boundary_flags.shape[2]
+        self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=device)
+        self.walls = wp.zeros((rows, wall_capacity(grids)), dtype=wp.int32, device=device)
+        self.painted = wp.zeros((rows, points), dtype=wp.uint8, device=device)
+        self.grid_of_row = wp.full(rows, -1, dtype=wp.int32, device=device)
+        self.news = wp.zeros((rows, news_capacity(cells)), dtype=wp.int32, device=device)
+        self.news_count = wp.full(rows, -1, dtype=wp.int32, device=device)
+        self.met, self.total, self.stale = (wp.zeros(rows, dtype=wp.int32, device=device) for _ in range(3))
 
     def paint(self, launch) -> None:
         """Brings `known` up to date; ``launch(kernel, dim, inputs, outputs)`` launches or records."""
         rows = self.known.shape[0]
-        launch(_assign_grids, rows, [self.map_id, self.rows_per_env], [self.grid_of_row])
-        dim = (rows, self.lanes)
-        launch(_clear_known, dim, [self.grids, self.grid_of_row, self.lanes], [self.known])
+        launch(_begin_painting, rows, [], [self.met, self.news_count])
+        self._paint_layers(launch, again=0)
+        launch(
+            _find_stale, rows, [self.map_id, self.rows_per_env, self.met, self.news.shape[1]],
+            [self.total, self.grid_of_row, self.news_count, self.stale],
+        )  # fmt: skip
+        launch(_clear_stale, (rows, self.lanes), [self.stale, self.lanes], [self.painted, self.known, self.walls])
+        self._paint_layers(launch, again=1)
+
+    def _paint_layers(self, launch, again: int) -> None:
+        maps, grids, after_free = self.maps, self.grids, self.free_flags.shape[2]
         layers = [
-            (self.maps.free_begin, self.grids.free_cell, self.free_flags, FREE),
-            (self.maps.boundary_begin, self.grids.boundary_cell, self.boundary_flags, OBSTACLE),
+            (maps.boundary_begin, grids.boundary_cell, self.boundary_flags, OBSTACLE, after_free),
+            (maps.free_begin, grids.free_cell, self.free_flags, FREE, 0),
         ]
-        for begin, cell, flags, value in layers:
+        for begin, cell, flags, value, shift in layers:
             launch(
-                _paint_points, dim,
-                [self.map_id, begin, cell, flags, self.rows_per_env, wp.uint8(value), self.lanes], [self.known],
+                _paint_points, (self.known.shape[0], self.lanes),
+                [self.grids, self.map_id, begin, cell, flags, self.grid_of_row, self.stale, again, self.rows_per_env,
+                 wp.uint8(value), shift, self.lanes],
+                [self.painted, self.known, self.walls, self.met, self.total, self.news, self.news_count],
             )  # fmt: skip
-        launch(_fill_voids, dim, [self.grids, self.grid_of_row, self.lanes], [self.known])
+
+
+def news_capacity(cells: int) -> int:
+    """Cells that may change in one painting before masks are drawn anew instead."""
+    return max(256, cells // 4)
+
+
+def wall_capacity(grids: NavGrids) -> int:
+    """Words of the bitmap of walls of the largest grid."""
+    return int((grids.height.numpy() * -(-grids.width.numpy() // 32)).max())
 
 
 class PassableGrids:
-    """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep.
+    """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep. Paint after every painting
+    of those.
 
     Args:
         known: the grids to read.
@@ -272,11 +457,17 @@ class PassableGrids:
     def paint(self, launch) -> None:
         """Brings `passable` up to date with `known`."""
         launch(_assign_grids, self.grid_of_row.shape, [self.known.map_id, self.masks], [self.grid_of_row])
-        grids, lanes = self.known.grids, self.known.lanes
-        dim = (self.passable.shape[0], lanes)
-        inputs = [grids, self.grid_of_row, self.known.known, self.known_of_row]
-        launch(_open_cells, dim, [*inputs, self.through_unknown, lanes], [self.passable])
+        known, lanes = self.known, self.known.lanes
+        dim, all_known = (self.passable.shape[0], lanes), [known.grids, self.grid_of_row, known.known]
+        launch(
+            _open_cells, dim, [*all_known, known.news_count, self.known_of_row, self.through_unknown, lanes],
+            [self.passable],
+        )  # fmt: skip
+        inputs = [*all_known, known.news, known.news_count, self.known_of_row]
+        if not self.through_unknown:
+            launch(_open_news, dim, [*inputs, lanes], [self.passable])
         for radius, value in self.rings:
             launch(
-                _close_cells, dim, [*inputs, radius, self.margin, wp.uint8(value), lanes], [self.passable]
-            )
+                _close_cells, dim,
+                [*inputs, radius, self.margin, wp.uint8(value), self.through_unknown, lanes], [self.passable],
+            )  # fmt: skip

@@ -7,8 +7,7 @@ clearance shrinks where the path itself is narrower.
 
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE
-from maexp.kernels.known_grid import NavGrids, nav_center
+from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.types import Robots, point_xy
 from maexp.kernels.ways import path_slot, wp_path_cells
 
@@ -35,7 +34,6 @@ wp_look_cells = wp.constant(LOOK_CELLS)
 wp_ahead = wp.constant(AHEAD)
 wp_fit = wp.constant(FIT)
 wp_least = wp.constant(LEAST)
-wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
 
 
 @wp.func
@@ -65,18 +63,30 @@ def clear_ahead(
 
 
 @wp.func
-def nearest_obstacle(grids: NavGrids, m: int, known: wp.array2d(dtype=wp.uint8), row: int, at: wp.vec2) -> float:
+def nearest_obstacle(grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32), row: int, at: wp.vec2) -> float:
     """Distance to the nearest known obstacle cell [m], `LOOK_CELLS` cells at most."""
     w = grids.width[m]
-    h = grids.height[m]
     p = (at - grids.origin[m]) / grids.cell[m]
     x = int(wp.floor(p[0]))
     y = int(wp.floor(p[1]))
+    first = wp.max(x - wp_look_cells, 0)
+    last = wp.min(x + wp_look_cells, w - 1)
     nearest = float(wp_look_cells)
-    for v in range(wp.max(y - wp_look_cells, 0), wp.min(y + wp_look_cells, h - 1) + 1):
-        for u in range(wp.max(x - wp_look_cells, 0), wp.min(x + wp_look_cells, w - 1) + 1):
-            if known[row, v * w + u] == wp_obstacle:
+    if first <= last:
+        across = wall_words(w)
+        low = first / 32
+        shift = first % 32
+        window = (wp.uint32(1) << wp.uint32(last - first + 1)) - wp.uint32(1)
+        for v in range(wp.max(y - wp_look_cells, 0), wp.min(y + wp_look_cells, grids.height[m] - 1) + 1):
+            bits = wp.uint32(walls[row, v * across + low]) >> wp.uint32(shift)
+            if last / 32 > low:
+                bits = bits | (wp.uint32(walls[row, v * across + low + 1]) << wp.uint32(32 - shift))
+            bits = bits & window
+            while bits != wp.uint32(0):
+                below = bits - wp.uint32(1)
+                u = first + int(wp.bit_count(below & ~bits))
                 nearest = wp.min(nearest, wp.length(wp.vec2(float(u) + 0.5, float(v) + 0.5) - p))
+                bits = bits & below
     return nearest * grids.cell[m]
 
 
@@ -84,7 +94,7 @@ def nearest_obstacle(grids: NavGrids, m: int, known: wp.array2d(dtype=wp.uint8),
 def room_ahead(
     grids: NavGrids,
     m: int,
-    known: wp.array2d(dtype=wp.uint8),
+    walls: wp.array2d(dtype=wp.int32),
     row: int,
     at: wp.vec2,
     velocity: wp.vec2,
@@ -96,7 +106,7 @@ def room_ahead(
     room = float(1.0e30)
     for k in range(wp_samples + 1):
         s = span * float(k) / float(wp_samples)
-        gap = nearest_obstacle(grids, m, known, row, at + ahead * s) - threshold
+        gap = nearest_obstacle(grids, m, walls, row, at + ahead * s) - threshold
         room = wp.min(room, wp_brake * s + wp_headroom * wp.max(gap, 0.0))
     return room
 
@@ -106,7 +116,7 @@ def _fit_clearance(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
     rows_per_env: int,
     # Robots:
     robots: Robots,
@@ -134,7 +144,7 @@ def _fit_clearance(
     for j in range(wp.min(wp.min(total, wp_path_cells), path_used[item] + 1)):
         point = nav_center(grids, m, path[item, path_slot(j, total)])
         if wp.length(point - at) <= wp_ahead * full:
-            gap = wp.min(gap, nearest_obstacle(grids, m, known, row, point))
+            gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, point))
     least = wp.min(wp_least * robots.threshold[e, i], full)
     clearance[e, i] = wp.clamp(wp_fit * gap, least, full)
 
@@ -144,7 +154,7 @@ def _hold_back(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
     rows_per_env: int,
     # Robots:
     robots: Robots,
@@ -183,9 +193,9 @@ def _hold_back(
     span = 0.5 * wp.dot(velocity, velocity) / accel + clearance
     stops = wp.length(target[e, i] - goal[e, i]) == 0.0
     room = clear_ahead(e, i, way, 2.0 * clearance, stops, collided, center)
-    room = wp.min(room, room_ahead(grids, m, known, row, at, velocity, threshold, span))
-    gap = nearest_obstacle(grids, m, known, row, at)
-    gap = wp.min(gap, nearest_obstacle(grids, m, known, row, at + velocity * wp_slack_time))
+    room = wp.min(room, room_ahead(grids, m, walls, row, at, velocity, threshold, span))
+    gap = nearest_obstacle(grids, m, walls, row, at)
+    gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, at + velocity * wp_slack_time))
     spare = wp.max(gap - threshold, 0.0)
     slack = wp_slack * spare * wp.min(spare / (wp_slack_gap * threshold), 1.0)
     length = wp.max(lead_time * wp.sqrt(2.0 * accel * room) + slack, wp_creep * clearance)

@@ -128,7 +128,9 @@ def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
     return result
 
 
-def grid_memory_per_env(cells: int, robots: int, known_rows: int, masks: int) -> int:
+def grid_memory_per_env(
+    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int
+) -> int:
     """Bytes of the `wavefront` planner's grids and paths for one env (`kernels.wavefront`, `known_grid`, `geodesic`).
 
     Args:
@@ -136,10 +138,13 @@ def grid_memory_per_env(cells: int, robots: int, known_rows: int, masks: int) ->
         robots: N.
         known_rows: grids of what is known, 1 for the team or one per robot.
         masks: grids of where robots fit.
+        points: free and boundary points of the largest maps.
+        wall_words: words of the bitmap of walls of the largest grid.
+        news: capacity of the list of cells that changed.
     """
-    known = known_rows * (cells + 4)  # uint8 per cell; the map of each row
+    known = known_rows * (cells + points + 4 * (wall_words + news) + 5 * 4)  # bytes, flags, words; counters of a row
     passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
-    search = robots * (3 * 4 * cells + 2 * 4)  # distances and two queues, int32; source and stop
+    search = robots * (3 * 4 * cells + 4 * 64 + 4 * 4)  # distances and lists of buckets, int32; BUCKETS, ends
     paths = robots * (4 * 64 + 4 * 4)  # PATH_CELLS cells; length, place, end, mask of each
     return known + passable + search + paths
 

@@ -23,6 +23,7 @@ from maexp.kernels.ways import (
     PATH_CELLS,
     in_sight,
     is_passable,
+    nearest_cell,
     nearest_passable,
     path_slot,
     step_back,
@@ -52,11 +53,16 @@ def _start_search(
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
     path_total: wp.array(dtype=wp.int32),  # [item]
     path_used: wp.array(dtype=wp.int32),  # [item]
+    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     # Out:
     sources: wp.array2d(dtype=wp.int32),  # [item, 1]
     stop: wp.array(dtype=wp.int32),  # [item]
 ):
-    """Which robots need a new path, from where and to where; the others skip the search."""
+    """Which robots need a new path, from where and to where; the others skip the search.
+
+    A goal where no robot fits is replaced by the nearest cell where one does: should that be out of reach, the search
+    will have reached all that can be.
+    """
     e, i = wp.tid()
     item = e * center.shape[1] + i
     stop[item] = wp_skip
@@ -81,7 +87,7 @@ def _start_search(
         start = nearest_passable(passable, row, nav_cell(grids, m, point_xy(center[e, i])), w, h)
         end = nav_cell(grids, m, goal[e, i])
         if not is_passable(passable, row, end):
-            end = -1
+            end = nearest_cell(end, passable, row, distance, -1, w, h)
         sources[item, 0] = start
         stop[item] = end
 
@@ -112,21 +118,13 @@ def _trace_path(
     w = grids.width[m]
     h = grids.height[m]
     end = stop[item]
-    path_ends[item] = 1
+    wanted = nav_cell(grids, m, goal[e, i])
     if end >= 0:
         if distance[item, end] >= wp_unreached:
             end = -1
     if end < 0:
-        path_ends[item] = 0
-        wanted = nav_cell(grids, m, goal[e, i])
-        nearest = wp.int32(1 << 30)
-        for cell in range(w * h):
-            if distance[item, cell] < wp_unreached:
-                x = cell % w - wanted % w
-                y = cell / w - wanted / w
-                if x * x + y * y < nearest:
-                    nearest = x * x + y * y
-                    end = cell
+        end = nearest_cell(wanted, passable, row_of_item[item], distance, item, w, h)
+    path_ends[item] = wp.where(end == wanted and end == stop[item], 1, 0)
     total = wp.int32(0)
     cell = end
     while cell >= 0:
@@ -220,7 +218,7 @@ class PathSearch:
         launch(
             _start_search, self.shape,
             [known.grids, known.map_id, active, collided, center, goal, target, masks.passable,
-             self.row_of_item, self.path, self.path_total, self.path_used],
+             self.row_of_item, self.path, self.path_total, self.path_used, self.search.distance],
             [self.search.sources, self.search.stop],
         )  # fmt: skip
         self.flood(launch)
@@ -303,7 +301,7 @@ class Wavefront:
     def pick_waypoints(self, launch) -> None:
         s = self.view
         self.paths.pick(launch, s.active, s.collided, s.center, s.goal, self.robots.radar_range, s.target)
-        known = [self.known.grids, s.map_id, self.known.known, self.known.rows_per_env]
+        known = [self.known.grids, s.map_id, self.known.walls, self.known.rows_per_env]
         launch(
             _fit_clearance, self.paths.shape,
             [*known, self.robots, s.active, s.collided, s.center, self.paths.path, self.paths.path_total,

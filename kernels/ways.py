@@ -40,6 +40,52 @@ def nearest_passable(passable: wp.array2d(dtype=wp.uint8), row: int, cell: int, 
 
 
 @wp.func
+def nearer(
+    x: int, y: int, dx: int, dy: int, found: wp.vec2i, passable: wp.array2d(dtype=wp.uint8), row: int,
+    distance: wp.array2d(dtype=wp.int32), item: int, w: int, h: int,
+) -> wp.vec2i:
+    """`found` (a squared gap, a cell), or the cell at (x + dx, y + dy) if it is nearer and counts."""  # fmt: skip
+    result = found
+    u = x + dx
+    v = y + dy
+    gap = dx * dx + dy * dy
+    if u >= 0 and u < w and v >= 0 and v < h:
+        cell = v * w + u
+        if gap < found[0] or (gap == found[0] and cell < found[1]):
+            counts = wp.bool(False)
+            if item >= 0:
+                counts = distance[item, cell] < wp_unreached
+            else:
+                counts = is_passable(passable, row, cell)
+            if counts:
+                result = wp.vec2i(gap, cell)
+    return result
+
+
+@wp.func
+def nearest_cell(
+    cell: int, passable: wp.array2d(dtype=wp.uint8), row: int, distance: wp.array2d(dtype=wp.int32), item: int,
+    w: int, h: int,
+) -> int:
+    """The reached cell of `item` (the passable cell of `row`, if `item` is -1) nearest to a cell; -1 where none is.
+
+    Of several as near the one with the lowest number.
+    """  # fmt: skip
+    x = cell % w
+    y = cell / w
+    found = wp.vec2i(1 << 30, -1)
+    k = wp.int32(0)
+    while k < wp.max(w, h) and k * k <= found[0]:  # squares around the cell, from the inside out
+        for j in range(-k, k + 1):
+            found = nearer(x, y, j, -k, found, passable, row, distance, item, w, h)
+            found = nearer(x, y, j, k, found, passable, row, distance, item, w, h)
+            found = nearer(x, y, -k, j, found, passable, row, distance, item, w, h)
+            found = nearer(x, y, k, j, found, passable, row, distance, item, w, h)
+        k += 1
+    return found[1]
+
+
+@wp.func
 def in_sight(passable: wp.array2d(dtype=wp.uint8), row: int, start: int, end: int, w: int) -> bool:
     """Whether every cell that the segment between two cell centres touches, `start` apart, is passable."""
     x = start % w

@@ -16,7 +16,7 @@ from maexp.kernels.ways import PATH_CELLS
 pytestmark = pytest.mark.kernels
 
 launch = partial(wp.launch, device="cpu")
-SIZES = ((13, 20), (17, 9))  # height, width of the two maps
+SIZES = ((13, 41), (17, 9))  # height, width of the two maps; one row of cells takes two words
 CELL = np.array([0.5, 2.0])
 ORIGIN = np.array([[-3.0, 4.0], [1.0, -9.0]])
 MAP_OF_ENV = [1, 0, 1]
@@ -57,6 +57,14 @@ class World:
         self.accel, self.threshold, self.clearance = (rng.uniform(a, b, (3, ROBOTS)) for a, b in
                                                       ((1, 3), (0.3, 0.8), (0.9, 2.0)))  # fmt: skip
 
+    def walls(self) -> wp.array:
+        """A bit for every obstacle cell, rows of cells padded to words of 32."""
+        words = np.zeros((3, max(h * -(-w // 32) for h, w in SIZES)), np.uint32)
+        for row, known in zip(words, self.known, strict=True):
+            padded = np.pad(known == OBSTACLE, ((0, 0), (0, -known.shape[1] % 32))).reshape(-1, 32)
+            row[: len(padded)] = (padded << np.arange(32, dtype=np.uint32)).sum(1)
+        return array(words.view(np.int32), wp.int32)
+
     def metres(self, places) -> np.ndarray:
         return places * self.cell[..., None] + ORIGIN[MAP_OF_ENV][:, None]
 
@@ -92,7 +100,7 @@ def test_waypoints_leave_room_to_brake():
         goal = np.where((world.goal == world.target)[..., :1], target.numpy()[..., :2], world.metres(world.goal))
         launch(
             pace._hold_back, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), 1, world.robots(), LEAD,
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.walls(), 1, world.robots(), LEAD,
              active, collided, array(pose, wp.vec4), array(world.slip * world.cell, wp.float32), center,
              array(goal, wp.vec2)],
             [target],
@@ -130,7 +138,7 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
         clearance = array(np.full((3, ROBOTS), -1.0), wp.float32)
         launch(
             pace._fit_clearance, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), 1, world.robots(),
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.walls(), 1, world.robots(),
              active, collided, center, array(path, wp.int32), array(total, wp.int32), array(used, wp.int32)],
             [clearance],
         )  # fmt: skip

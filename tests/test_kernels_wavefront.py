@@ -11,6 +11,7 @@ from oracle.grid import geodesic_distance
 from maexp.envs.map import PointCloudMap
 from maexp.envs.nav_grid import build_nav_grid, stack_nav_grids
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.geodesic import SKIP
 from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import PathSearch, distinct_masks
@@ -256,10 +257,9 @@ def test_a_path_is_kept_until_it_is_blocked_used_up_or_out_of_sight():
     assert paths.path_total.numpy()[0] == 198 > PATH_CELLS
 
     def replanned(x: float, blocked=()) -> bool:
-        paths.search.distance.fill_(-7)
         wall_off(paths, list(blocked))
         run_planner(scene, np.array([[[x, 1.5]]]), goal, 6.0, paths, target=first)
-        return paths.search.distance.numpy()[0, 0] != -7
+        return paths.search.stop.numpy()[0] != SKIP
 
     assert not replanned(2.5)
     assert not replanned(2.5, [width + 80])  # beyond what is kept
@@ -284,9 +284,8 @@ def test_a_new_goal_always_searches_anew_and_stopped_robots_never():
         (goal, {"collided": [[1]]}, False),
     ]
     for before, state, searches in cases:
-        paths.search.distance.fill_(-7)
         target, _ = run_planner(scene, at, goal, 2.0, paths, target=before, **state)
-        assert (paths.search.distance.numpy()[0, 0] != -7) == searches
+        assert (paths.search.stop.numpy()[0] != SKIP) == searches
         np.testing.assert_allclose(target, goal if state else first)  # a stopped robot's is left alone
 
 
@@ -370,4 +369,5 @@ def test_robots_alike_share_a_mask():
 def test_nav_grids_struct_has_every_field():
     assert set(NavGrids.vars) == {
         "origin", "cell", "width", "height", "free_cell", "boundary_cell", "cell_begin", "stand_in",
+        "void_begin", "voids",
     }  # fmt: skip
