@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 from tensordict import TensorDict
-from tensordict.nn import CompositeDistribution, InteractionType, TensorDictModule
+from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, distributions, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from maexp.agents.distributions import ACTION, Heads, RegionHeads
 from maexp.agents.model import ModelConfig, model_config
 from maexp.agents.networks import TargetGenerator
 
@@ -16,7 +17,6 @@ GRID = ("agents", "observation", "grid")
 COMM = ("agents", "observation", "comm")
 OBSERVATION = (MAP, POSE, GRID, COMM)
 PARAMS = ("agents", "params")
-ACTION = ("agents", "action")
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
 CONTROL_HEADS = {"control": IndependentNormal}
 PARAM_NAMES = {distributions.Categorical: ("logits",), IndependentNormal: ("loc", "scale")}
@@ -80,20 +80,18 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
         env: gives the specs and the device; not kept
         model: a preset's name or a ModelConfig
     """
-    shape = observation_shape(env)
-    network = TargetGenerator(model_config(model), shape.channels, shape.side, shape.regions)
+    shape, config = observation_shape(env), model_config(model)
+    network = TargetGenerator(config, shape.channels, shape.side, shape.regions)
     heads = REGION_HEADS if shape.regions else CONTROL_HEADS
+    joint = shape.regions and config.offsets == "per_region"
     module = TensorDictModule(ActionParams(network, heads), in_keys=list(OBSERVATION), out_keys=[PARAMS])
     actor = ProbabilisticActor(
         module,
         in_keys=[PARAMS],
+        out_keys=[(*ACTION, head) for head in heads],
         spec=None,
-        distribution_class=CompositeDistribution,
-        distribution_kwargs={
-            "distribution_map": heads,
-            "name_map": {head: (*ACTION, head) for head in heads},
-            "extra_kwargs": {head: {"validate_args": False} for head in heads},
-        },
+        distribution_class=RegionHeads if joint else Heads,
+        distribution_kwargs={"heads": heads},
         return_log_prob=True,
         default_interaction_type=InteractionType.RANDOM,
     )

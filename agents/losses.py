@@ -7,16 +7,15 @@ loss_critic (and loss_kl), plus what one likes to log.
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import CompositeDistribution, set_composite_lp_aggregate
 from torch import Tensor
-from torch.distributions import kl_divergence
 from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.utils import distance_loss
 
-from maexp.agents.actor import PARAM_NAMES, PARAMS
+from maexp.agents.actor import PARAMS
 from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
 from maexp.agents.critics import TEAM_VALUE, VALUE
+from maexp.agents.distributions import Heads
 
 
 class NonFiniteLoss(ArithmeticError):
@@ -32,20 +31,16 @@ def check_finite(name: str, value: Tensor) -> None:
         )
 
 
-def policy_divergence(batch: TensorDictBase, dist: CompositeDistribution) -> Tensor:
-    """KL(policy that acted || dist), summed over the heads, shape [*, robots].
+def policy_divergence(batch: TensorDictBase, dist: Heads) -> Tensor:
+    """KL(policy that acted || dist) over the whole action, shape [*, robots].
 
     Raises:
         KeyError: the batch holds no ("agents", "params") of the policy that acted.
     """
-    total = 0.0
-    for name, new in dist.dists.items():
-        kind = type(new)
-        params = {key: batch.get((*PARAMS, name[-1], key)) for key in PARAM_NAMES[kind]}
-        if any(value is None for value in params.values()):
-            raise KeyError(f"The batch lacks {(*PARAMS, name[-1])}; keep what the policy wrote while it acted.")
-        total = total + kl_divergence(kind(**params, validate_args=False), new)
-    return total
+    params = batch.get(PARAMS)
+    if params is None:
+        raise KeyError(f"The batch lacks {PARAMS}; keep what the policy wrote while it acted.")
+    return dist.divergence_from(params)
 
 
 class RobotValues:
@@ -144,7 +139,7 @@ class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
         advantage = batch.get(self.tensor_keys.advantage)
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
         log_weight, dist, _, _ = self._log_weight(batch.copy(), adv_shape=advantage.shape[:-1])
-        entropy = sum(head.entropy() for head in dist.dists.values()).unsqueeze(-1)
+        entropy = dist.entropy().unsqueeze(-1)
         objective, entropy = -(log_weight.exp() * advantage).mean(), entropy.mean()
         self.__dict__["terms"] = {"loss_objective": objective.item(), "entropy": entropy.item()}
         return objective - self.entropy_coeff * entropy, policy_divergence(batch, dist).mean()
@@ -171,10 +166,9 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
         following = [("next", *key) for key in self.critic_network.in_keys]
         return [*self.tensor_keys.action, *ends, *seen, *following]
 
-    def get_entropy_bonus(self, dist: CompositeDistribution) -> Tensor:
-        return sum(head.entropy() for head in dist.dists.values()).unsqueeze(-1)
+    def get_entropy_bonus(self, dist: Heads) -> Tensor:
+        return dist.entropy().unsqueeze(-1)
 
-    @set_composite_lp_aggregate(False)
     def _log_probs(self, tensordict: TensorDictBase):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(tensordict.select(*self.actor_network.in_keys))

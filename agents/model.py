@@ -19,6 +19,8 @@ class ModelConfig:
         feedforward: width of the feed-forward layers as a multiple of the cell's features.
         merge_maps: show each cell what the robots in contact have explored together, as two more input
             channels. The attention can find that out by itself, only later.
+        offsets: "per_region" gives each region an offset of its own; with one "shared" by all regions, as in the
+            paper, a policy cannot even copy a planner.
         critic_hidden: width of the critic's hidden layers.
     """
 
@@ -29,6 +31,7 @@ class ModelConfig:
     heads: int = whole(1, most=64)
     feedforward: int = whole(2, most=64)
     merge_maps: bool = flag(True)
+    offsets: str = choice("per_region", "shared")
     critic_hidden: int = whole(64, most=4096)
 
     def __post_init__(self):
@@ -48,7 +51,8 @@ class ModelConfig:
 PRESETS = {
     "small": ModelConfig(),
     "paper": ModelConfig(
-        stem="conv", channels=32, grid_features=16, depth=2, heads=4, merge_maps=False, critic_hidden=128
+        stem="conv", channels=32, grid_features=16, depth=2, heads=4, merge_maps=False, offsets="shared",
+        critic_hidden=128,
     ),
 }
 

@@ -1,4 +1,4 @@
-"""The Multi-Agent Target Generator: Spatial-TeamFormer and the two heads that choose a goal.
+"""The Multi-Agent Target Generator: Spatial-TeamFormer and the heads that choose a goal.
 
 After the paper's section IV-D and the Spatial-TeamFormer of MAANS (Yu et al. 2022). One set of weights
 serves a team of any size, and permuting the robots permutes the output.
@@ -101,13 +101,16 @@ class TargetGenerator(nn.Module):
         self.blocks = nn.ModuleList(TeamFormerBlock(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.width)
         self.merge = TeamAttention(config.width, config.heads)
-        self.cells = nn.Linear(config.width, 2)
-        self.fine = nn.Linear(side * side, 4)
+        self.per_region = regions and config.offsets == "per_region"
+        self.cells = nn.Linear(config.width, 5 if self.per_region else 2)
+        self.fine = None if self.per_region else nn.Linear(side * side, 4)
         self._start_uniform()
 
     def _start_uniform(self) -> None:
         """Start with nearly equal logits and a wide offset around each region's centre."""
         for layer, gain in ((self.cells, 0.1), (self.fine, 0.01)):
+            if layer is None:
+                continue
             nn.init.orthogonal_(layer.weight, gain)
             nn.init.zeros_(layer.bias)
 
@@ -121,7 +124,8 @@ class TargetGenerator(nn.Module):
             comm: who hears whom, bool [*, robots, robots]
 
         Returns:
-            logits [*, robots, L * L] (left out for a control action), mean and scale [*, robots, 2]
+            logits [*, robots, L * L] (left out for a control action), mean and scale of the offset or control,
+            [*, robots, 2], or [*, robots, L * L, 2] where each region has an offset of its own
         """
         lead = comm.shape[:-2]
         picture, pose, grid, comm = (
@@ -133,8 +137,11 @@ class TargetGenerator(nn.Module):
             cells = block(cells, bias)
         cells = cells + self.merge(own, self.norm(cells), bias)
         cells = self.cells(cells)
-        coarse, fine = cells.reshape(*lead, *cells.shape[1:]).unbind(-1)
-        mean, scale = self.fine(fine).chunk(2, dim=-1)
+        cells = cells.reshape(*lead, *cells.shape[1:])
+        coarse, fine = cells[..., 0], cells[..., 1:]
+        if not self.per_region:
+            fine = self.fine(fine.squeeze(-1))
+        mean, scale = fine.chunk(2, dim=-1)
         mean, scale = mean.tanh(), MIN_SCALE + (MAX_SCALE - MIN_SCALE) * scale.sigmoid()
         return (coarse, mean, scale) if self.regions else (mean, scale)
 

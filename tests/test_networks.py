@@ -149,7 +149,18 @@ def test_policy_starts_near_uniform_and_modes_differ_from_samples(env):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         calm = policy(states(64, 3))
     assert torch.equal(calm["agents", "action", "region"], probabilities.argmax(-1))
-    assert torch.equal(calm["agents", "action", "offset"], calm["agents", "params", "offset", "loc"])
+    every, chosen = calm["agents", "params", "offset", "loc"], calm["agents", "action", "region"]
+    assert torch.equal(calm["agents", "action", "offset"], every.take_along_dim(chosen[..., None, None], -2)[..., 0, :])
+
+
+def test_offsets_belong_to_regions_or_are_shared(env):
+    for kind, shape in (("per_region", (4, 3, SIDE**2, 2)), ("shared", (4, 3, 2))):
+        policy = awake(make_policy(env, ModelConfig(offsets=kind)))
+        td = policy(states(4, 3))
+        loc = td["agents", "params", "offset", "loc"]
+        assert loc.shape == td["agents", "params", "offset", "scale"].shape == shape
+        if kind == "per_region":
+            assert (loc.std(-2) > 1e-3).all(), "all regions have the same offset"
 
 
 def test_stored_log_probabilities_are_those_of_the_stored_action(env, model):
