@@ -15,7 +15,8 @@ MAP = ("agents", "observation", "map")
 POSE = ("agents", "observation", "pose")
 GRID = ("agents", "observation", "grid")
 COMM = ("agents", "observation", "comm")
-OBSERVATION = (MAP, POSE, GRID, COMM)
+TIME_LEFT = ("agents", "observation", "time_left")
+ALIVE = ("agents", "observation", "alive")
 PARAMS = ("agents", "params")
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
 CONTROL_HEADS = {"control": IndependentNormal}
@@ -37,14 +38,19 @@ class ObservationShape:
     regions: bool
 
 
-def observation_shape(env) -> ObservationShape:
+def observation_keys(config: ModelConfig) -> list[tuple[str, ...]]:
+    """What policy and critics read, in the order of their networks' arguments."""
+    return [MAP, POSE, GRID, COMM, *([TIME_LEFT, ALIVE] if config.sees_time else [])]
+
+
+def observation_shape(env, config: ModelConfig) -> ObservationShape:
     """Read the sizes from an environment's specs.
 
     Raises:
-        ValueError: a key of the contract is missing.
+        ValueError: a key that the networks read is missing.
     """
     spec = env.observation_spec
-    missing = [key for key in OBSERVATION if key not in spec.keys(True, True)]
+    missing = [key for key in observation_keys(config) if key not in spec.keys(True, True)]
     if missing:
         raise ValueError(f"The environment's observation lacks {missing}; give the keys of ExplorationEnv.")
     actions = env.full_action_spec.keys(True, True)
@@ -64,8 +70,8 @@ class ActionParams(nn.Module):
         self.network = network
         self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> TensorDict:
-        values = self.network(picture, pose, grid, comm)
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor) -> TensorDict:
+        values = self.network(picture, pose, grid, comm, *state)
         return TensorDict(dict(zip(self.names, values, strict=True)), batch_size=comm.shape[:-2])
 
 
@@ -80,11 +86,12 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
         env: gives the specs and the device; not kept
         model: a preset's name or a ModelConfig
     """
-    shape, config = observation_shape(env), model_config(model)
+    config = model_config(model)
+    shape = observation_shape(env, config)
     network = TargetGenerator(config, shape.channels, shape.side, shape.regions)
     heads = REGION_HEADS if shape.regions else CONTROL_HEADS
     joint = shape.regions and config.offsets == "per_region"
-    module = TensorDictModule(ActionParams(network, heads), in_keys=list(OBSERVATION), out_keys=[PARAMS])
+    module = TensorDictModule(ActionParams(network, heads), in_keys=observation_keys(config), out_keys=[PARAMS])
     actor = ProbabilisticActor(
         module,
         in_keys=[PARAMS],

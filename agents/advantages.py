@@ -4,7 +4,6 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.objectives.value import GAE, MultiAgentGAE
 
-from maexp.agents.actor import COMM, GRID, MAP, POSE
 from maexp.agents.critics import TEAM_VALUE, VALUE
 
 REWARD = ("agents", "reward")
@@ -80,7 +79,7 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
         with loss.critic_network_params.to_module(loss.critic_network):
             return torch.cat([loss.critic_network(part.copy()).get(key) for part in states.split(chunk)])
 
-    inputs = (MAP, POSE, GRID, COMM)
+    inputs = loss.critic_network.in_keys
     value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
     last = loss.bare_estimator.tensor_keys.terminated  # "done" where the horizon is finite
     done, final = (batch["next", name].squeeze(-1) for name in ("done", last))

@@ -28,6 +28,7 @@ class Settings:
         critic_coeff: weight of the critic's loss
         value_norm: measure the critic's error in units of the returns' running spread
         normalize_advantage: standardise advantages per minibatch
+        mask_collided: leave the actions of robots that had collided out of what the policy learns from
         minibatch_size: team steps per gradient step
         max_grad_norm: bound on the gradient of the policy, and on the critic's
     """
@@ -42,6 +43,7 @@ class Settings:
     critic_coeff: float = number(1.0)
     value_norm: bool = flag(True)
     normalize_advantage: bool = flag(True)
+    mask_collided: bool = flag(True)
     minibatch_size: int = whole(128)
     max_grad_norm: float = number(1.0, open_ends=True)
 
@@ -50,7 +52,7 @@ class Settings:
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings."""
-        names = ("entropy_coeff", "critic_coeff", "normalize_advantage")
+        names = ("entropy_coeff", "critic_coeff", "normalize_advantage", "mask_collided")
         return {name: getattr(self, name) for name in names}
 
 
@@ -190,7 +192,8 @@ class Algorithm:
 
 def _reference(settings: Settings, **others) -> Settings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
-    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0, finite_horizon=False)
+    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
+    shared |= dict(finite_horizon=False, mask_collided=False)
     return replace(settings, **shared, **others)
 
 

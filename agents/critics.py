@@ -8,8 +8,8 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from maexp.agents.actor import COMM, GRID, MAP, POSE, observation_shape
-from maexp.agents.encoder import CellEncoder
+from maexp.agents.actor import observation_keys, observation_shape
+from maexp.agents.encoder import CellEncoder, add_state
 from maexp.agents.mixers import make_mixer
 from maexp.agents.model import ModelConfig, model_config
 
@@ -36,9 +36,7 @@ class RobotEncoder(nn.Module):
         self.narrow = nn.Sequential(
             nn.Conv2d(config.width, config.width, 3, stride=2, padding=1), nn.ReLU(), nn.Flatten()
         )
-        self.wide = nn.Sequential(
-            nn.Linear(config.width * ((side + 1) // 2) ** 2, config.critic_hidden), nn.ReLU()
-        )
+        self.wide = nn.Sequential(nn.Linear(config.width * ((side + 1) // 2) ** 2, config.critic_hidden), nn.ReLU())
 
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
         """Batch of teams [batch, robots, ...] to [batch, robots, critic_hidden]."""
@@ -72,9 +70,9 @@ class Critic(nn.Module):
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor):
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor):
         """Shapes as in TargetGenerator.forward."""
-        lead = comm.shape[:-2]
+        lead, pose = comm.shape[:-2], add_state(pose, *state)
         parts = (value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid, comm))
         features = robots = self.encoder(*parts)
         if self.team:
@@ -97,9 +95,7 @@ class Critic(nn.Module):
         self.calibrated.fill_(True)
 
 
-def build_critic(
-    kind: str, env, model: "str | ModelConfig" = "small", mixer: str = "qmix"
-) -> TensorDictModule:
+def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: str = "qmix") -> TensorDictModule:
     """A critic of the given kind for the specs of `env`.
 
     It writes ("agents", "state_value") [*, robots, 1] and, for mixed, ("team", "state_value") [*, 1].
@@ -112,8 +108,9 @@ def build_critic(
     """
     if kind not in KINDS:
         raise ValueError(f"critic kind {kind!r} is unknown; choose one of {', '.join(KINDS)}.")
-    shape = observation_shape(env)
-    network = Critic(model_config(model), shape.channels, shape.side, kind, mixer)
+    config = model_config(model)
+    shape = observation_shape(env, config)
+    network = Critic(config, shape.channels, shape.side, kind, mixer)
     keys = [VALUE, TEAM_VALUE] if kind == "mixed" else [VALUE]
-    critic = TensorDictModule(network, in_keys=[MAP, POSE, GRID, COMM], out_keys=keys)
+    critic = TensorDictModule(network, in_keys=observation_keys(config), out_keys=keys)
     return critic.to(env.device) if env.device is not None else critic

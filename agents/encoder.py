@@ -75,17 +75,32 @@ def resample(cells: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     return torch.bmm(by_column.flatten(1, 2), rows).unflatten(1, (cells.shape[1], -1))
 
 
+def add_state(pose: Tensor, time_left: Tensor | None = None, alive: Tensor | None = None) -> Tensor:
+    """The robots' poses [*, robots, 4], followed by what else is known of each: [*, robots, 4 or 6].
+
+    Args:
+        pose: as observed
+        time_left: share of the episode left, shape [*, robots, 1]
+        alive: has not collided, bool [*, robots]
+    """
+    if time_left is None:
+        return pose
+    return torch.cat((pose, time_left, alive.unsqueeze(-1).to(pose.dtype)), dim=-1)
+
+
 def grid_inputs(pose: Tensor, grid: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
-    """What each region is told about its robot: offsets and distances to it and to its last goal, the pose
-    with its heading as sine and cosine, and where the region lies. Shape [batch, L * L, 13]."""
+    """What each region is told about its robot: offsets and distances to it and to its last goal, where the
+    region lies, the pose with its heading as sine and cosine, and what follows the pose (`add_state`).
+
+    Returns:
+        shape [batch, L * L, 13, and 2 more with time and life]
+    """
     side = grid.shape[-1]
     distances = [grid[:, start : start + 2].square().sum(1, keepdim=True).sqrt() for start in (0, 2)]
-    place = torch.stack(
-        (along_x[:, :, None].expand(-1, -1, side), along_y[:, None, :].expand(-1, side, -1)), dim=1
-    )
+    place = torch.stack((along_x[:, :, None].expand(-1, -1, side), along_y[:, None, :].expand(-1, side, -1)), dim=1)
     cells = torch.cat((grid, *distances, place), dim=1).flatten(2).transpose(1, 2)
-    heading = pose[:, 3:] * torch.pi
-    pose = torch.cat((pose[:, :3], heading.sin(), heading.cos()), dim=-1)
+    heading = pose[:, 3:4] * torch.pi
+    pose = torch.cat((pose[:, :3], heading.sin(), heading.cos(), pose[:, 4:]), dim=-1)
     return torch.cat((cells, pose.unsqueeze(1).expand(-1, side * side, -1)), dim=-1)
 
 
@@ -115,14 +130,14 @@ class CellEncoder(nn.Module):
             nn.Conv2d(inputs, width, 4, stride=2, padding=1), nn.ReLU(),
             nn.Conv2d(width, width, 4, stride=2, padding=1), nn.ReLU(),
         )  # fmt: skip
-        self.grid = nn.Sequential(nn.Linear(13, config.grid_features), nn.ReLU())
+        self.grid = nn.Sequential(nn.Linear(13 + 2 * config.sees_time, config.grid_features), nn.ReLU())
 
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
         """Encode each robot's observation once.
 
         Args:
             picture: uint8, shape [batch, robots, channels, pixels, pixels]; or what `compact` makes of it
-            pose: shape [batch, robots, 4]
+            pose: what `add_state` gives, shape [batch, robots, 4 or 6]
             grid: shape [batch, robots, 4, L, L]
             comm: who hears whom, bool [batch, robots, robots]
 

@@ -1,18 +1,19 @@
 """The losses of the six algorithms: TorchRL's, each with only what our teams need to differ.
 
 All read a Collector batch [envs, T], or its flattened team steps once advantages are in it. They keep robots
-apart (one probability ratio per robot, over its two heads) and write loss_objective, loss_entropy,
-loss_critic (and loss_kl), plus what one likes to log.
+apart (one probability ratio per robot, over its whole action) and write loss_objective, loss_entropy,
+loss_critic (and loss_kl), plus what one likes to log. A robot that had collided decides nothing: its actions are
+left out of all that concerns the policy, its values are learned like any other.
 """
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.utils import distance_loss
 
-from maexp.agents.actor import PARAMS
+from maexp.agents.actor import ALIVE, PARAMS
 from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
 from maexp.agents.critics import TEAM_VALUE, VALUE
 from maexp.agents.distributions import Heads
@@ -43,6 +44,66 @@ def policy_divergence(batch: TensorDictBase, dist: Heads) -> Tensor:
     return dist.divergence_from(params)
 
 
+def select_living(values: Tensor, alive: Tensor) -> Tensor:
+    """The rows of `values` [*, robots, k] whose robot is alive, [n, k]; one row of zeros where none is."""
+    chosen = values[alive]
+    return chosen if len(chosen) else 0 * values.flatten(0, alive.ndim - 1)[:1]
+
+
+def standardise(values: Tensor, alive: Tensor, keep_robots: bool) -> Tensor:
+    """`values` [*, robots, 1] less their mean over the living, over their spread.
+
+    Args:
+        values: of every robot
+        alive: which count, bool [*, robots]
+        keep_robots: standardise each robot of the team by itself
+    """
+    dims = [dim for dim in range(alive.ndim) if not (keep_robots and dim == alive.ndim - 1)]
+    weight = alive.to(values.dtype)
+    count = weight.sum(dims, keepdim=True)
+    mean = (weight * values[..., 0]).sum(dims, keepdim=True) / count.clamp_min(1)
+    rest = values[..., 0] - mean
+    spread = ((weight * rest.square()).sum(dims, keepdim=True) / (count - 1).clamp_min(1)).sqrt()
+    return (rest / spread.clamp_min(1e-6)).unsqueeze(-1)
+
+
+class LivingRobots:
+    """Leaves the actions of robots that had collided out of the objective, entropy, divergence and statistics.
+
+    Args:
+        mask_collided: false counts them like the others
+    """
+
+    def __init__(self, *args, mask_collided: bool = True, **settings):
+        super().__init__(*args, **settings)
+        self.mask_collided = mask_collided
+
+    def find_living(self, batch: TensorDictBase) -> Tensor:
+        """Whose actions count, bool [*, robots]."""
+        alive = batch.get(ALIVE, None) if self.mask_collided else None
+        if alive is None:
+            alive = torch.ones(batch.get(self.tensor_keys.advantage).shape[:-1], dtype=torch.bool, device=batch.device)
+        return alive
+
+    def _maybe_normalize_advantage(self, advantage: Tensor, tensordict, *, update_norm: bool = False) -> Tensor:
+        self.__dict__["_alive"] = alive = self.find_living(tensordict)
+        if self.normalize_advantage:
+            advantage = standardise(advantage, alive, bool(self.normalize_advantage_exclude_dims))
+        return select_living(advantage, alive)
+
+    def _log_weight(self, tensordict, adv_shape):
+        alive = self._alive  # the shape given is that of the advantages selected
+        log_weight, dist, kl, behaviour = super()._log_weight(tensordict.copy(), alive.shape)
+        return select_living(log_weight, alive), dist, select_living(kl, alive), behaviour
+
+    def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
+        return select_living(dist.entropy().unsqueeze(-1), self._alive)
+
+    def mean_divergence(self, batch: TensorDictBase, dist: Heads) -> Tensor:
+        """Of `dist` from the policy that acted, over the living."""
+        return select_living(policy_divergence(batch, dist).unsqueeze(-1), self.find_living(batch)).mean()
+
+
 class RobotValues:
     """A value per robot: keys and estimator of a loss with a local or a team critic."""
 
@@ -66,7 +127,7 @@ class TeamValues(RobotValues):
     team_value = True
 
 
-class KLPenalty:
+class KLPenalty(LivingRobots):
     """Adds `loss_kl` = kl_coeff * KL(acting policy || policy) to a PPO loss; kl_coeff 0 leaves it out."""
 
     def __init__(self, *args, kl_coeff: float = 0.0, kl_target: float = 0.01, **settings):
@@ -75,15 +136,15 @@ class KLPenalty:
         self.kl_target = kl_target
 
     def _log_weight(self, tensordict, adv_shape):
-        terms = super()._log_weight(tensordict.copy(), adv_shape)  # a copy: it overwrites the acting parameters
+        terms = super()._log_weight(tensordict, adv_shape)
         check_finite("loss_objective", terms[0])  # here, for TorchRL would draw from the broken policy next
-        self.__dict__["_divergence"] = policy_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
+        self.__dict__["_divergence"] = self.mean_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
         return terms
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = super().forward(tensordict)
         if self._divergence is not None:
-            terms.set("loss_kl", self.kl_coeff * self._divergence.mean())
+            terms.set("loss_kl", self.kl_coeff * self._divergence)
         return terms
 
     def adapt_penalty(self, divergence: float) -> None:
@@ -121,7 +182,7 @@ class NormalisedValues:
         return norm.normalize(target), norm.normalize(value), None if old is None else norm.normalize(old)
 
 
-class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
+class TRPOLoss(RobotValues, NormalisedValues, LivingRobots, PPOLoss):
     """Unclipped surrogate with its divergence from the acting policy, for a trust-region step.
 
     `surrogate` gives the two terms a trust-region step needs and leaves its parts in `terms`, to be logged;
@@ -138,21 +199,22 @@ class TRPOLoss(RobotValues, NormalisedValues, PPOLoss):
         """Mean loss to lower (objective and entropy bonus) and mean divergence, each a scalar with its graph."""
         advantage = batch.get(self.tensor_keys.advantage)
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
-        log_weight, dist, _, _ = self._log_weight(batch.copy(), adv_shape=advantage.shape[:-1])
-        entropy = dist.entropy().unsqueeze(-1)
-        objective, entropy = -(log_weight.exp() * advantage).mean(), entropy.mean()
+        log_weight, dist, _, _ = self._log_weight(batch, adv_shape=advantage.shape[:-1])
+        objective, entropy = -(log_weight.exp() * advantage).mean(), self._get_entropy(dist).mean()
         self.__dict__["terms"] = {"loss_objective": objective.item(), "entropy": entropy.item()}
-        return objective - self.entropy_coeff * entropy, policy_divergence(batch, dist).mean()
+        return objective - self.entropy_coeff * entropy, self.mean_divergence(batch, dist)
 
     def divergence(self, batch: TensorDictBase) -> Tensor:
         """Mean divergence from the acting policy, a scalar with its graph."""
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        return policy_divergence(batch, dist).mean()
+        return self.mean_divergence(batch, dist)
 
 
-class VDA2C(TeamValues, NormalisedValues, A2CLoss):
-    """Advantage actor-critic on the mixed team value (Su et al. 2021), for actions of two heads."""
+class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
+    """Advantage actor-critic on the mixed team value (Su et al. 2021), for actions of several heads."""
+
+    normalize_advantage_exclude_dims = ()  # all robots have the same advantage
 
     def __init__(self, *args, normalize_advantage: bool = True, **settings):
         super().__init__(*args, **settings)
@@ -166,15 +228,10 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
         following = [("next", *key) for key in self.critic_network.in_keys]
         return [*self.tensor_keys.action, *ends, *seen, *following]
 
-    def get_entropy_bonus(self, dist: Heads) -> Tensor:
-        return dist.entropy().unsqueeze(-1)
-
     def _log_probs(self, tensordict: TensorDictBase):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(tensordict.select(*self.actor_network.in_keys))
         log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
-        with torch.no_grad():
-            self.__dict__["_divergence"] = policy_divergence(tensordict, dist).mean()
         return sum(log_probs.values(True, True)).unsqueeze(-1), dist
 
     def loss_critic(self, tensordict: TensorDictBase):
@@ -194,9 +251,15 @@ class VDA2C(TeamValues, NormalisedValues, A2CLoss):
                 params=self.critic_network_params.detach(),
                 target_params=self.target_critic_network_params,
             )
-        advantage = tensordict.get(self.tensor_keys.advantage)
-        if self.normalize_advantage:
-            advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
-        tensordict.set(self.tensor_keys.advantage, advantage)
-        terms = super().forward(tensordict).set("kl", self._divergence)
-        return terms.set("explained_variance", self._explained)
+        advantage = self._maybe_normalize_advantage(tensordict.get(self.tensor_keys.advantage), tensordict)
+        log_prob, dist = self._log_probs(tensordict)
+        entropy = self._get_entropy(dist).mean()
+        terms = {
+            "loss_objective": -(select_living(log_prob, self._alive) * advantage).mean(),
+            "loss_entropy": -self.entropy_coeff * entropy,
+            "loss_critic": self.loss_critic(tensordict)[0].mean(),
+            "entropy": entropy.detach(),
+            "kl": self.mean_divergence(tensordict, dist).detach(),
+            "explained_variance": self._explained,
+        }
+        return TensorDict(terms, batch_size=[])

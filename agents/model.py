@@ -21,6 +21,7 @@ class ModelConfig:
             channels. The attention can find that out by itself, only later.
         offsets: "per_region" gives each region an offset of its own; with one "shared" by all regions, as in the
             paper, a policy cannot even copy a planner.
+        sees_time: show each cell the share of the episode that is left, and whether its robot has collided.
         critic_hidden: width of the critic's hidden layers.
     """
 
@@ -32,14 +33,14 @@ class ModelConfig:
     feedforward: int = whole(2, most=64)
     merge_maps: bool = flag(True)
     offsets: str = choice("per_region", "shared")
+    sees_time: bool = flag(True)
     critic_hidden: int = whole(64, most=4096)
 
     def __post_init__(self):
         check_ranges(self, "model")
         if self.width % self.heads:
             raise ValueError(
-                f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; "
-                "choose a divisor."
+                f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; choose a divisor."
             )
 
     @property
@@ -51,7 +52,14 @@ class ModelConfig:
 PRESETS = {
     "small": ModelConfig(),
     "paper": ModelConfig(
-        stem="conv", channels=32, grid_features=16, depth=2, heads=4, merge_maps=False, offsets="shared",
+        stem="conv",
+        channels=32,
+        grid_features=16,
+        depth=2,
+        heads=4,
+        merge_maps=False,
+        offsets="shared",
+        sees_time=False,
         critic_hidden=128,
     ),
 }

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from maexp.agents.encoder import CellEncoder
+from maexp.agents.encoder import CellEncoder, add_state
 from maexp.agents.model import ModelConfig
 
 MIN_SCALE = 0.05  # a narrower offset makes probability ratios explode, a wider one than 1 leaves the region
@@ -114,7 +114,7 @@ class TargetGenerator(nn.Module):
             nn.init.orthogonal_(layer.weight, gain)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Parameters of the action for any leading batch shape [*, robots].
 
         Args:
@@ -122,12 +122,13 @@ class TargetGenerator(nn.Module):
             pose: shape [*, robots, 4]
             grid: shape [*, robots, 4, L, L]
             comm: who hears whom, bool [*, robots, robots]
+            state: with `sees_time` the share of time left [*, robots, 1] and who is alive, bool [*, robots]
 
         Returns:
             logits [*, robots, L * L] (left out for a control action), mean and scale of the offset or control,
             [*, robots, 2], or [*, robots, L * L, 2] where each region has an offset of its own
         """
-        lead = comm.shape[:-2]
+        lead, pose = comm.shape[:-2], add_state(pose, *state)
         picture, pose, grid, comm = (
             value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid, comm)
         )

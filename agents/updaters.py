@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from maexp.agents.actor import GRID, MAP, PARAMS, POSE
+from maexp.agents.actor import ALIVE, GRID, MAP, PARAMS, POSE
 from maexp.agents.advantages import write_advantages
 from maexp.agents.encoder import compact, pools_pictures
 from maexp.agents.losses import check_finite
@@ -100,12 +100,14 @@ class Updater:
         check_finite("the advantage", batch.get(keys.advantage))
         self._calibrate(batch)
         needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys, PARAMS]
+        needed += [ALIVE] if ALIVE in batch.keys(True) else []
         needed += [keys.advantage, keys.value_target, keys.value, *keys.action, *keys.sample_log_prob]
         return batch.select(*needed).flatten()
 
     def _compact(self, batch: TensorDictBase) -> TensorDictBase:
-        """Pool the pictures once, where both networks would do so in every pass."""
-        if all(pools_pictures(net) for net in (self.loss.actor_network, self.loss.critic_network)):
+        """Pool the pictures once, where all networks that look at them would do so in every pass."""
+        readers = [net for net in (self.loss.actor_network, self.loss.critic_network) if MAP in net.in_keys]
+        if readers and all(pools_pictures(net) for net in readers):
             parts = [part.flatten(0, 1) for part in (batch[MAP], batch[POSE], batch[GRID])]
             chunks = zip(*(part.split(CHUNK) for part in parts), strict=True)
             batch[MAP] = torch.cat([compact(*chunk) for chunk in chunks]).unflatten(0, batch.shape)

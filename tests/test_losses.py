@@ -7,7 +7,7 @@ import torch
 from toy_env import ToyEnv
 
 from maexp.agents import make_critic, make_loss, make_policy
-from maexp.agents.actor import MAP
+from maexp.agents.actor import ALIVE, MAP
 from maexp.agents.advantages import ADVANTAGE, TARGET, TEAM_TARGET, write_advantages
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.critics import TEAM_VALUE, VALUE
@@ -194,3 +194,90 @@ def test_value_error_in_units_of_the_returns():
         batch[TARGET] = batch[TARGET] * scale
         errors.append(loss(batch)["loss_critic"].item())
     assert errors[1] == pytest.approx(errors[0], rel=0.05)
+
+
+def with_collisions(batch):
+    """The batch, two robots of five having collided in its second half; and who is alive."""
+    batch = batch.clone()
+    alive = batch[ALIVE]
+    alive[::2, 3:, 1] = False
+    alive[1, 5:, :2] = False
+    return batch, alive
+
+
+def policy_gradient(name, loss, batch):
+    terms = loss(batch)
+    total = sum(terms[key] for key in terms.keys() if key in ("loss_objective", "loss_entropy", "loss_kl"))
+    if hasattr(loss, "surrogate"):
+        total = total + sum(loss.surrogate(batch)) + loss.divergence(batch)
+    params = list(loss.actor_network_params.parameters())
+    grads = torch.autograd.grad(total, params, allow_unused=True)
+    return torch.cat([g.flatten() for g in grads if g is not None])
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_what_a_collided_robot_did_moves_no_policy(name):
+    """Its advantage, its action's stored probability and its parameters may be anything."""
+    settings = {"kl_coeff": 0.3} if ALGORITHMS[name].loss.__name__ in ("IPPO", "MAPPO", "VDPPO") else {}
+    policy, _, loss, batch = setup(name, **settings)
+    batch, alive = with_collisions(batch)
+    batch, _, _ = acting_terms(loss, policy, batch)
+    before = policy_gradient(name, loss, batch)
+    assert before.abs().max() > 1e-4
+    other = batch.clone()
+    other[ADVANTAGE][~alive] += 100 * torch.randn_like(other[ADVANTAGE][~alive])
+    for head in ("region", "offset"):
+        other["agents", "action", f"{head}_log_prob"][~alive] -= 5.0
+    other["agents", "params", "region", "logits"][~alive] *= -3.0
+    torch.testing.assert_close(policy_gradient(name, loss, other), before, atol=1e-6, rtol=1e-4)
+    other[ADVANTAGE][alive] += 10 * torch.randn_like(other[ADVANTAGE][alive])
+    assert not torch.allclose(policy_gradient(name, loss, other), before, atol=1e-4)
+    loss.mask_collided = False
+    assert not torch.allclose(policy_gradient(name, loss, batch), before, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_objective_and_entropy_are_means_over_the_living(name):
+    policy, _, loss, batch = setup(name, normalize_advantage=True)
+    batch, alive = with_collisions(batch)
+    batch, log_prob, log_ratio = acting_terms(loss, policy, batch)
+    advantage = batch[ADVANTAGE][..., 0].double()
+    parts = [advantage] if name == "vda2c" else [advantage[..., robot] for robot in range(3)]
+    masks = [alive] if name == "vda2c" else [alive[..., robot] for robot in range(3)]
+    parts = [(part - part[mask].mean()) / part[mask].std() for part, mask in zip(parts, masks, strict=True)]
+    advantage = parts[0] if name == "vda2c" else torch.stack(parts, -1)
+    ratio = log_ratio.exp()
+    if name == "vda2c":
+        each = log_prob * advantage
+    elif name in ("itrpo", "matrpo"):
+        each = ratio * advantage
+    else:
+        each = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage)
+    terms = loss(batch)
+    assert terms["loss_objective"].item() == pytest.approx(-each[alive].mean().item(), rel=1e-4)
+    dist = policy.get_dist(batch.copy())
+    assert terms["entropy"].item() == pytest.approx(dist.entropy()[alive].mean().item(), rel=1e-5)
+    if "clip_fraction" in terms.keys():
+        share = ((ratio - 1).abs() > 0.2)[alive].float().mean().item()
+        assert terms["clip_fraction"].item() == pytest.approx(share, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_minibatch_without_a_living_robot_teaches_the_critic_alone(name):
+    policy, critic, loss, batch = setup(name)
+    batch[ALIVE][:] = False
+    batch, _, _ = acting_terms(loss, policy, batch)
+    assert policy_gradient(name, loss, batch).abs().max() == 0
+    terms = loss(batch)
+    assert all(torch.isfinite(value).all() for value in terms.values())
+    grads = torch.autograd.grad(terms["loss_critic"], list(critic.parameters()), allow_unused=True)
+    assert sum(g.abs().sum() for g in grads if g is not None) > 0
+
+
+def test_values_of_collided_robots_are_learned_too():
+    _, _, loss, batch = setup("ippo", value_norm=False)
+    batch, alive = with_collisions(batch)
+    batch = write_advantages(loss, batch)
+    before = loss(batch)["loss_critic"]
+    batch[TARGET][~alive] += 1e3
+    assert loss(batch)["loss_critic"] > 1.5 * before

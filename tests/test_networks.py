@@ -1,5 +1,7 @@
 """The target generator and the critics: any team size, no order among robots, nobody unheard, right pixels."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,7 +10,7 @@ from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_policy
 from maexp.agents.critics import TEAM_VALUE, VALUE, build_critic
-from maexp.agents.encoder import STRIDE, add_rows, compact, pool_regions, resampling
+from maexp.agents.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
 from maexp.agents.model import PRESETS, model_config
 
 PIXELS, SIDE = 29, 3
@@ -29,6 +31,8 @@ def states(batch, robots, seed=0) -> TensorDict:
         "pose": pose,
         "grid": torch.cat(offsets, dim=2),
         "comm": torch.ones(batch, robots, robots, dtype=torch.bool),
+        "time_left": torch.rand(batch, robots, 1, generator=generator),
+        "alive": torch.rand(batch, robots, generator=generator) < 0.7,
     }
     return TensorDict({"agents": {"observation": observation}}, batch_size=[batch])
 
@@ -79,7 +83,7 @@ def test_leading_shapes_make_no_difference(env, model):
 
 def permuted(td, order) -> TensorDict:
     out = td.clone()
-    for name in ("map", "pose", "grid"):
+    for name in ("map", "pose", "grid", "time_left", "alive"):
         out["agents", "observation", name] = td["agents", "observation", name][:, order]
     out["agents", "observation", "comm"] = td["agents", "observation", "comm"][:, order][:, :, order]
     return out
@@ -103,12 +107,13 @@ def test_permuting_robots_permutes_logits_and_values(env, model):
 def changed(td, robot, name) -> TensorDict:
     """The same states with one part of one robot's observation drawn anew."""
     out = td.clone()
-    new = states(td.shape[0], td["agents", "observation", "pose"].shape[1], seed=9)
-    out["agents", "observation", name][:, robot] = new["agents", "observation", name][:, robot]
+    new = states(td.shape[0], td["agents", "observation", "pose"].shape[1], seed=9)["agents", "observation", name]
+    new = ~td["agents", "observation", name] if name == "alive" else new
+    out["agents", "observation", name][:, robot] = new[:, robot]
     return out
 
 
-@pytest.mark.parametrize("name", ["map", "pose", "grid"])
+@pytest.mark.parametrize("name", ["map", "pose", "grid", "time_left", "alive"])
 def test_only_robots_in_contact_matter(env, model, name):
     policy = awake(make_policy(env, model))
     td = states(3, 3)
@@ -120,7 +125,7 @@ def test_only_robots_in_contact_matter(env, model, name):
     assert not torch.allclose(before[:, 2], after[:, 2])
 
 
-@pytest.mark.parametrize("name", ["map", "pose", "grid"])
+@pytest.mark.parametrize("name", ["map", "pose", "grid", "time_left", "alive"])
 def test_team_critic_sees_every_robot_and_local_only_its_own(env, model, name):
     td = states(3, 3)
     td["agents", "observation", "comm"][:] = torch.eye(3, dtype=torch.bool)  # critics do not ask who hears whom
@@ -155,7 +160,8 @@ def test_policy_starts_near_uniform_and_modes_differ_from_samples(env):
 
 def test_offsets_belong_to_regions_or_are_shared(env):
     for kind, shape in (("per_region", (4, 3, SIDE**2, 2)), ("shared", (4, 3, 2))):
-        policy = awake(make_policy(env, ModelConfig(offsets=kind)))
+        policy = make_policy(env, ModelConfig(offsets=kind))
+        torch.nn.init.normal_(policy.module[0].module.network.cells.weight, std=0.3)
         td = policy(states(4, 3))
         loc = td["agents", "params", "offset", "loc"]
         assert loc.shape == td["agents", "params", "offset", "scale"].shape == shape
@@ -177,7 +183,8 @@ def test_control_actions_of_the_direct_planner():
     policy = make_policy(env)
     td = env.rollout(3, policy)
     assert td["agents", "action", "control"].shape == (4, 3, 3, 2)
-    assert set(policy.in_keys) == {("agents", "observation", k) for k in ("map", "pose", "grid", "comm")}
+    seen = {("agents", "observation", k) for k in ("map", "pose", "grid", "comm")}
+    assert seen < set(policy.in_keys) and set(make_policy(env, "paper").in_keys) == seen
 
 
 def test_rows_are_averaged_like_floats():
@@ -204,11 +211,13 @@ def test_a_lit_region_is_the_cell_of_that_region():
 
 
 def test_features_of_a_lit_region_land_in_that_regions_cell(env, model):
+    model = replace(model_config(model), sees_time=True)
     encoder = make_policy(env, model).module[0].module.network.encoder
     for p in encoder.parameters():
         torch.nn.init.uniform_(p, 0, 0.1)  # no signs: every path counts
     td = states(1, 1)
     parts = [td["agents", "observation", name] for name in ("map", "pose", "grid", "comm")]
+    parts[1] = add_state(parts[1], *(td["agents", "observation", name] for name in ("time_left", "alive")))
     dark = torch.zeros_like(parts[0])
     place = parts[1][0, 0, :2, None] + 2 * torch.stack((parts[2][0, 0, 0, :, 0], parts[2][0, 0, 1, 0]))
     for ix, iy in ((0, 2), (2, 1)):

@@ -15,8 +15,8 @@ GOOD = {
     "lr": [1e-9, 2], "critic_lr": [1e-9], "max_grad_norm": [1e-3], "kl_target": [1e-6], "max_kl": [1e-6],
     "entropy_coeff": [0], "critic_coeff": [0], "clip_value": [0, 10], "kl_coeff": [0], "damping": [0],
     "clip_epsilon": [0.01, 0.99], "backtrack_factor": [0.01, 0.99],
-    "value_norm": [True, False], "normalize_advantage": [True, False], "mixer": ["vdn", "qmix"],
-    "finite_horizon": [True, False],
+    **{name: [True, False] for name in ("value_norm", "normalize_advantage", "finite_horizon", "mask_collided")},
+    "mixer": ["vdn", "qmix"],
     **{name: [1, 7] for name in (
         "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
     )},
@@ -29,7 +29,7 @@ BAD = {
     **{name: [0, -3, 1.5, True] for name in (
         "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
     )},
-    **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage", "finite_horizon")},
+    **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage", "finite_horizon", "mask_collided")},
 }  # fmt: skip
 EVERYWHERE = [math.nan, math.inf, -math.inf, "much", None]
 

@@ -31,6 +31,8 @@ class ToyEnv(EnvBase):
             pose=Unbounded((*team, 4)),
             grid=Unbounded((*team, 4, side, side)),
             comm=Binary(num_robots, shape=(*team, num_robots), dtype=torch.bool),
+            time_left=Unbounded((*team, 1)),
+            alive=Binary(num_robots, shape=team, dtype=torch.bool),
             shape=team,
         )
         self.observation_spec = Composite(
@@ -105,6 +107,8 @@ class ToyEnv(EnvBase):
             "pose": pose,
             "grid": torch.cat((offsets, offsets), dim=2),
             "comm": torch.ones(*team, self.num_robots, dtype=torch.bool),
+            "time_left": (1 - self.step_count / self.steps).reshape(-1, 1, 1).repeat(1, self.num_robots, 1),
+            "alive": torch.ones(team, dtype=torch.bool),
         }
         agents = TensorDict({"observation": TensorDict(observation, batch_size=team)}, batch_size=team)
         return TensorDict({"agents": agents, "team": {"map": maps.amax(1)[:, :3]}}, batch_size=self.batch_size)
