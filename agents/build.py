@@ -151,6 +151,15 @@ def choose_starts(cfg: Any, num_robots: int) -> Any:
     return starts if starts in STARTS else read_starts(starts, num_robots)
 
 
+def set_steps(cfg: Any, env: ExplorationEnv) -> int:
+    """Write down the macro steps of every team in a batch; unless set, those of an episode.
+
+    Batches in step with the episodes hold all parts of an episode alike; others would alternate between them.
+    """
+    cfg.collector.steps = cfg.collector.steps or env.macro_steps
+    return cfg.collector.steps
+
+
 def team_configs(cfg: Any, num_robots: int) -> tuple[Any, Any]:
     """Robot and radar of a team: one of each for all robots, or lists where `robot.team` tells robots apart.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner
+from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner, set_steps
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.errors import UserError, blame_input
@@ -224,7 +224,7 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
         UserError, ValueError: settings that cannot be used.
     """
     check_collector(cfg.collector)
-    alone, workers, steps = cfg.collector.backend == "single", cfg.collector.workers, cfg.collector.steps
+    alone, workers = cfg.collector.backend == "single", cfg.collector.workers
     here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
     teams = divide_teams(cfg.num_envs, team_sizes(cfg.num_robots), workers)
     envs = [
@@ -232,6 +232,7 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
                  first_env=one.first_env)
         for one in teams
     ]  # fmt: skip
+    steps = set_steps(cfg, envs[0])
     for env, one in zip(envs, teams, strict=True):
         check_batch_memory(env, steps, one.num_envs)
     like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
@@ -245,7 +246,8 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
 
 def check_collector(settings: Any) -> None:
     """Raise UserError for settings of `collector` that do not go together."""
-    check_counts(settings, "steps", "workers", prefix="collector.")
+    counts = ("workers",) if settings.steps is None else ("steps", "workers")
+    check_counts(settings, *counts, prefix="collector.")
     if settings.backend not in BACKENDS:
         raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
     if settings.backend == "single":

@@ -144,6 +144,13 @@ def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(cap
     assert_same_runs(whole, broken)
 
 
+@pytest.mark.parametrize("steps, frames, ends", [("null", 9, 3), ("2", 6, 0)])
+def test_a_batch_is_an_episode_of_every_team_unless_told_otherwise(steps, frames, ends):
+    folder = run("whole", 1, f"collector.steps={steps}")
+    (row,) = read_metrics(folder / "metrics.csv")
+    assert (row["frames"], row["episodes"]) == (frames, ends)
+
+
 def test_evaluations_in_between_change_nothing():
     assert_same(
         find_checkpoint(run("with", 4, "evaluate_every=1"))[1]["updater"],

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from maexp.agents.bench.shared import describe_point, print_table, spread, sweep_points, write_report
-from maexp.agents.build import Learner, load_maps, make_env, make_learner
+from maexp.agents.build import Learner, load_maps, make_env, make_learner, set_steps
 from maexp.agents.checkpoint import seed_everything
 from maexp.agents.collect import Stopwatch, make_collector
 from maexp.agents.memory import check_batch_memory
@@ -35,7 +35,7 @@ class Trainee:
         """Raises what `maexp train` would: a setting or map that cannot be used."""
         seed_everything(cfg.seed)
         env = make_env(cfg, load_maps(cfg.scenario).train, cfg.num_robots)
-        check_batch_memory(env, cfg.collector.steps)
+        check_batch_memory(env, set_steps(cfg, env))
         learner = make_learner(cfg, env)
         return cls(cfg, env, learner, make_collector(env, learner.policy, cfg.collector.steps))
 

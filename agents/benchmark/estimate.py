@@ -10,7 +10,7 @@ import torch
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.benchmark.plan import Cell, cell_config, length_of
-from maexp.agents.build import load_maps, make_env, make_learner
+from maexp.agents.build import load_maps, make_env, make_learner, set_steps
 from maexp.agents.errors import blame_input
 from maexp.agents.policies import POLICIES
 from maexp.envs.scenarios import find_scenario
@@ -117,10 +117,10 @@ def _measure_learner(cfg: Any, cell: Cell) -> tuple[float, float]:
     if find_scenario(cell.scenario).build is not None:
         settings.scenario.maps = [0]
         settings.scenario.held_out = [0]
-    steps = min(settings.collector.steps, math.ceil(FRAMES / settings.num_envs))
     with blame_input():
         env = make_env(settings, load_maps(settings.scenario).train, settings.num_robots)
         learner = make_learner(settings, env)
+    steps = min(set_steps(settings, env), math.ceil(FRAMES / settings.num_envs))
     with torch.no_grad():
         batch = env.rollout(steps, learner.policy, break_when_any_done=False)
         think = _time(lambda: learner.policy(batch[:, 0].clone())) / settings.num_envs

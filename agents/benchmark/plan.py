@@ -169,7 +169,9 @@ def length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     """For `iterations`: each collects one whole episode of every team."""
     if cfg.iterations is None:
         return {}
-    steps = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or cfg.collector.steps
+    steps = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps
+    if steps is None:
+        raise UserError(f"iterations={cfg.iterations} are of whole episodes: set scenario.macro_steps too.")
     return {"collector.steps": steps, "total_frames": cfg.iterations * cfg.num_envs * steps}
 
 

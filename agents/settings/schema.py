@@ -97,7 +97,7 @@ class ScenarioSettings:
 class CollectorSettings:
     """How experience is gathered."""
 
-    steps: int = 15  # macro steps of every team in one iteration
+    steps: int | None = None  # macro steps of every team in one iteration; null: scenario.macro_steps, a whole episode
     backend: str = "single"  # or processes, ray
     workers: int = 1  # worker processes, for each team size
     overlap: bool = False  # collect the next batch while learning from this one; the policy that acts is one batch old
