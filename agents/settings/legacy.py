@@ -36,6 +36,9 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     "scenario.validation=[]",
     "reward.charge_rest=false",
     "algorithm.finite_horizon=false",
+    "model.offsets=shared",
+    "model.sees_time=false",
+    "algorithm.mask_collided=false",
 ]
 
 
