@@ -1,0 +1,6 @@
+"""Goals for a team of real robots: needs NumPy and SciPy, and imports neither torch nor Warp."""
+
+from .choices import CHOICES
+from .planner import Plan, TeamPlanner
+
+__all__ = ["CHOICES", "Plan", "TeamPlanner"]

@@ -1,0 +1,152 @@
+"""Which target each robot takes: the classical planners of `maexp.agents.policies`, for one team in NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from .grid import FREE, UNKNOWN, KnownGrid
+from .scene import Scene
+from .ways import cells_ahead
+
+BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
+LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
+RRT_SAMPLES = 512
+RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
+DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
+REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
+FAR = 1e12  # stands for no way where numbers must be finite
+
+
+def prefer(travel: np.ndarray, worth: np.ndarray) -> np.ndarray:
+    """`travel` without the targets that are not `worth` it, for robots that can get to one that is."""
+    kept = np.where(worth, travel, np.inf)
+    return np.where(np.isfinite(kept).any(-1, keepdims=True), kept, travel)
+
+
+def choose_nearest(scene: Scene) -> np.ndarray:
+    """Each robot its nearest target (Yamauchi 1997)."""
+    return scene.travel.argmin(-1)
+
+
+def choose_in_turn(scene: Scene, gain: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """Pairs in order of gain - cost, both [N, K]; a target taken lowers the gain of others that can be seen from
+    there (Burgard et al. 2005)."""
+    chosen = np.zeros(len(scene.at), np.int64)
+    waiting = np.ones(len(scene.at), bool)
+    for _ in range(len(scene.at)):
+        value = np.where(waiting[:, None], gain - cost, -np.inf)
+        robot, target = np.unravel_index(value.argmax(), value.shape)
+        chosen[robot], waiting[robot] = target, False
+        far = np.linalg.norm(scene.points - scene.points[target], axis=-1) / scene.radar_range
+        gain = gain * np.minimum(far, 1.0)
+    return chosen
+
+
+def choose_by_utility(scene: Scene) -> np.ndarray:
+    """Unknown area around the target against the way there."""
+    gain = np.broadcast_to(scene.gain, scene.travel.shape)
+    return choose_in_turn(scene, gain, BETA * scene.travel / scene.radar_range)
+
+
+def choose_by_area(scene: Scene) -> np.ndarray:
+    """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
+    own = scene.travel.argmin(0) == np.arange(len(scene.at))[:, None]
+    mine = np.where(own, scene.travel, np.inf)
+    return np.where(np.isfinite(mine).any(-1), mine.argmin(-1), scene.travel.argmin(-1))
+
+
+def choose_by_assignment(scene: Scene) -> np.ndarray:
+    """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
+    chosen = scene.travel.argmin(-1)
+    robot, target = linear_sum_assignment(np.where(np.isfinite(scene.travel), scene.travel, FAR))
+    can = np.isfinite(scene.travel[robot, target])
+    chosen[robot[can]] = target[can]
+    return chosen
+
+
+def choose_by_force(scene: Scene) -> np.ndarray:
+    """The target whose way starts off closest to the force: pulls along the ways, pushes between robots.
+
+    As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
+    """
+    reached = np.isfinite(scene.travel)
+    first = [cells_ahead(p, d, scene.targets.cell, 3.0) for p, d in zip(scene.passable, scene.distance, strict=True)]
+    ways = scene.grid.centers(np.maximum(np.stack(first), 0)) - scene.at[:, None]
+    ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-6)
+    with np.errstate(invalid="ignore"):
+        pull = np.where(reached, scene.targets.size / np.maximum(scene.travel / scene.grid.cell, 1.0) ** DECAY, 0.0)
+    force = (pull[..., None] * ways).sum(1)
+    apart = scene.at[:, None] - scene.at
+    gap = np.maximum(np.linalg.norm(apart, axis=-1, keepdims=True), 1e-6)
+    push = REPULSION * np.maximum(1.0 - gap / scene.radar_range, 0.0)
+    force += pull.sum(-1, keepdims=True) * (push * apart / gap).sum(1)
+    along = (ways * force[:, None]).sum(-1) / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-6)
+    return np.where(reached, pull * (1.0 + along), -np.inf).argmax(-1)
+
+
+def choose_by_tree(scene: Scene) -> np.ndarray:
+    """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
+    ends = np.concatenate([_grow_tree(scene, robot) for robot in range(len(scene.at))])
+    shift = scene.targets.block_of(ends % scene.grid.width, ends // scene.grid.width)
+    found = (scene.targets.block[:, None] == shift).all(-1).any(1) & np.isfinite(scene.travel)
+    found |= ~found.any(-1, keepdims=True)  # no tree of the team found any: all frontiers count
+    near = np.linalg.norm(scene.points - scene.at[:, None], axis=-1) <= scene.radar_range
+    gain = scene.gain * np.where(near, RRT_HYSTERESIS, 1.0)
+    return choose_in_turn(scene, gain, np.where(found, BETA * scene.travel / scene.radar_range, np.inf))
+
+
+def _grow_tree(scene: Scene, robot: int) -> np.ndarray:
+    """Free cells where the branches of a robot's tree left what is known, int64 [n]."""
+    grid, ends = scene.grid, []
+    size = np.array([grid.width, grid.height])
+    branch = 0.5 * scene.radar_range / grid.cell
+    node = np.empty((RRT_SAMPLES + 1, 2))
+    node[0] = scene.at[robot] / grid.cell
+    count = 1
+    for point in scene.rng.random((RRT_SAMPLES, 2)) * size:
+        gap = np.linalg.norm(node[:count] - point, axis=-1)
+        start = node[gap.argmin()]
+        point = start + (point - start) * min(1.0, branch / max(gap.min(), 1e-9))
+        end = _walk_branch(grid, start, point)
+        if end == -1:
+            node[count] = point
+            count += 1
+        elif end >= 0:
+            ends.append(end)
+    return np.array(ends, np.int64)
+
+
+def _walk_branch(grid: KnownGrid, start: np.ndarray, end: np.ndarray) -> int:
+    """Walks a segment in half cells: -1 = known and free all along, -2 = blocked, else the last free cell before the
+    unknown."""
+    steps = 1 + int(2.0 * np.linalg.norm(end - start))
+    at = np.floor(start + (end - start) * (np.arange(steps + 1) / steps)[:, None]).astype(np.int64)
+    at = np.clip(at, 0, (grid.width - 1, grid.height - 1))
+    state = grid.known[at[:, 1], at[:, 0]]
+    first = int((state != FREE).argmax())
+    if state[first] == FREE:
+        return -1
+    if first == 0 or state[first] != UNKNOWN:
+        return -2
+    return int(at[first - 1, 1] * grid.width + at[first - 1, 0])
+
+
+def choose_any(scene: Scene) -> np.ndarray:
+    """Each robot any target that it can get to."""
+    draw = scene.rng.random(scene.travel.shape)
+    return np.where(np.isfinite(scene.travel), draw, -1.0).argmax(-1)
+
+
+CHOICES: dict[str, Callable[[Scene], np.ndarray]] = {
+    "random": choose_any,
+    "nearest_frontier": choose_nearest,
+    "cost_utility": choose_by_utility,
+    "potential_field": choose_by_force,
+    "rrt_frontiers": choose_by_tree,
+    "voronoi": choose_by_area,
+    "hungarian": choose_by_assignment,
+}
+"""Name -> `Scene` to the target of each robot, int64 [N]; what is infinitely far does not count as chosen."""

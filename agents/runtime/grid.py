@@ -1,0 +1,130 @@
+"""What the team knows, read from an occupancy grid as ROS has it: unknown, free or obstacle by cell."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+UNKNOWN, FREE, OBSTACLE = 0, 1, 2
+MAX_CELLS = 36_000_000
+
+
+@dataclass(frozen=True)
+class KnownGrid:
+    """Cells in rows along y; cell number = iy * width + ix.
+
+    Points "on the grid" are measured from its lower left corner along its own axes [m].
+
+    Attributes:
+        known: uint8 [H, W], `UNKNOWN`, `FREE` or `OBSTACLE`.
+        cell: edge length [m].
+        corner: lower left corner in the map's frame [m].
+        yaw: the grid's turn in the map's frame [rad].
+    """
+
+    known: np.ndarray
+    cell: float
+    corner: tuple[float, float]
+    yaw: float = 0.0
+
+    @property
+    def height(self) -> int:
+        """Cells along y."""
+        return self.known.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Cells along x."""
+        return self.known.shape[1]
+
+    def from_map(self, points: np.ndarray) -> np.ndarray:
+        """Points of the map's frame on the grid, [..., 2] [m]."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return (np.asarray(points, np.float64) - self.corner) @ np.array([[c, -s], [s, c]])
+
+    def to_map(self, points: np.ndarray) -> np.ndarray:
+        """Points on the grid in the map's frame, [..., 2] [m]."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return np.asarray(points, np.float64) @ np.array([[c, s], [-s, c]]) + self.corner
+
+    def centers(self, cells: np.ndarray) -> np.ndarray:
+        """Middles of cells on the grid, float64 [..., 2] [m]."""
+        cells = np.asarray(cells)
+        return (np.stack([cells % self.width, cells // self.width], axis=-1) + 0.5) * self.cell
+
+    def cells(self, points: np.ndarray) -> np.ndarray:
+        """Cells of points on the grid, int64 [...]; -1 outside of it and for NaN."""
+        index = np.floor(np.asarray(points) / self.cell)
+        inside = ((index >= 0) & (index < (self.width, self.height))).all(-1)
+        index = np.where(inside[..., None], index, 0).astype(np.int64)
+        return np.where(inside, index[..., 1] * self.width + index[..., 0], -1)
+
+
+def read_grid(grid, resolution, origin, occupied: float, notes: list[str]) -> KnownGrid:
+    """The grid of one call.
+
+    Args:
+        grid: [H, W] of numbers, `grid[row = y, column = x]`: -1 unknown, 0 (free) to 100 (occupied).
+        resolution: edge of a cell [m].
+        origin: x, y [m] and, if given, yaw [rad] of the lower left corner.
+        occupied: from this value on a cell is an obstacle.
+        notes: what was taken otherwise than it stands there is added in a sentence.
+
+    Raises:
+        ValueError: what was given cannot be an occupancy grid.
+    """
+    values = _check_values(grid)
+    number = _number(resolution)
+    if not (number is not None and 1e-4 <= number <= 1e3):
+        raise ValueError(f"resolution={resolution!r} must be the edge of a cell in metres, 0.0001 to 1000")
+    x, y, yaw = _check_origin(origin)
+    valid = (values >= 0) & (values <= 100)
+    odd = int(np.count_nonzero(~valid & (values != (255 if values.dtype.kind == "u" else -1))))
+    if odd:
+        notes.append(f"grid: {odd} cells hold neither -1 nor 0 to 100 and were taken as unknown")
+    known = np.where(values >= occupied, np.uint8(OBSTACLE), np.uint8(FREE))
+    known[~valid] = UNKNOWN
+    return KnownGrid(known, number, (x, y), yaw)
+
+
+def _check_values(grid) -> np.ndarray:
+    advice = "give numbers [rows along y, columns along x], as np.reshape(msg.data, (height, width))"
+    try:
+        values = np.asarray(grid)
+    except ValueError:  # rows of different lengths
+        raise ValueError(f"grid has rows of different lengths: {advice}") from None
+    if values.dtype.kind not in "iuf":
+        raise ValueError(f"grid is a {type(grid).__name__} of {values.dtype}: {advice}")
+    if values.ndim != 2:
+        raise ValueError(f"grid has {values.ndim} axes: {advice}")
+    if values.size > MAX_CELLS:
+        raise ValueError(f"grid has {values.size:,} cells, and at most {MAX_CELLS:,} are planned on: make cells larger")
+    if values.dtype.kind == "f" and ((values > 0) & (values < 1)).any() and not (values > 1).any():
+        raise ValueError("grid holds shares between 0 and 1: multiply them by 100, unknown cells stay -1")
+    return values
+
+
+def _check_origin(origin) -> tuple[float, float, float]:
+    numbers = [_number(one) for one in _listed(origin)]
+    if len(numbers) not in (2, 3) or None in numbers or max(map(abs, numbers)) > 1e8:
+        raise ValueError(f"origin={origin!r} must be x, y [m] and at most a yaw [rad] of the lower left corner")
+    x, y, yaw = [*numbers, 0.0][:3]
+    return x, y, yaw
+
+
+def _listed(value) -> list:
+    try:
+        return list(value)
+    except TypeError:
+        return []
+
+
+def _number(value) -> float | None:
+    """A finite number, else None."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None

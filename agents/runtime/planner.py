@@ -1,0 +1,224 @@
+"""Goals for a team of robots from an occupancy grid and their poses, without torch and without the simulator."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .choices import CHOICES, LEAST_GAIN, prefer
+from .grid import FREE, KnownGrid, read_grid
+from .scene import Scene, look_at
+from .team import Team, read_team
+from .watch import Watch
+from .ways import trace
+
+LOG = logging.getLogger("maexp.runtime")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where a team should go now; N robots in the order of the poses, lengths in metres, in the map's frame.
+
+    Attributes:
+        names: keys of the poses, or 0 to N - 1.
+        goals: float64 [N, 2]; where a robot stands if it has nowhere to go, NaN if its pose is not known.
+        active: bool [N], robots that have somewhere to go: their goals lie on known free ground that they get to.
+        ways: float64 [k, 2] each, corners of the way from a robot to its goal; k = 0 for robots that stay.
+        targets: float64 [K, 2], all places that were chosen from, for drawing.
+        done: nothing is left that a robot could get to and see more from.
+        notes: what was ignored or given up, a sentence each.
+    """
+
+    names: tuple[Hashable, ...]
+    goals: np.ndarray
+    active: np.ndarray
+    ways: list[np.ndarray]
+    targets: np.ndarray
+    done: bool
+    notes: tuple[str, ...]
+
+
+class TeamPlanner:
+    """Chooses where each robot of a team should go next, call by call.
+
+    Args:
+        policy: one of the classical planners, `maexp.agents.runtime.CHOICES`.
+        radar_range: how far robots see [m].
+        robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list.
+        clearance_factor: radii that ways keep from obstacles twice over where there is room.
+        occupied: cells of the grid with this value and above are obstacles, 1 to 100.
+        bounded: the grid shows the whole place; else the unknown lies beyond its edge.
+        least_area: targets with less unknown area in sight do not count [m^2]; None: what the smallest robot covers.
+        patience: how long a robot may stand still on its way, or beside a target that stays, until that is given up [s].
+        pause: how long a target is given up for the first time; longer every time, the third for good [s].
+        seed: of choices at random.
+    """
+
+    def __init__(
+        self,
+        policy: str = "cost_utility",
+        *,
+        radar_range: float = 5.0,
+        robot_radius=0.3,
+        clearance_factor: float = 2.0,
+        occupied: float = 50.0,
+        bounded: bool = False,
+        least_area: float | None = None,
+        patience: float = 10.0,
+        pause: float = 60.0,
+        seed: int = 0,
+    ):
+        if policy not in CHOICES:
+            raise ValueError(f"policy={policy!r} is unknown: choose one of {', '.join(CHOICES)}")
+        self.choose = CHOICES[policy]
+        self.radar_range = _positive("radar_range", radar_range)
+        self.robot_radius, self.bounded, self.seed = robot_radius, bounded, seed
+        self.clearance_factor = _positive("clearance_factor", clearance_factor)
+        self.occupied = _positive("occupied", occupied)
+        self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
+        self.watch = Watch(_positive("patience", patience), _positive("pause", pause))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: what was given up, where robots were."""
+        self.watch.forget()
+        self.rng = np.random.default_rng(self.seed)
+        self.anchor: KnownGrid | None = None  # blocks of targets are counted from its corner
+        self.said: frozenset[str] = frozenset()
+
+    def plan(
+        self,
+        grid,
+        resolution: float,
+        origin,
+        poses,
+        *,
+        velocities=None,
+        time_left: float = 1.0,
+        radar_range: float | None = None,
+        robot_radius=None,
+        now: float | None = None,
+    ) -> Plan:
+        """Goals of all robots.
+
+        Args:
+            grid: numbers [H, W], `grid[row = y, column = x]`: -1 unknown, 0 free to 100 occupied.
+            resolution: edge of a cell [m].
+            origin: x, y [m] and, if given, yaw [rad] of the grid's lower left corner in the map's frame.
+            poses: {name: (x, y, yaw) or None}, or numbers [N, 2] or [N, 3]; map's frame [m, rad].
+            velocities: speeds [m/s] or (vx, vy), one for each robot; None: standing.
+            time_left: share of the time for the whole exploration that is left, 1 to 0.
+            radar_range, robot_radius: instead of those of this planner.
+            now: time of the call [s]; None: a clock's.
+
+        Raises:
+            ValueError: an argument is not what it should be at all. What is merely missing or strange is ignored,
+                and `Plan.notes` says so.
+        """
+        notes: list[str] = []
+        reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+        now = time.monotonic() if now is None else _finite("now", now)
+        known = read_grid(grid, resolution, origin, self.occupied, notes)
+        team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
+        shift = self._shift(known, notes)
+        if not (known.known == FREE).any():
+            notes.append("the grid holds no free cell yet: robots stay where they are")
+            return self._finish(_stay(team, notes))
+        scene = look_at(
+            known, team, reach, self.clearance_factor, self.bounded, self.least_area, shift, self.rng, notes
+        )
+        notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
+        chosen, events = self._choose(team, scene)
+        notes += events
+        return self._finish(_describe(team, scene, chosen, notes))
+
+    def _shift(self, grid: KnownGrid, notes: list[str]) -> tuple[int, int]:
+        """How far the grid's corner has moved since the first call, in cells."""
+        old = self.anchor
+        if old is not None and (abs(old.cell / grid.cell - 1.0) > 1e-3 or abs(old.yaw - grid.yaw) > 1e-6):
+            notes.append("the grid has another resolution or turn than before: what was given up is forgotten")
+            self.watch.forget()
+            old = None
+        if old is None:
+            self.anchor = old = replace(grid, known=grid.known[:0])
+        x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
+        return int(x), int(y)
+
+    def _choose(self, team: Team, scene: Scene) -> tuple[np.ndarray, list[str]]:
+        """The target of each robot of the scene, int64 [n], -1 = none; and what happened."""
+        notes = []
+        allowed = self.watch.allowed(team, scene.robots, scene.targets)
+        if not np.isfinite(scene.travel[allowed]).any() and self.watch.try_again():
+            notes.append("nothing else is left: what was given up is tried once more")
+            allowed = self.watch.allowed(team, scene.robots, scene.targets)
+        travel = np.where(allowed, scene.travel, np.inf).astype(np.float32)
+        chosen = np.full(len(scene.robots), -1)
+        if not travel.size:
+            return chosen, notes
+        parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots])
+        wanted = prefer(travel, scene.gain >= LEAST_GAIN)
+        if not parked.all():
+            chosen[~parked] = self.choose(replace(scene, travel=wanted).of(~parked))
+        chosen[parked] = scene.travel[parked].argmin(-1)
+        travel[parked] = scene.travel[parked]
+        chosen[~np.isfinite(travel[np.arange(len(chosen)), chosen])] = -1
+        chosen, events = self.watch.settle(
+            team, scene.robots, scene.targets, travel, chosen, scene.radar_range
+        )
+        return chosen, notes + events
+
+    def _finish(self, plan: Plan) -> Plan:
+        """Log what has not been said in the call before."""
+        for note in plan.notes:
+            if note not in self.said:
+                LOG.warning(note)
+        self.said = frozenset(plan.notes)
+        return plan
+
+
+def _describe(team: Team, scene: Scene, chosen: np.ndarray, notes: list[str]) -> Plan:
+    """The plan of a choice, with a way to every goal."""
+    plan = _stay(team, notes)
+    for row, robot in enumerate(scene.robots):
+        if chosen[row] >= 0:
+            cells = trace(scene.passable[row], scene.distance[row], scene.targets.cell[chosen[row]])
+            way = np.concatenate([team.at[robot][None], scene.grid.to_map(scene.grid.centers(cells))])
+            plan.ways[robot], plan.goals[robot], plan.active[robot] = way, way[-1], True
+    done = len(scene.robots) > 0 and not plan.active.any()
+    return replace(plan, targets=scene.grid.to_map(scene.points), done=done)
+
+
+def _stay(team: Team, notes: list[str]) -> Plan:
+    """Everybody stays where they are."""
+    count = len(team.names)
+    return Plan(
+        names=team.names,
+        goals=team.at.copy(),
+        active=np.zeros(count, bool),
+        ways=[np.zeros((0, 2))] * count,
+        targets=np.zeros((0, 2)),
+        done=False,
+        notes=tuple(notes),
+    )
+
+
+def _finite(name: str, value) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name}={value!r} must be a finite number")
+    return number
+
+
+def _positive(name: str, value, zero: bool = False) -> float:
+    number = _finite(name, value)
+    if number < 0.0 or (number == 0.0 and not zero):
+        raise ValueError(f"{name}={value!r} must be {'0 or more' if zero else 'above 0'}")
+    return number

@@ -1,0 +1,156 @@
+"""What a team chooses from, out of its grid and poses: who takes part, ways, targets and what is to be seen there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import label
+
+from .frontiers import Targets, block_side, list_targets, look_around, mark_frontier
+from .grid import OBSTACLE, KnownGrid
+from .team import Team
+from .ways import MARGIN_CELLS, SNAP_CELLS, STRAIGHT, UNREACHED, flood, gap_squares, mark_passable, snap
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What targets are chosen from: n robots that take part, K targets, lengths on the grid in metres.
+
+    Attributes:
+        grid, radar_range: what the team knows, and how far robots see.
+        robots: int64 [n], which of the team take part.
+        at: float64 [n, 2], where they are.
+        passable, distance: per robot uint8 and int32 [H, W], as `mark_passable` and `flood` make them.
+        targets: blocks, cells and sizes of the targets.
+        travel: float32 [n, K], way from robot to target; infinite where there is none or it is not to be taken.
+        points: float64 [K, 2], where the targets are.
+        gain: float32 [K], unknown cells in radar range and sight of each, as a share of the radar's disc.
+        middle: float32 [K, 2], the middle of those, from the target.
+        near: bool [n, K], which robots stand beside which targets.
+        rng: for choices at random.
+    """
+
+    grid: KnownGrid
+    radar_range: float
+    robots: np.ndarray
+    at: np.ndarray
+    passable: list[np.ndarray]
+    distance: np.ndarray
+    targets: Targets
+    travel: np.ndarray
+    points: np.ndarray
+    gain: np.ndarray
+    middle: np.ndarray
+    near: np.ndarray
+    rng: np.random.Generator
+
+    def of(self, rows: np.ndarray) -> Scene:
+        """The scene for some of its robots, bool [n]."""
+        passable = [mask for mask, kept in zip(self.passable, rows, strict=True) if kept]
+        parts = {name: getattr(self, name)[rows] for name in ("robots", "at", "distance", "travel", "near")}
+        return replace(self, passable=passable, **parts)
+
+
+def look_at(
+    grid: KnownGrid,
+    team: Team,
+    radar_range: float,
+    clearance_factor: float,
+    bounded: bool,
+    least_area: float | None,
+    shift: tuple[int, int],
+    rng: np.random.Generator,
+    notes: list[str],
+) -> Scene:
+    """Looks at the grid for the whole team.
+
+    Args:
+        radar_range: how far robots see [m].
+        clearance_factor: radii that robots keep from walls where there is room.
+        bounded: nothing lies beyond the grid's edge.
+        least_area: targets with less to see do not count [m^2]; None: what a robot covers.
+        shift: the grid's corner, in cells from where blocks are counted.
+        rng: for choices at random.
+        notes: robots that are left out are added, a sentence each.
+    """
+    robots, passable, distance = _find_ways(grid, team, clearance_factor, notes)
+    radius = team.radius[robots]
+    search = math.ceil(np.float32(radius.max(initial=0.0)) / np.float32(grid.cell) + np.float32(MARGIN_CELLS)) + 1
+    targets = list_targets(
+        mark_frontier(grid.known, bounded), (distance < UNREACHED).any(0), block_side(radar_range, grid.cell), search,
+        shift,
+    )  # fmt: skip
+    area, middle = look_around(grid, targets.cell, radar_range, bounded)
+    least = math.pi * radius.min(initial=math.inf) ** 2 if least_area is None else least_area
+    kept = area * grid.cell**2 >= least
+    targets, area, middle = targets.select(kept), area[kept], middle[kept]
+    points = grid.centers(targets.cell)
+    way = distance.reshape(len(robots), -1)[:, targets.cell]
+    at = grid.from_map(team.at[robots])
+    beside = np.maximum(1.5 * grid.cell, clearance_factor * radius)[:, None]
+    return Scene(
+        grid=grid,
+        radar_range=radar_range,
+        robots=robots,
+        at=at,
+        passable=passable,
+        distance=distance,
+        targets=targets,
+        travel=np.where(way < UNREACHED, way * np.float32(grid.cell / STRAIGHT), np.float32(np.inf)),
+        points=points,
+        gain=area / np.float32(math.pi * (radar_range / grid.cell) ** 2),
+        middle=middle,
+        near=np.linalg.norm(points - at[:, None], axis=-1) <= beside,
+        rng=rng,
+    )
+
+
+def _find_ways(grid: KnownGrid, team: Team, clearance_factor: float, notes: list[str]):
+    """The robots that have a place on the grid, and where each can get to."""
+    gaps = gap_squares(grid.known)
+    sizes, which = np.unique(team.radius, return_inverse=True)
+    masks = [mark_passable(grid, gaps, size, clearance_factor * size) for size in sizes]
+    sources = np.full(len(team.names), -1)
+    for robot in np.flatnonzero(np.isfinite(team.at).all(-1)):
+        sources[robot] = _find_start(grid, masks[which[robot]], team, robot, notes)
+    robots = np.flatnonzero(sources >= 0)
+    distance = np.full((len(robots), *grid.known.shape), UNREACHED, np.int32)
+    for k, mask in enumerate(masks):
+        rows = which[robots] == k
+        if rows.any():
+            distance[rows] = flood(mask, sources[robots[rows]])
+    return robots, [masks[which[robot]] for robot in robots], distance
+
+
+def _find_start(grid: KnownGrid, passable: np.ndarray, team: Team, robot: int, notes: list[str]) -> int:
+    """The cell that a robot's ways start from, -1 = none."""
+    cell = int(grid.cells(grid.from_map(team.at[robot])))
+    x, y = team.at[robot]
+    if cell < 0:
+        notes.append(f"{team.title(robot)} is outside of the grid at ({x:.2f}, {y:.2f}) and was left out")
+        return -1
+    start = snap(passable, cell)
+    if start < 0:
+        start = _snap_far(grid, passable, cell, 4.0 * team.radius[robot])
+    if start < 0:
+        notes.append(f"{team.title(robot)} is in a wall or on unknown ground at ({x:.2f}, {y:.2f}) and was left out")
+    return start
+
+
+def _snap_far(grid: KnownGrid, passable: np.ndarray, cell: int, room: float) -> int:
+    """The nearest passable cell within `room` [m] on this side of the walls; -1 where none is.
+
+    A robot may stand on ground that it does not see itself, and nearer to a wall than its radius allows.
+    """
+    reach = max(SNAP_CELLS, math.ceil(room / grid.cell))
+    y, x = divmod(cell, grid.width)
+    part = (slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1))
+    side, _ = label(grid.known[part] != OBSTACLE)
+    here = side[y - part[0].start, x - part[1].start]
+    if here == 0:
+        return -1
+    near = np.zeros_like(passable)
+    near[part] = passable[part] * (side == here)
+    return snap(near, cell, reach)
