@@ -39,6 +39,8 @@ def choose_in_turn(scene: Scene, gain: np.ndarray, cost: np.ndarray) -> np.ndarr
     for _ in range(len(scene.at)):
         value = np.where(waiting[:, None], gain - cost, -np.inf)
         robot, target = np.unravel_index(value.argmax(), value.shape)
+        if value[robot, target] == -np.inf:  # only robots without a way to any target are left
+            break
         chosen[robot], waiting[robot] = target, False
         far = np.linalg.norm(scene.points - scene.points[target], axis=-1) / scene.radar_range
         gain = gain * np.minimum(far, 1.0)

@@ -16,6 +16,7 @@ from .grid import FREE, OBSTACLE, UNKNOWN, KnownGrid
 RAYS = 48  # rays that look around from a target
 BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 LOOKED_AT_ONCE = 4_000_000  # cells of rays in one go: bounds the memory
+STRIDE = 1 << 20  # more blocks than a row has
 WALL, UNSEEN = 1, 2  # bits of a cell: obstacle, unknown; then a bit for each way to come diagonally between two walls
 CORNERS = {(1, 1): 4, (-1, 1): 8, (-1, -1): 16, (1, -1): 32}
 
@@ -78,8 +79,10 @@ def list_targets(frontier: np.ndarray, reached: np.ndarray, side: int, search: i
     """
     y, x = np.nonzero(frontier)
     across = (np.stack([x, y], axis=1) + shift) // side
-    block, which = np.unique(across, axis=0, return_inverse=True)
-    which = which.reshape(-1)
+    lower = across.min(0, initial=0)
+    key = (across - lower) @ (1, STRIDE)  # row by row, as the kernels number them
+    key, which = np.unique(key, return_inverse=True)
+    block = np.stack([key % STRIDE, key // STRIDE], axis=1) + lower
     size = np.bincount(which, minlength=len(block))
     total = np.stack([np.bincount(which, one, len(block)) for one in (x, y)], axis=1).astype(np.int64)
     cell = _nearest_reached(reached, block * side - shift, size, total, side, search)

@@ -54,7 +54,7 @@ class TeamPlanner:
         occupied: cells of the grid with this value and above are obstacles, 1 to 100.
         bounded: the grid shows the whole place; else the unknown lies beyond its edge.
         least_area: targets with less unknown area in sight do not count [m^2]; None: what the smallest robot covers.
-        patience: how long a robot may stand still on its way, or beside a target that stays, until that is given up [s].
+        patience: how long a robot may stand still on its way, or beside a target that stays [s].
         pause: how long a target is given up for the first time; longer every time, the third for good [s].
         seed: of choices at random.
     """
@@ -121,21 +121,21 @@ class TeamPlanner:
                 and `Plan.notes` says so.
         """
         notes: list[str] = []
-        reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
         now = time.monotonic() if now is None else _finite("now", now)
         known = read_grid(grid, resolution, origin, self.occupied, notes)
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
-        shift = self._shift(known, notes)
+        reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+        scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
             notes.append("the grid holds no free cell yet: robots stay where they are")
             return self._finish(_stay(team, notes))
-        scene = look_at(
-            known, team, reach, self.clearance_factor, self.bounded, self.least_area, shift, self.rng, notes
-        )
         notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
         chosen, events = self._choose(team, scene)
-        notes += events
-        return self._finish(_describe(team, scene, chosen, notes))
+        return self._finish(_describe(team, scene, chosen, notes + events))
+
+    def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> Scene:
+        shift = self._shift(grid, notes)
+        return look_at(grid, team, reach, self.clearance_factor, self.bounded, self.least_area, shift, self.rng, notes)
 
     def _shift(self, grid: KnownGrid, notes: list[str]) -> tuple[int, int]:
         """How far the grid's corner has moved since the first call, in cells."""

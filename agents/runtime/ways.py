@@ -41,7 +41,8 @@ def mark_passable(grid: KnownGrid, gaps: np.ndarray, radius: float, clearance: f
         gaps: of `gap_squares`.
         radius, clearance: distances to keep, and to keep where there is room [m].
     """
-    near, far = (np.float32(r) / np.float32(grid.cell) + np.float32(MARGIN_CELLS) for r in (radius, COMFORT * clearance))
+    margin = np.float32(MARGIN_CELLS)
+    near, far = (np.float32(r) / np.float32(grid.cell) + margin for r in (radius, COMFORT * clearance))
     passable = np.where(gaps < far * far, np.uint8(TIGHT), np.uint8(OPEN))
     passable[(grid.known != FREE) | (gaps < near * near)] = BLOCKED
     return passable

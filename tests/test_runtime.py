@@ -1,0 +1,122 @@
+"""The runtime for robots: what it computes is what the kernels compute, and it needs neither torch nor Warp."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from runtime_cases import Moment, moments
+
+from maexp.agents import policies
+from maexp.agents.runtime import CHOICES, TeamPlanner, choices, frontiers, ways
+from maexp.agents.runtime.grid import read_grid
+from maexp.agents.runtime.team import read_team
+from maexp.envs import RobotConfig
+from maexp.kernels import geodesic, targets, wavefront
+from maexp.kernels import ways as kernel_ways
+
+CASES = {
+    "indoor": {},
+    "maze": {},
+    "jittered": {},
+    "maze, two sizes": {"robot": [RobotConfig(), RobotConfig(collision_threshold=0.6), RobotConfig()]},
+    "indoor, one robot": {"num_robots": 1},
+}
+
+
+def cases(name: str):
+    return moments(name.partition(",")[0], **CASES[name])
+
+
+def survey(now: Moment):
+    """The scene that the runtime makes of a moment."""
+    planner, notes = TeamPlanner("nearest_frontier", **now.settings), []
+    grid = read_grid(now.call["grid"], now.call["resolution"], now.call["origin"], planner.occupied, notes)
+    team = read_team(now.call["poses"], None, planner.robot_radius, notes)
+    return planner._look(grid, team, planner.radar_range, notes)
+
+
+def test_imports_neither_torch_nor_warp():
+    code = (
+        "import sys, numpy as np\nfrom maexp.agents.runtime import TeamPlanner\n"
+        "grid = np.zeros((20, 30), np.int8); grid[:, 20:] = -1\n"
+        "plan = TeamPlanner().plan(grid, 0.2, (0, 0), [(1.0, 1.0, 0.0)])\nassert plan.active.all(), plan\n"
+        "print([m for m in ('torch', 'warp', 'tensordict', 'torchrl', 'skimage', 'hydra') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+def test_numbers_are_those_of_the_kernels_and_policies():
+    for ours, theirs, names in (
+        (ways, geodesic, ("STRAIGHT", "DIAGONAL", "TIGHT_FACTOR", "UNREACHED", "BLOCKED", "OPEN", "TIGHT")),
+        (ways, wavefront, ("MARGIN_CELLS", "COMFORT")),
+        (ways, kernel_ways, ("SNAP_CELLS",)),
+        (frontiers, targets, ("RAYS",)),
+        (choices, policies, ("BETA", "LEAST_GAIN", "RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
+    ):
+        assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
+    assert set(CHOICES) == set(policies.POLICIES)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_targets_ways_and_gains_are_those_of_the_kernels(name):
+    count = 0
+    for now in cases(name):
+        scene, nav = survey(now), now.nav
+        alive = nav.alive()[0].numpy()
+        there = nav.target[0, 0].numpy()
+        assert np.array_equal(scene.targets.cell, there[there >= 0])
+        assert np.array_equal(scene.targets.size, nav.size[0, 0].numpy()[there >= 0])
+        cells = scene.distance[0].size
+        assert np.array_equal(scene.distance.reshape(-1, cells), nav.distance[0, alive, :cells].numpy())
+        travel = nav.travel()[0, alive][:, there >= 0].numpy()
+        np.testing.assert_allclose(scene.travel, travel, rtol=1e-6)
+        area, middle = (value[0, 0, there >= 0].numpy() for value in nav.look_around(nav.radar_range))
+        disc = np.pi * (nav.radar_range / now.call["resolution"]) ** 2
+        np.testing.assert_allclose(scene.gain * disc, area, rtol=1e-5)
+        np.testing.assert_allclose(scene.middle, middle, atol=1e-4 * nav.radar_range)
+        first = nav.first_points(3.0)[0, alive][:, there >= 0].numpy() - now.call["origin"]
+        for row in range(len(scene.robots)):
+            cells = ways.cells_ahead(scene.passable[row], scene.distance[row], scene.targets.cell, 3.0)
+            assert np.array_equal(cells >= 0, np.isfinite(travel[row]))
+            np.testing.assert_allclose(scene.grid.centers(cells)[cells >= 0], first[row, cells >= 0], atol=1e-4)
+        count += len(there[there >= 0])
+    assert count > 20
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_robots_take_the_targets_that_the_policies_take(name):
+    for now in cases(name):
+        for policy in ("nearest_frontier", "cost_utility", "voronoi", "potential_field", "hungarian"):
+            plan = TeamPlanner(policy, **now.settings).plan(**now.call)
+            there = policies.FrontierPlanner(now.env, policies.CHOICES[policy])
+            there(None)
+            chosen = there.chosen[0].squeeze(-1)
+            assert np.array_equal(plan.active, (chosen >= 0).numpy())
+            wanted = there.nav.points(there.nav.target[0, 0, chosen.clamp_min(0)].unsqueeze(0))[0].numpy()
+            if policy == "hungarian":  # of several assignments with the same total any will do
+                ours, theirs = (total_way(there.nav, goals) for goals in (plan.goals, wanted))
+                assert ours == pytest.approx(theirs, rel=1e-3)
+            else:
+                np.testing.assert_allclose(plan.goals[plan.active], wanted[plan.active], atol=1e-4, err_msg=policy)
+
+
+def total_way(nav, goals) -> float:
+    points = nav.points(nav.target.clamp_min(0))[0]
+    gap = (points - torch.as_tensor(goals).unsqueeze(1)).norm(dim=-1)
+    nearest = gap.masked_fill(nav.target[0, :1] < 0, torch.inf).argmin(-1)
+    return float(nav.travel()[0].gather(1, nearest.unsqueeze(1)).sum())
+
+
+def test_trees_find_frontiers_as_those_of_the_kernels_do():
+    ours, theirs = 0, 0
+    for now in cases("indoor"):
+        scene = survey(now)
+        grown = [choices._grow_tree(scene, robot) for robot in range(len(scene.robots))]
+        y, x = np.divmod(np.concatenate(grown), scene.grid.width)
+        blocks = scene.targets.block_of(x, y)
+        ours += len({tuple(one) for one in blocks.tolist()})
+        theirs += int(now.nav.grow_trees(policies.RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
+    assert ours == pytest.approx(theirs, rel=0.2)
