@@ -89,15 +89,16 @@ def test_targets_ways_and_gains_are_those_of_the_kernels(name):
 @pytest.mark.parametrize("name", CASES)
 def test_robots_take_the_targets_that_the_policies_take(name):
     for now in cases(name):
+        nav = now.nav
         for policy in ("nearest_frontier", "cost_utility", "voronoi", "potential_field", "hungarian"):
             plan = TeamPlanner(policy, **now.settings).plan(**now.call)
             there = policies.FrontierPlanner(now.env, policies.CHOICES[policy])
             there(None)
             chosen = there.tracker.state["chosen"][0].squeeze(-1)
             assert np.array_equal(plan.active, (chosen >= 0).numpy())
-            wanted = there.tracker.nav.points(there.tracker.nav.target[0, 0, chosen.clamp_min(0)].unsqueeze(0))[0].numpy()
+            wanted = nav.points(nav.target[:, 0, chosen.clamp_min(0)])[0].numpy()
             if policy == "hungarian":  # of several assignments with the same total any will do
-                ours, theirs = (total_way(there.tracker.nav, goals) for goals in (plan.goals, wanted))
+                ours, theirs = (total_way(nav, goals) for goals in (plan.goals, wanted))
                 assert ours == pytest.approx(theirs, rel=1e-3)
             else:
                 np.testing.assert_allclose(plan.goals[plan.active], wanted[plan.active], atol=1e-4, err_msg=policy)
