@@ -66,7 +66,8 @@ def choose_by_utility(scene: Scene) -> torch.Tensor:
 def choose_by_tree(scene: Scene) -> torch.Tensor:
     """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
     nav = scene.nav
-    found = scene.spread(nav.grow_trees(RRT_SAMPLES, 0.5 * nav.radar_range)) & scene.travel.isfinite()
+    found = scene.of_blocks(scene.spread(nav.grow_trees(RRT_SAMPLES, 0.5 * nav.radar_range)))
+    found = found & scene.travel.isfinite()
     found = found | ~found.any(-1, keepdim=True)  # no tree of the team found any: all frontiers count
     near = (scene.points - nav.centers().unsqueeze(2)).norm(dim=-1) <= nav.radar_range
     gain = scene.gain * torch.where(near, RRT_HYSTERESIS, 1.0)
@@ -99,15 +100,15 @@ def choose_by_force(scene: Scene) -> torch.Tensor:
     """
     nav = scene.nav
     at = nav.centers()
-    ways = nav.first_points(3.0) - at.unsqueeze(2)
+    ways = nav.points_on_way(scene.cells(), 3.0) - at.unsqueeze(2)
     ways = ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     cell = nav.cell_of_env().view(-1, 1, 1)
     pull = torch.where(scene.travel.isfinite(), scene.size / (scene.travel / cell).clamp_min(1.0) ** DECAY, 0.0)
-    force = (pull.unsqueeze(-1) * ways).sum(2)
+    force = scene.to_blocks(pull.unsqueeze(-1) * ways).sum(2)
     apart = at.unsqueeze(2) - at.unsqueeze(1)
     gap = apart.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     push = REPULSION * (1.0 - gap / nav.radar_range).clamp_min(0.0) * scene.alive[:, None, :, None]
-    force = force + pull.sum(-1, keepdim=True) * (push * apart / gap).sum(2)
+    force = force + scene.to_blocks(pull).sum(-1, keepdim=True) * (push * apart / gap).sum(2)
     along = (ways * force.unsqueeze(2)).sum(-1) / force.norm(dim=-1, keepdim=True).clamp_min(1e-6)
     return torch.where(scene.travel.isfinite(), pull * (1.0 + along), -torch.inf).argmax(-1)
 
@@ -126,13 +127,13 @@ class FrontierPlanner:
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
-        scene = self.tracker.look()
+        scene = self.tracker.look(compact=True)
         scene = replace(scene, travel=_prefer(scene.travel, scene.gain >= LEAST_GAIN))
         chosen = self.choose(scene).unsqueeze(-1)
         found = scene.travel.gather(2, chosen).isfinite()
-        cell = scene.spread(scene.nav.target).gather(2, chosen)
+        cell, block = scene.cells().gather(2, chosen), scene.block.gather(2, chosen)
         toward = scene.middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
-        return self.tracker.take(torch.where(found, chosen, -1).squeeze(-1), cell.squeeze(-1), toward)
+        return self.tracker.take(torch.where(found, block, -1).squeeze(-1), cell.squeeze(-1), toward)
 
 
 def _prefer(travel: torch.Tensor, worth: torch.Tensor) -> torch.Tensor:

@@ -16,7 +16,7 @@ import warp as wp
 from maexp.envs.nav_grid import bank_nav_grids
 from maexp.kernels import targets
 from maexp.kernels.frontier import mark_frontier
-from maexp.kernels.geodesic import BLOCKED, STRAIGHT, UNREACHED
+from maexp.kernels.geodesic import STRAIGHT, UNREACHED
 from maexp.kernels.known_grid import KnownGrids, PassableGrids
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
@@ -34,7 +34,8 @@ class Navigation:
     """Known grids, distances and targets of all envs of an `ExplorationEnv`.
 
     R rows per env hold what is known: 1 where all communicate, else N (a robot knows what it has heard). K is
-    the number of blocks of the largest map. Attributes below are valid after `update`.
+    the number of blocks of the largest map, T the most blocks with a target that an env has now. Attributes below are
+    valid after `update`.
 
     Attributes:
         known: uint8 [E, R, C], `UNKNOWN`, `FREE` or `OBSTACLE` by cell (iy * width + ix).
@@ -42,6 +43,8 @@ class Navigation:
         distance: int32 [E, N, C], way from each robot over known free cells, 10 a cell; `UNREACHED` elsewhere.
         target: int64 [E, R, K], the cell to go to for each block with frontier cells; -1 = none.
         size: int32 [E, R, K], frontier cells in the block.
+        block: int64 [E, 1, T], the blocks with a target in some row, in order; -1 fills up.
+        cell: int64 [E, R, T], the cells to go to for these; -1 = none.
     """
 
     def __init__(self, env: ExplorationEnv):
@@ -53,7 +56,7 @@ class Navigation:
         self.grids, cells = nav
         limited = env.comm_config.limited
         self.rows = self.num_robots if limited else 1
-        prefix = "known" if limited else "seen"
+        prefix = "known" if limited else "viewers"
         self.arrays = {
             name: wp.from_torch(self.state[name], dtype=kind)
             for name, kind in (
@@ -69,10 +72,11 @@ class Navigation:
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
         self.paths = PathSearch(self.passable, mask_of_robot)
-        room = comfort * (OPEN_GROUND / COMFORT)
-        self.open_ground = PassableGrids(self.known_grids, room, None, 0.0, through_unknown=True)
+        room = np.ascontiguousarray((comfort * (OPEN_GROUND / COMFORT))[:, mask_of_robot])
+        self.room = wp.array(room, dtype=wp.float32, device=str(env.device))
         self._size_blocks(env, float(threshold.max()))
         self._make_views(cells)
+        self._rays: dict[float, list[wp.array]] = {}
         self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
         self.radar_range = max(r.range for r in env.radar_configs)
         self.clearance = float(sim.robot_tensors["clearance"].max())
@@ -82,8 +86,9 @@ class Navigation:
         reach = min(r.range for r in env.radar_configs)
         block = np.maximum(2, np.round(reach / cell / BLOCKS_PER_RANGE)).astype(np.int32)
         search = np.ceil(threshold / cell + MARGIN_CELLS).astype(np.int32) + 1
-        self.block, self.search = (wp.array(v, dtype=wp.int32, device=str(env.device)) for v in (block, search))
+        self.block_side, self.search = (wp.array(v, dtype=wp.int32, device=str(env.device)) for v in (block, search))
         self.num_blocks = int((-(-width // block) * -(-height // block)).max())
+        self.tallest, self.finest = int(height.max()), float(cell.min())
 
     def _make_views(self, cells: int) -> None:
         """Outputs as torch tensors that share memory with the kernels' arrays."""
@@ -98,6 +103,7 @@ class Navigation:
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
         self._target = torch.zeros((e * r, k), dtype=torch.int32, device=self.device)
         self._size = torch.zeros_like(self._target)
+        self._sums = torch.zeros((e * r, k, 2), dtype=torch.int32, device=self.device)
 
     def update(self) -> None:
         """Bring everything up to date with the env."""
@@ -113,32 +119,75 @@ class Navigation:
         self.paths.flood(self.launch)
         rows = self.known_grids.grid_of_row
         frontier = wp.from_torch(self.frontier.flatten(0, 1))
-        mark_frontier(self.known_grids.known, rows, grids.width, grids.height, frontier)
-        self.launch(
-            targets._list_targets, tuple(self._target.shape),
-            inputs=[grids, rows, self.block, self.search, frontier, self.paths.search.distance, self.rows,
-                    self.num_robots],
-            outputs=[wp.from_torch(self._target), wp.from_torch(self._size)],
+        mark_frontier(
+            self.known_grids.known, rows, grids.width, grids.height, frontier, self.tallest, self.launch
         )  # fmt: skip
-        self.target = self._target.view(self.num_envs, self.rows, -1).long()
-        self.size = self._size.view(self.num_envs, self.rows, -1)
+        self._size.zero_()
+        self._sums.zero_()
+        size, sums = wp.from_torch(self._size), wp.from_torch(self._sums)
+        self.launch(
+            targets._sum_frontier, (len(self._size), self.tallest),
+            inputs=[grids, rows, self.block_side, frontier], outputs=[size, sums],
+        )  # fmt: skip
+        self.launch(
+            targets._place_targets, tuple(self._target.shape),
+            inputs=[grids, rows, self.block_side, self.search, size, sums, self.paths.search.distance, self.rows,
+                    self.num_robots],
+            outputs=[wp.from_torch(self._target)],
+        )  # fmt: skip
+        self._list_targets()
 
-    def look_around(self, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
+    def _list_targets(self) -> None:
+        """The blocks where some row has a target, env by env (of some 4,000 blocks a hundred have)."""
+        target = self._target.view(self.num_envs, self.rows, -1)
+        env, block = (target >= 0).any(1).nonzero(as_tuple=True)
+        count = torch.bincount(env, minlength=self.num_envs)
+        slot = torch.arange(len(env), device=self.device) - (count.cumsum(0) - count)[env]
+        most = max(int(count.max()), 1)
+        self.block = torch.full((self.num_envs, 1, most), -1, device=self.device)
+        self.block[env, 0, slot] = block
+        cell = target.gather(2, self.block.clamp_min(0).expand(-1, self.rows, -1)).long()
+        self.cell = torch.where(self.block >= 0, cell, -1)
+
+    @property
+    def target(self) -> torch.Tensor:
+        return self._target.view(self.num_envs, self.rows, -1).long()
+
+    @property
+    def size(self) -> torch.Tensor:
+        return self._size.view(self.num_envs, self.rows, -1)
+
+    def look_around(self, radius: float, cells: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """What could be seen for the first time from every target, within ``radius`` [m] and in front of known walls.
 
+        Args:
+            radius: how far [m].
+            cells: int64 [E, R, M], from where; -1 = nowhere. None: from the targets of all blocks.
+
         Returns:
-            float32 [E, R, K], unknown cells; float32 [E, R, K, 2], their middle, from the target [m].
+            float32 [E, R, K or M], unknown cells; float32 [E, R, K or M, 2], their middle, from the target [m].
         """
-        area = torch.empty(self._target.shape, device=self.device)
-        middle = torch.empty((*self._target.shape, 2), device=self.device)
+        start = self._target if cells is None else cells.flatten(0, 1).to(torch.int32).contiguous()
+        area = torch.empty(start.shape, device=self.device)
+        middle = torch.empty((*start.shape, 2), device=self.device)
         self.launch(
             targets._look_around, tuple(area.shape),
-            inputs=[self.grids, self.known_grids.grid_of_row, self.known_grids.known,
-                    wp.from_torch(self._target), float(radius)],
+            inputs=[self.grids, self.known_grids.grid_of_row, self.known_grids.known, wp.from_torch(start),
+                    *self._spread_rays(radius), float(radius)],
             outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
         )  # fmt: skip
         shape = (self.num_envs, self.rows, -1)
         return area.view(shape), middle.view(*shape, 2)
+
+    def _spread_rays(self, radius: float) -> list[wp.array]:
+        """Cells of the rays of a radius [m], computed once, and their directions."""
+        if radius not in self._rays:
+            steps, device = int(radius / self.finest) + 2, str(self.device)
+            rays = [wp.zeros((targets.RAYS, steps), dtype=wp.vec2i, device=device)]
+            rays.append(wp.zeros(targets.RAYS, dtype=wp.vec2, device=device))
+            self.launch(targets._spread_rays, (targets.RAYS, steps), inputs=[], outputs=rays)
+            self._rays[radius] = rays
+        return self._rays[radius]
 
     def grow_trees(self, samples: int, branch: float) -> torch.Tensor:
         """Targets that random trees of the robots came upon: bool [E, R, K].
@@ -154,7 +203,7 @@ class Navigation:
         cells = branch / float(self.cell_size.max())
         self.launch(
             _grow_tree, items,
-            inputs=[self.grids, self.arrays["map_id"], self.block, *state, self.known_grids.known,
+            inputs=[self.grids, self.arrays["map_id"], self.block_side, *state, self.known_grids.known,
                     self.paths.search.sources, self.rows, self.num_robots, samples, cells],
             outputs=[wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
         )  # fmt: skip
@@ -168,12 +217,15 @@ class Navigation:
         """Centres of the bodies [m]: float32 [E, N, 2]."""
         return self.state["center"][..., :2]
 
-    def travel(self) -> torch.Tensor:
-        """Way from every robot to every target [m]: float32 [E, N, K], infinite where there is none."""
-        cells = self.target.clamp_min(0).expand(-1, self.num_robots, -1)
-        way = self.distance.gather(2, cells)
+    def travel(self, cells: torch.Tensor | None = None) -> torch.Tensor:
+        """Way from every robot to every target [m]: float32 [E, N, K], infinite where there is none.
+
+        ``cells``, int64 [E, R, M], asks for other places (-1 = none): float32 [E, N, M].
+        """
+        cells = (self.target if cells is None else cells).expand(-1, self.num_robots, -1)
+        way = self.distance.gather(2, cells.clamp_min(0))
         metres = way * (self.cell_of_env() / STRAIGHT).view(-1, 1, 1)
-        return torch.where((self.target >= 0) & (way < UNREACHED), metres, torch.inf)
+        return torch.where((cells >= 0) & (way < UNREACHED), metres, torch.inf)
 
     def cell_of_env(self) -> torch.Tensor:
         """Edge of a cell of each env's grid [m]: float32 [E]."""
@@ -188,8 +240,16 @@ class Navigation:
         return self.origin[m].view(*shape, 2) + index * self.cell_size[m].view(*shape, 1)
 
     def first_points(self, ahead: float) -> torch.Tensor:
-        """Points ``ahead`` [cells] in front of every robot on its way to every target: float32 [E, N, K, 2]."""
-        wanted = self.target.to(torch.int32).expand(-1, self.num_robots, -1).contiguous()
+        """Points ``ahead`` [cells] in front of every robot on its way to every target: float32 [E, N, K, 2] [m]."""
+        return self.points_on_way(self.target.expand(-1, self.num_robots, -1), ahead)
+
+    def points_on_way(self, cells: torch.Tensor, ahead: float) -> torch.Tensor:
+        """Points ``ahead`` [cells] in front of robots on their ways to ``cells``, int64 [E, N, M], -1 = none.
+
+        Returns:
+            float32 [E, N, M, 2] [m]; the first cell of the map where there is no way.
+        """
+        wanted = cells.to(torch.int32).contiguous()
         cell = torch.empty_like(wanted)
         self.launch(
             targets._first_cells, tuple(wanted.shape),
@@ -231,15 +291,20 @@ class Navigation:
         Returns:
             bool [E, N].
         """
-        self.open_ground.paint(self.launch)
         share = torch.linspace(0.0, 1.0, OPEN_SAMPLES, device=self.device).view(1, 1, -1, 1)
         at = self.centers().unsqueeze(2)
         m = self.state["map_id"].long().view(-1, 1, 1)
         cell = (at + share * (points.unsqueeze(2) - at) - self.origin[m]) / self.cell_size[m].unsqueeze(-1)
         x, y = cell.floor().long().clamp_min(0).unbind(-1)
         index = torch.minimum(y, self.height[m] - 1) * self.width[m] + torch.minimum(x, self.width[m] - 1)
-        rows = wp.to_torch(self.paths.row_of_item).long().view(index.shape[:2]).unsqueeze(-1)
-        return (wp.to_torch(self.open_ground.passable)[rows, index] != BLOCKED).any(-1)
+        found = torch.empty(index.shape[:2], dtype=torch.bool, device=self.device)
+        self.launch(
+            targets._find_open_ground, tuple(found.shape),
+            inputs=[self.grids, self.arrays["map_id"], self.known_grids.known, self.rows,
+                    wp.from_torch(index.to(torch.int32).contiguous()), self.room],
+            outputs=[wp.from_torch(found)],
+        )  # fmt: skip
+        return found
 
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""

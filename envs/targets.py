@@ -30,6 +30,8 @@ class Scene:
         middle: float32 [E, N, K, 2], the middle of those, from the target [m].
         alive: bool [E, N], robots that still move.
         nav: the env's grids.
+        block: int64 [E, N, K], the blocks of frontier cells that they stand for, 0 for absent ones; None: K is the
+            number of blocks, in order.
     """
 
     travel: torch.Tensor
@@ -39,10 +41,31 @@ class Scene:
     middle: torch.Tensor
     alive: torch.Tensor
     nav: Navigation
+    block: torch.Tensor | None = None
 
     def spread(self, per_row: torch.Tensor) -> torch.Tensor:
         """[E, R, K] of what is known -> [E, N, K] of the robots."""
         return per_row.expand(-1, self.travel.shape[1], -1)
+
+    def cells(self) -> torch.Tensor:
+        """Cells of the targets, int64 [E, N, K]; -1 for absent ones."""
+        return self.spread(self.nav.target if self.block is None else self.nav.cell)
+
+    def of_blocks(self, per_block: torch.Tensor) -> torch.Tensor:
+        """[E, N, blocks] -> [E, N, K]: what belongs to these targets."""
+        return per_block if self.block is None else per_block.gather(2, self.block)
+
+    def to_blocks(self, values: torch.Tensor) -> torch.Tensor:
+        """[E, N, K, ...] -> [E, N, blocks, ...], 0 for blocks without a target.
+
+        A sum over all blocks adds up in another order than one over the targets: here the former is kept.
+        """
+        if self.block is None:
+            return values
+        there = self.travel.isfinite().view(*self.block.shape, *[1] * (values.dim() - 3))
+        index = self.block.view(there.shape).expand(values.shape)
+        blocks = values.new_zeros((*values.shape[:2], self.nav.num_blocks, *values.shape[3:]))
+        return blocks.scatter_add_(2, index, torch.where(there, values, 0.0))
 
 
 class TargetTracker:
@@ -67,22 +90,30 @@ class TargetTracker:
             "counted": torch.full((env.num_envs,), -1, dtype=torch.int32, device=device),
         }
 
-    def look(self) -> Scene:
-        """Bring everything up to date with the env, and give up what led nowhere (once a macro step)."""
+    def look(self, compact: bool = False) -> Scene:
+        """Bring everything up to date with the env, and give up what led nowhere (once a macro step).
+
+        Args:
+            compact: list the targets that there are (`Scene.block`), not one for every block of frontier cells.
+        """
         nav, robots = self.nav, self.env.num_robots
         nav.update()
-        points = nav.points(nav.target.expand(-1, robots, -1).clamp_min(0))
-        travel = self._give_up(nav.travel(), points)
+        cells = nav.cell if compact else nav.target
+        block = nav.block.clamp_min(0).expand(-1, robots, -1) if compact else None
+        points = nav.points(cells.clamp_min(0)).expand(-1, robots, -1, -1)
+        travel = self._give_up(nav.travel(cells), points, block)
         disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        area, middle = nav.look_around(nav.radar_range)
+        area, middle = nav.look_around(nav.radar_range, cells if compact else None)
+        size = nav.size.expand(-1, robots, -1)
         return Scene(
             travel=travel,
             points=points,
-            size=nav.size.expand(-1, robots, -1).float(),
+            size=(size.gather(2, block) if compact else size).float(),
             gain=(area / disc.view(-1, 1, 1)).expand(-1, robots, -1),
             middle=middle.expand(-1, robots, -1, -1),
             alive=nav.alive(),
             nav=nav,
+            block=block,
         )
 
     def take(
@@ -138,9 +169,11 @@ class TargetTracker:
         far = torch.where(at_target.unsqueeze(-1), beyond, far)
         return torch.where(is_open.unsqueeze(-1), far, near)
 
-    def _give_up(self, travel: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    def _give_up(
+        self, travel: torch.Tensor, points: torch.Tensor, block: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
-        each robot those that it got stuck on the way to."""
+        each robot those that it got stuck on the way to. ``block`` as in `Scene`."""
         nav, s = self.nav, self.state
         step = nav.state["macro_step"]
         fresh, due = step == 0, step != s["counted"]
@@ -148,13 +181,18 @@ class TargetTracker:
         due = (due | fresh).view(-1, 1, 1)
         near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
         beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near) & due
-        s["dwell"] += beside.any(1, keepdim=True) if nav.rows == 1 else beside
+        beside = beside.any(1, keepdim=True).expand_as(beside) if nav.rows == 1 else beside
+        if block is None:
+            s["dwell"] += beside
+        else:
+            s["dwell"].scatter_add_(2, block, beside.to(torch.int32))
         stuck = (nav.centers() - s["stood"]).norm(dim=-1, keepdim=True) < STUCK * nav.clearance
         stuck = stuck & (s["chosen"] >= 0) & nav.alive().unsqueeze(-1) & due
         s["dwell"].scatter_add_(2, s["chosen"].clamp_min(0), stuck.to(torch.int32))
         s["stood"] = torch.where(due, nav.centers(), s["stood"])
         s["counted"] = step.clone()
-        kept = travel.masked_fill(s["dwell"] >= DWELL, torch.inf)
+        dwell = s["dwell"] if block is None else s["dwell"].gather(2, block)
+        kept = travel.masked_fill(dwell >= DWELL, torch.inf)
         # Nothing else left: try them all once more.
         again = ~kept.isfinite().flatten(1).any(1)
         s["dwell"][again] = 0

@@ -4,6 +4,9 @@ A grid cell is `UNKNOWN`, `FREE` or `OBSTACLE`; a frontier cell is a free one th
 unknown one. What lies outside the grid is not unknown: nothing can ever be seen there.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 import warp as wp
 
@@ -25,31 +28,42 @@ def _mark_frontier(
     # Out:
     frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
 ):
-    row, cell = wp.tid()
+    row, y = wp.tid()
     grid = grid_of_row[row]
     w = width[grid]
-    cells = w * height[grid]
-    found = wp.uint8(0)
-    if cell < cells:
-        if known[row, cell] == wp_free:
-            x = cell % w
-            if x > 0:
-                if known[row, cell - 1] == wp_unknown:
+    h = height[grid]
+    if y >= h:
+        return
+    line = known[row]
+    for cell in range(y * w, (y + 1) * w):
+        found = wp.uint8(0)
+        if line[cell] == wp_free:
+            if cell > y * w:
+                if line[cell - 1] == wp_unknown:
                     found = wp.uint8(1)
-            if x + 1 < w:
-                if known[row, cell + 1] == wp_unknown:
+            if cell + 1 < (y + 1) * w:
+                if line[cell + 1] == wp_unknown:
                     found = wp.uint8(1)
-            if cell >= w:
-                if known[row, cell - w] == wp_unknown:
+            if y > 0:
+                if line[cell - w] == wp_unknown:
                     found = wp.uint8(1)
-            if cell + w < cells:
-                if known[row, cell + w] == wp_unknown:
+            if y + 1 < h:
+                if line[cell + w] == wp_unknown:
                     found = wp.uint8(1)
-    frontier[row, cell] = found
+        frontier[row, cell] = found
+    if y == h - 1:
+        for cell in range(w * h, known.shape[1]):
+            frontier[row, cell] = wp.uint8(0)
 
 
 def mark_frontier(
-    known: wp.array, grid_of_row: wp.array, width: wp.array, height: wp.array, frontier: wp.array
+    known: wp.array,
+    grid_of_row: wp.array,
+    width: wp.array,
+    height: wp.array,
+    frontier: wp.array,
+    tallest: int,
+    launch: Callable | None = None,
 ):
     """Marks the frontier cells of a batch of grids of different sizes.
 
@@ -58,14 +72,11 @@ def mark_frontier(
         grid_of_row: int32 [rows], which grid (map) a row has now.
         width, height: int32 [grids], cells of each grid along x and y.
         frontier: uint8 [rows, cells], out: 1 on frontier cells, 0 elsewhere.
+        tallest: cells of the tallest grid along y.
+        launch: launches or records ``launch(kernel, dim, inputs, outputs)``; on the arrays' device.
     """
-    wp.launch(
-        _mark_frontier,
-        known.shape,
-        inputs=[known, grid_of_row, width, height],
-        outputs=[frontier],
-        device=known.device,
-    )
+    launch = launch or partial(wp.launch, device=known.device)
+    launch(_mark_frontier, (known.shape[0], tallest), [known, grid_of_row, width, height], [frontier])
 
 
 def frontier_cells(known_free: torch.Tensor, known_obstacle: torch.Tensor) -> torch.Tensor:
@@ -100,5 +111,6 @@ def frontier_cells(known_free: torch.Tensor, known_obstacle: torch.Tensor) -> to
         wp.array([width], dtype=wp.int32, device=device),
         wp.array([height], dtype=wp.int32, device=device),
         wp.from_torch(frontier),
+        height,
     )
     return frontier.view(batch, height, width) != 0

@@ -249,12 +249,12 @@ def near_wall(
 ) -> bool:
     """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
     reach = int(wp.ceil(radius))
-    found = wp.bool(False)
     for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
         for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
             if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
-                found = found or known[row, v * w + u] == wp_obstacle
-    return found
+                if known[row, v * w + u] == wp_obstacle:
+                    return True
+    return False
 
 
 @wp.kernel(enable_backward=False)

@@ -10,7 +10,7 @@ import warp as wp
 
 from maexp.kernels.frontier import OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
-from maexp.kernels.known_grid import NavGrids, nav_cell
+from maexp.kernels.known_grid import NavGrids, nav_cell, near_wall
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import nearest_passable, step_back
 
@@ -62,25 +62,56 @@ def is_reached(
 
 
 @wp.kernel(enable_backward=False)
-def _list_targets(
+def _sum_frontier(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
+    # State in:
+    frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    # Out, zero before:
+    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
+    sums: wp.array3d(dtype=wp.int32),  # [row, block, 2], sums of their x and y, from the block's corner
+):
+    """Gathers the frontier cells of a line of cells in their blocks."""
+    row, y = wp.tid()
+    m = grid_of_row[row]
+    w = grids.width[m]
+    if y >= grids.height[m]:
+        return
+    b = block[m]
+    first = y / b * ((w + b - 1) / b)
+    line = frontier[row]
+    for x in range(w):
+        if line[y * w + x] != wp.uint8(0):
+            k = first + x / b
+            wp.atomic_add(size, row, k, 1)
+            wp.atomic_add(sums, row, k, 0, x % b)
+            wp.atomic_add(sums, row, k, 1, y % b)
+
+
+@wp.kernel(enable_backward=False)
+def _place_targets(
     # Map:
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
     search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
     # State in:
-    frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
+    sums: wp.array3d(dtype=wp.int32),  # [row, block, 2]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     rows_per_env: int,
     robots: int,
     # Out:
     target: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
-    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
 ):
     """The reached cell nearest to the middle of a block's frontier cells, in the block or close to it."""
     row, k = wp.tid()
     target[row, k] = -1
-    size[row, k] = 0
+    count = size[row, k]
+    if count == 0:
+        return
     m = grid_of_row[row]
     w = grids.width[m]
     h = grids.height[m]
@@ -88,43 +119,37 @@ def _list_targets(
     across = (w + b - 1) / b
     x0 = (k % across) * b
     y0 = (k / across) * b
-    if y0 >= h:
-        return
-    x1 = wp.min(x0 + b, w)
-    y1 = wp.min(y0 + b, h)
-    count = wp.int32(0)
-    sum_x = wp.int32(0)
-    sum_y = wp.int32(0)
-    for y in range(y0, y1):
-        for x in range(x0, x1):
-            if frontier[row, y * w + x] != wp.uint8(0):
-                count += 1
-                sum_x += x
-                sum_y += y
-    if count == 0:
-        return
-    size[row, k] = count
     e = row / rows_per_env
     first = wp.where(rows_per_env > 1, row % rows_per_env, 0)
     last = wp.where(rows_per_env > 1, first + 1, robots)
     s = search[m]
-    best_gap = wp.int32(1 << 30)
-    for y in range(wp.max(y0 - s, 0), wp.min(y1 + s, h)):
-        for x in range(wp.max(x0 - s, 0), wp.min(x1 + s, w)):
-            # Compared after scaling by `count`, which keeps the mean in integers.
-            gap_x = wp.abs(x * count - sum_x)
-            gap_y = wp.abs(y * count - sum_y)
+    best_gap = wp.int64(1) << wp.int64(60)
+    for y in range(wp.max(y0 - s, 0), wp.min(wp.min(y0 + b, h) + s, h)):
+        for x in range(wp.max(x0 - s, 0), wp.min(wp.min(x0 + b, w) + s, w)):
+            # Compared after scaling by `count`, which keeps the mean in integers; 64 bits, for blocks may be large.
+            gap_x = wp.int64((x - x0) * count - sums[row, k, 0])
+            gap_y = wp.int64((y - y0) * count - sums[row, k, 1])
             gap = gap_x * gap_x + gap_y * gap_y
-            if gap < best_gap and is_reached(distance, e, first, last, robots, y * w + x):
-                best_gap = gap
-                target[row, k] = y * w + x
+            if gap < best_gap:
+                if is_reached(distance, e, first, last, robots, y * w + x):
+                    best_gap = gap
+                    target[row, k] = y * w + x
 
 
-@wp.func
-def cell_ahead(x: int, y: int, ux: float, uy: float, steps: int) -> wp.vec2i:
-    """The cell `steps` cells from (x, y) along a unit vector."""
-    t = float(steps)
-    return wp.vec2i(x + int(wp.floor(t * ux + 0.5)), y + int(wp.floor(t * uy + 0.5)))
+@wp.kernel(enable_backward=False)
+def _spread_rays(
+    # Out:
+    cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], from the middle
+    way: wp.array(dtype=wp.vec2),  # [ray], unit vectors
+):
+    """The cells that each ray goes through."""
+    ray, step = wp.tid()
+    ux = wp.cos((float(ray) + 0.5) * wp_ray_angle)
+    uy = wp.sin((float(ray) + 0.5) * wp_ray_angle)
+    t = float(step)
+    cell[ray, step] = wp.vec2i(int(wp.floor(t * ux + 0.5)), int(wp.floor(t * uy + 0.5)))
+    if step == 0:
+        way[ray] = wp.vec2(ux, uy)
 
 
 @wp.kernel(enable_backward=False)
@@ -134,11 +159,13 @@ def _look_around(
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     # State in:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
-    target: wp.array2d(dtype=wp.int32),  # [row, block]
+    target: wp.array2d(dtype=wp.int32),  # [row, target], -1 = none
+    ray_cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], as far as the radius in every grid
+    ray_way: wp.array(dtype=wp.vec2),  # [ray]
     radius: float,  # [m]
     # Out:
-    area: wp.array2d(dtype=wp.float32),  # [row, block], unknown cells in sight of the target
-    middle: wp.array2d(dtype=wp.vec2),  # [row, block], the middle of those, from the target [m]
+    area: wp.array2d(dtype=wp.float32),  # [row, target], unknown cells in sight of the target
+    middle: wp.array2d(dtype=wp.vec2),  # [row, target], the middle of those, from the target [m]
 ):
     """What a robot at each target might see for the first time: known walls hide what is behind them.
 
@@ -156,29 +183,54 @@ def _look_around(
         reach = int(radius / grids.cell[m])
         x = cell % w
         y = cell / w
+        line = known[row]
         for ray in range(wp_rays):
-            ux = wp.cos((float(ray) + 0.5) * wp_ray_angle)
-            uy = wp.sin((float(ray) + 0.5) * wp_ray_angle)
-            before = wp.vec2i(x, y)
-            blocked = wp.bool(False)
+            u = x
+            v = y
             for step in range(1, reach + 1):
-                if not blocked:
-                    at = cell_ahead(x, y, ux, uy, step)
-                    if at[0] < 0 or at[0] >= w or at[1] < 0 or at[1] >= h:
-                        blocked = True
-                    else:
-                        state = known[row, at[1] * w + at[0]]
-                        # Not between two walls that touch at a corner either.
-                        beside = known[row, at[1] * w + before[0]] == wp_obstacle
-                        beside = beside and known[row, before[1] * w + at[0]] == wp_obstacle
-                        blocked = beside or state == wp_obstacle
-                        if not blocked and state == wp_unknown:
-                            part = float(step) * wp_ray_angle
-                            total += part
-                            moment += wp.vec2(ux, uy) * (part * float(step))
-                        before = at
+                at = ray_cell[ray, step] + wp.vec2i(x, y)
+                if at[0] < 0 or at[0] >= w or at[1] < 0 or at[1] >= h:
+                    break
+                state = line[at[1] * w + at[0]]
+                if state == wp_obstacle:
+                    break
+                if at[0] != u and at[1] != v:  # not between two walls that touch at a corner either
+                    if line[at[1] * w + u] == wp_obstacle and line[v * w + at[0]] == wp_obstacle:
+                        break
+                if state == wp_unknown:
+                    part = float(step) * wp_ray_angle
+                    total += part
+                    moment += ray_way[ray] * (part * float(step))
+                u = at[0]
+                v = at[1]
     area[row, k] = total
     middle[row, k] = moment * (grids.cell[m] / wp.max(total, 1.0e-6))
+
+
+@wp.kernel(enable_backward=False)
+def _find_open_ground(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),
+    # State in:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    rows_per_env: int,
+    cell: wp.array3d(dtype=wp.int32),  # [env, robot, sample]
+    room: wp.array2d(dtype=wp.float32),  # [env, robot], distance from known obstacles [m]
+    # Out:
+    found: wp.array2d(dtype=wp.bool),  # [env, robot]
+):
+    """Whether one of a robot's cells lies no nearer to known obstacles than `room`."""
+    e, i = wp.tid()
+    m = map_id[e]
+    w = grids.width[m]
+    row = e * rows_per_env + wp.where(rows_per_env > 1, i, 0)
+    open = wp.bool(False)
+    for k in range(cell.shape[2]):
+        at = cell[e, i, k]
+        if not open and known[row, at] != wp_obstacle:
+            open = not near_wall(known, row, at % w, at / w, w, grids.height[m], room[e, i] / grids.cell[m])
+    found[e, i] = open
 
 
 @wp.kernel(enable_backward=False)

@@ -59,7 +59,7 @@ def test_mixed_grid_sizes():
     known[:, 49:] = FREE  # beyond both grids
     out = wp.empty((3, capacity), dtype=wp.uint8, device="cpu")
     ints = [wp.array(v, dtype=wp.int32, device="cpu") for v in (grid_of_row, [9, 6], [5, 8])]
-    mark_frontier(wp.array(known, dtype=wp.uint8, device="cpu"), *ints, out)
+    mark_frontier(wp.array(known, dtype=wp.uint8, device="cpu"), *ints, out, 8)
     for row, g in enumerate(grid_of_row):
         cells = sizes[g][0] * sizes[g][1]
         part = known[row, :cells].reshape(sizes[g])

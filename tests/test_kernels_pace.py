@@ -164,9 +164,12 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
         target = np.stack([world.rng.integers(-1, known.size, blocks) for known in world.known])
         area, middle = wp.zeros((3, blocks), dtype=float), wp.zeros((3, blocks), dtype=wp.vec2)
         radius = 6.1
+        rays = [wp.zeros((targets.RAYS, 14), dtype=wp.vec2i), wp.zeros(targets.RAYS, dtype=wp.vec2)]
+        launch(targets._spread_rays, rays[0].shape, [], rays)
         launch(
             targets._look_around, (3, blocks),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), array(target, wp.int32), radius],
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), array(target, wp.int32), *rays,
+             radius],
             [area, middle],
         )  # fmt: skip
         for e, k in np.ndindex(3, blocks):

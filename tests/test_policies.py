@@ -191,7 +191,11 @@ class Places:
     def cell_of_env(self):
         return torch.ones(len(self.at))
 
-    def first_points(self, ahead: float):
+    @property
+    def target(self):
+        return torch.zeros(self.ways.shape[:3], dtype=torch.long)
+
+    def points_on_way(self, cells, ahead: float):
         return self.at.unsqueeze(2) + self.ways
 
     def grow_trees(self, samples: int, branch: float):
