@@ -3,13 +3,14 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from maexp.envs.metrics import episode_metrics, summarise
+from maexp.envs.metrics import episode_metrics, resample_weights, summarise
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
@@ -24,6 +25,8 @@ class EvaluationResult:
         num_robots: team size
         episodes: each metric's value in each episode; NaN where an episode has none
         seconds: wall time
+        maps: the map of each episode, names [episodes]
+        learned: whether the policy was trained
         place: the map, where several were played one by one; "": all of them
         times, coverage: coverage over time, [records] [s] and [episodes, records] in [0, 1]; None: not recorded
         shares: of each robot in what its team discovered, [episodes, robots]; None: not recorded
@@ -33,14 +36,29 @@ class EvaluationResult:
     num_robots: int
     episodes: dict
     seconds: float
+    maps: np.ndarray
+    learned: bool = False
     place: str = ""
     times: np.ndarray | None = None
     coverage: np.ndarray | None = None
     shares: np.ndarray | None = None
 
+    @property
+    def weights(self) -> np.ndarray:
+        """Resamples of maps, and of the episodes on each."""
+        return resample_weights(self.maps)
+
     def summary(self) -> dict[str, dict]:
         """{metric: {mean, std, ci95: [lo, hi], n}}."""
-        return {name: summarise(values) for name, values in self.episodes.items()}
+        return self._summary
+
+    @cached_property
+    def _summary(self) -> dict[str, dict]:
+        return {name: summarise(values, self.weights) for name, values in self.episodes.items()}
+
+    def minus(self, other: "EvaluationResult") -> dict[str, dict]:
+        """The same of the paired differences to another result on the same episodes."""
+        return {name: summarise(values - other.episodes[name], self.weights) for name, values in self.episodes.items()}
 
 
 def pool(parts: list[EvaluationResult]) -> EvaluationResult:
@@ -52,6 +70,8 @@ def pool(parts: list[EvaluationResult]) -> EvaluationResult:
         parts[0].num_robots,
         {metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes},
         sum(one.seconds for one in parts),
+        np.concatenate([one.maps for one in parts]),
+        parts[0].learned,
         times=times,
         coverage=np.stack(lines),
         shares=np.concatenate([one.shares for one in parts]),
@@ -82,7 +102,7 @@ def evaluate(
     had happened. `advance(count)` is called as episodes end.
     """
     begin = time.perf_counter()
-    finals = []
+    finals, maps = [], []
     devices = [env.device] if env.device.type == "cuda" else []
     with torch.random.fork_rng(devices):
         torch.manual_seed(seed)
@@ -90,9 +110,10 @@ def evaluate(
             numbers = torch.arange(first, first + env.num_envs, device=env.device)
             count = min(env.num_envs, episodes - first)
             finals.append(play(policy, env, numbers.clamp(max=episodes - 1))[:count])
+            maps += [env.maps[index].name for index in env.simulation.tensors["map_id"][:count].tolist()]
             advance(count)
     metrics = episode_metrics(torch.cat(finals), env.local_steps * env.macro_steps, env.success_coverage)
-    return EvaluationResult(name, env.num_robots, metrics, time.perf_counter() - begin)
+    return EvaluationResult(name, env.num_robots, metrics, time.perf_counter() - begin, np.array(maps))
 
 
 @torch.no_grad()

@@ -9,13 +9,13 @@ import torch
 
 from maexp.agents.errors import UserError
 from maexp.envs.film import write_gif, write_mp4
-from maexp.envs.render import draw_frame, draw_grid, watch_episode
+from maexp.envs.render import add_headline, draw_frame, draw_grid, watch_episode
 from maexp.envs.viewing.episode import Episode, EpisodeRecorder
 
 WRITERS = {"gif": write_gif, "mp4": write_mp4}
 EPISODES = "episodes"  # folder of the episode files
 MOST_TEAMS = 64  # in one film or on one page
-WIDTHS = ((1, 512), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
+WIDTHS = ((1, 512), (2, 440), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
 
 
 def check_render(cfg: Any) -> None:
@@ -60,14 +60,19 @@ def play_teams(
 
 
 def draw_film(episodes: list[Episode]) -> list[np.ndarray]:
-    """The pictures of a film, uint8 (height, width, 3): the teams side by side, at the same time each."""
+    """The pictures of a film, uint8 (height, width, 3): the teams side by side, at the same time each.
+
+    Where policies differ, each team's picture has the name of its own on top.
+    """
+    several = len({one.policy for one in episodes}) > 1
     width = next(pixels for most, pixels in WIDTHS if len(episodes) <= most)
     frames, latest = [], {}
     for step in np.unique(np.concatenate([one.step for one in episodes])):
         for k, episode in enumerate(episodes):
             record = int(np.searchsorted(episode.step, step, side="right")) - 1
             if latest.get(k, (-1,))[0] != record:  # a team that is done stands still
-                latest[k] = record, draw_frame(episode.snapshot(record), width)
+                picture = draw_frame(episode.snapshot(record), width)
+                latest[k] = record, add_headline(picture, episode.policy) if several else picture
         pictures = [latest[k][1] for k in range(len(episodes))]
         frames.append(pictures[0] if len(pictures) == 1 else draw_grid(pictures))
     return frames

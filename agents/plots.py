@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from maexp.agents.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
+from maexp.envs.metrics import resample_weights, resampled_means
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
@@ -197,7 +198,8 @@ def draw_coverage(curves: dict, path) -> Path:
 
     Args:
         curves: name -> (seconds (records,), coverage (episodes, records) in [0, 1]), as
-            ``CoverageRecorder.curves`` returns them.
+            ``CoverageRecorder.curves`` returns them; third, where known, the map of each episode: the interval
+            then resamples maps, too.
         path: picture to write.
 
     Raises:
@@ -225,23 +227,31 @@ def draw_coverage_lines(ax, curves: dict, looks: dict[str, int] | None = None) -
     Raises:
         ValueError: shapes that do not fit (named).
     """
-    for k, (name, (seconds, coverage)) in enumerate(curves.items()):
+    for k, (name, (seconds, coverage, *maps)) in enumerate(curves.items()):
         seconds, coverage = np.asarray(seconds, dtype=float), np.atleast_2d(np.asarray(coverage, dtype=float))
         if coverage.shape[1:] != seconds.shape:
             raise ValueError(
                 f"curves[{name!r}]: coverage has shape {coverage.shape}, which must be (episodes, {len(seconds)})"
             )
-        mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
+        mean = 100 * coverage.mean(axis=0)
+        low, high = _band(coverage, *maps)
         k = k if looks is None else looks[name]
         colour, style = COLOURS[k % len(COLOURS)], STYLES[(k + k // len(COLOURS)) % len(STYLES)]
         ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
-        low, high = np.clip(mean - error, 0, 100), np.clip(mean + error, 0, 100)
-        ax.fill_between(seconds, low, high, color=colour, alpha=0.2, linewidth=0)
+        ax.fill_between(seconds, np.clip(low, 0, 100), np.clip(high, 0, 100), color=colour, alpha=0.2, linewidth=0)
     for mark in (85, 95):
         ax.axhline(mark, color="#808080", linewidth=0.8, linestyle=(0, (2, 2)))
     ax.set_ylim(0, 101)
     ax.set_xlim(left=0)
     ax.set_xlabel("time [s]")
+
+
+def _band(coverage: np.ndarray, maps: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """95 % interval of the mean at each record [%]."""
+    if maps is not None:
+        return tuple(100 * np.percentile(resampled_means(coverage, resample_weights(maps)), [2.5, 97.5], axis=0))
+    mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
+    return mean - error, mean + error
 
 
 # Metrics

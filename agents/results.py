@@ -21,7 +21,7 @@ COLUMNS = {
     "coverage_auc": "over time",
     "coverage_step_85": "85 % at step",
     "coverage_step_95": "95 % at step",
-    "coverage_step_95_censored": "or the limit",
+    "coverage_step_95_censored": "95 % censored",
     "mutual_overlap_85": "overlap",
     "success_rate": "success",
     "collisions": "collisions",
@@ -62,9 +62,23 @@ def result_names(results: list[EvaluationResult]) -> list[str]:
     return [f"{one.policy}{place}{size}" for one, place, size in zip(results, places, sizes, strict=True)]
 
 
+def paired_differences(results: list[EvaluationResult]) -> dict[str, dict]:
+    """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b on the same episodes, for every learned a and all others."""
+    named = list(zip(result_names(results), results, strict=True))
+
+    def others(one: EvaluationResult) -> list[tuple[str, EvaluationResult]]:
+        alike = (one.place, one.num_robots)
+        return [(name, other) for name, other in named if other is not one and (other.place, other.num_robots) == alike]
+
+    learned = {name: {rival: one.minus(other) for rival, other in others(one)} for name, one in named if one.learned}
+    return {name: found for name, found in learned.items() if found}
+
+
 def write_results(path: Path, results: list[EvaluationResult], run: dict) -> None:
-    """{policy: {metric: {mean, std, ci95, n}}} and `run`: what was run."""
+    """{policy: {metric: {mean, std, ci95, n}}}; `difference`: the same of the learned ones less each other; `run`: what
+    was run."""
     named = {name: one.summary() for name, one in zip(result_names(results), results, strict=True)}
+    named |= {"difference": found} if (found := paired_differences(results)) else {}
     named["run"] = run | {"num_robots": sorted({one.num_robots for one in results})}
     write_json(path, named)
 

@@ -1,10 +1,13 @@
 """Metrics of finished episodes and their summary (design 4.6; paper, section III-C)."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.stats import bootstrap
 from tensordict import TensorDictBase
 
 RESAMPLES = 5000
+GROUPED_RESAMPLES = 2000  # of maps, seeds and episodes: each takes a weight for every episode
 
 
 def episode_metrics(
@@ -44,18 +47,58 @@ def episode_metrics(
     return metrics
 
 
-def summarise(values: np.ndarray) -> dict:
+def resample_weights(*factors: np.ndarray) -> np.ndarray:
+    """How often each episode counts in each resample of a bootstrap of groups, float32 [GROUPED_RESAMPLES, episodes].
+
+    Args:
+        factors: what each episode belongs to, labels [episodes] each: its map, the seed of the training. Every factor
+            is resampled with replacement by itself, and the episodes within each combination (Owen 2007). One label
+            for all changes nothing.
+    """
+    return _resample_weights(*(tuple(np.unique(labels, return_inverse=True)[1].ravel().tolist()) for labels in factors))
+
+
+@lru_cache(maxsize=4)
+def _resample_weights(*factors: tuple[int, ...]) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    codes = np.array(factors)
+    counts = [max(one) + 1 for one in factors]
+    often = [rng.multinomial(count, np.full(count, 1 / count), size=GROUPED_RESAMPLES) for count in counts]
+    weights = np.zeros((GROUPED_RESAMPLES, codes.shape[1]), dtype=np.float32)
+    for combination in np.unique(codes, axis=1).T:
+        episodes = np.flatnonzero((codes == combination[:, None]).all(0))
+        count = np.prod([one[:, code] for one, code in zip(often, combination, strict=True)], axis=0)
+        weights[:, episodes] = rng.multinomial(count * len(episodes), np.full(len(episodes), 1 / len(episodes)))
+    return weights
+
+
+def resampled_means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Mean of `values` [episodes, ...] in each resample of `weights` [resamples, episodes], where it has one."""
+    total = weights.sum(1, keepdims=True).reshape(-1, *(1,) * (values.ndim - 1))
+    middle = values.mean(0)  # small numbers lose less in float32
+    sums = np.tensordot(weights, (values - middle).astype(np.float32), axes=1)
+    return middle + (sums[total.ravel() > 0] / total[total.ravel() > 0]).astype(np.float64)
+
+
+def summarise(values: np.ndarray, weights: np.ndarray | None = None) -> dict:
     """Mean, standard deviation and bootstrap 95 % interval of the mean over the episodes that have a value.
+
+    Args:
+        values: one for each episode; NaN: it has none.
+        weights: of `resample_weights`; None: episodes alone are resampled.
 
     Returns:
         ``{mean, std, ci95: [low, high], n}``; NaN where no episode has a value.
     """
     kept = np.asarray(values, dtype=np.float64)
-    kept = kept[~np.isnan(kept)]
+    have = ~np.isnan(kept)
+    kept = kept[have]
     if not len(kept):
         return {"mean": np.nan, "std": np.nan, "ci95": [np.nan, np.nan], "n": 0}
     low = high = float(kept.mean())
-    if np.ptp(kept) > 0.0:
+    if np.ptp(kept) > 0.0 and weights is not None:
+        low, high = (float(x) for x in np.percentile(resampled_means(kept, weights[:, have]), [2.5, 97.5]))
+    elif np.ptp(kept) > 0.0:
         found = bootstrap(
             (kept,), np.mean, n_resamples=RESAMPLES, batch=500, method="percentile", rng=np.random.default_rng(0)
         )

@@ -101,6 +101,16 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
     return np.array(frame)
 
 
+def add_headline(frame: np.ndarray, text: str) -> np.ndarray:
+    """A picture with a line of text on top, uint8 (height, width, 3)."""
+    height = frame.shape[1] // 14 // 2 * 2  # even sides, for video codecs
+    strip = Image.new("RGB", (frame.shape[1], height), STRIP)
+    font = _font(max(10, int(0.7 * height)))
+    at = (frame.shape[1] // 2, height // 2)
+    ImageDraw.Draw(strip).text(at, _fit(text, font, 0.96 * frame.shape[1]), INK, font, "mm")
+    return np.concatenate([np.asarray(strip), frame])
+
+
 def draw_grid(frames, columns: int | None = None, gap: int = 6) -> np.ndarray:
     """Several pictures (of any sizes) in one, row by row, about as wide as high; uint8 (height, width, 3)."""
     frames = [np.asarray(frame) for frame in frames]

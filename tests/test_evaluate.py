@@ -11,12 +11,15 @@ from maexp.agents import make_policy
 from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import describe_episodes
+from maexp.agents.comparison import describe_differences
 from maexp.agents.errors import UserError
 from maexp.agents.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
 from maexp.agents.policies import POLICIES
+from maexp.agents.results import paired_differences
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map
+from maexp.envs.metrics import resample_weights, summarise
 
 POINTCLOUD = ("scenario=pointcloud", "policy=random")
 
@@ -60,8 +63,8 @@ def test_recording_changes_nothing_and_ends_where_the_episodes_end(env):
 def test_pooled_curves_share_their_times():
     """A place with longer episodes and other moments: what is done keeps its coverage."""
     one, other = (
-        EvaluationResult("random", 1, {"exploration_ratio": np.ones(1)}, 1.0, "", np.array(times), np.array([coverage]),
-                         np.ones((1, 1)))
+        EvaluationResult("random", 1, {"exploration_ratio": np.ones(1)}, 1.0, np.array(["floor"]),
+                         times=np.array(times), coverage=np.array([coverage]), shares=np.ones((1, 1)))
         for times, coverage in (([0.0, 2.0], [0.0, 0.5]), ([0.0, 1.0, 4.0], [0.1, 0.4, 1.0]))
     )  # fmt: skip
     both = pool([one, other])
@@ -139,8 +142,78 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
 ])  # fmt: skip
 def test_episodes_are_called_held_out_where_they_are(words, wanted):
     cfg = compose_config("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
-    results = [EvaluationResult("random", 2, {"exploration_ratio": np.zeros(cfg.episodes)}, 1.0)]
+    results = [EvaluationResult("random", 2, {"exploration_ratio": np.zeros(cfg.episodes)}, 1.0, np.array(["a"]))]
     assert describe_episodes(cfg.episodes, results, load_maps(cfg.scenario, train=False)) == wanted
+
+
+def spread(found: dict) -> float:
+    return found["ci95"][1] - found["ci95"][0]
+
+
+def test_intervals_resample_maps_and_the_episodes_on_each():
+    """Ten maps that differ and ten episodes each that do not: a hundred episodes say no more than ten."""
+    rng = np.random.default_rng(1)
+    of_map, maps = rng.normal(size=10), np.repeat([f"map {k}" for k in range(10)], 10)
+    same = np.repeat(of_map, 10)
+    plain, grouped, ten = summarise(same), summarise(same, resample_weights(maps)), summarise(of_map)
+    assert spread(plain) < 0.45 * spread(ten) and spread(grouped) == pytest.approx(spread(ten), rel=0.1)
+    assert (grouped["mean"], grouped["n"]) == (plain["mean"], 100)
+    noise = rng.normal(size=100)  # maps alike: both say nearly the same
+    assert spread(summarise(noise, resample_weights(maps))) == pytest.approx(spread(summarise(noise)), rel=0.4)
+    alone = summarise(noise, resample_weights(np.repeat("floor", 100)))
+    assert spread(alone) == pytest.approx(spread(summarise(noise)), rel=0.1)
+
+
+def test_intervals_resample_the_seeds_of_training():
+    """Three trainings of which one failed: no number of episodes makes that certain."""
+    seeds, maps = np.repeat([0, 1, 2], 200), np.tile(np.repeat(["a", "b"], 100), 3)
+    values = np.where(seeds == 2, 0.0, 1.0)
+    assert spread(summarise(values, resample_weights(maps))) < 0.1
+    found = summarise(values, resample_weights(maps, seeds))
+    assert found["ci95"] == [pytest.approx(0.0, abs=0.01), pytest.approx(1.0)] and found["n"] == 600
+
+
+def test_weights_count_episodes_and_values_that_are_missing_are_left_out():
+    weights = resample_weights(np.array(["a", "a", "b", "b", "b"]))
+    assert (weights == np.round(weights)).all() and weights.shape[1] == 5
+    totals = {0: 4, 1: 5, 2: 6}  # twice a, once each, twice b
+    assert set(weights.sum(1)) == set(totals.values()) and ((weights[:, :2].sum(1) % 2) == 0).all()
+    found = summarise(np.array([1.0, np.nan, 3.0, np.nan, 5.0]), weights)
+    assert (found["mean"], found["n"]) == (3.0, 3) and 1.0 <= found["ci95"][0] < 3.0 < found["ci95"][1] <= 5.0
+
+
+def result(policy: str, coverage: list, steps: list, learned: bool = False, **others) -> EvaluationResult:
+    episodes = {"coverage_auc": np.array(coverage), "coverage_step_95_censored": np.array(steps)}
+    return EvaluationResult(policy, others.pop("num_robots", 3), episodes, 1.0, np.array(["a", "b"]), learned, **others)
+
+
+def test_differences_are_those_of_the_same_episodes():
+    """Episodes differ far more than policies do, and the difference is certain all the same."""
+    teams = [result("trained", [0.9, 0.3], [100.0, 200.0], True), result("voronoi", [0.8, 0.2], [150.0, 250.0])]
+    found = paired_differences(teams)
+    assert list(found) == ["trained"] and list(found["trained"]) == ["voronoi"]
+    assert found["trained"]["voronoi"]["coverage_auc"]["ci95"] == [pytest.approx(0.1)] * 2
+    assert found["trained"]["voronoi"]["coverage_step_95_censored"]["mean"] == -50
+    text = describe_differences(teams, {3: "voronoi"})
+    assert text == [
+        "The trained team is ahead of voronoi, the best classical planner on the validation maps: "
+        "+10.0 points of coverage over time [+10.0, +10.0], -50 steps to 95 % [-50, -50]."
+    ]
+    assert describe_differences(teams, {}) == [] and paired_differences(teams[1:]) == {}
+    tied = [result("trained", [0.9, 0.1], [100.0, 300.0], True), teams[1]]
+    assert "The trained team cannot be told from voronoi" in describe_differences(tied, {3: "voronoi"})[0]
+
+
+def test_differences_pair_what_was_played_in_the_same_place_by_as_many():
+    teams = [
+        result(policy, [0.5, 0.5], [1.0, 1.0], policy == "trained", num_robots=size, place=place)
+        for size in (1, 2) for place in ("", "floor") for policy in ("trained", "random")
+    ]  # fmt: skip
+    found = paired_differences(teams)
+    assert {one: list(others) for one, others in found.items()} == {
+        "trained N=1": ["random N=1"], "trained on floor N=1": ["random on floor N=1"],
+        "trained N=2": ["random N=2"], "trained on floor N=2": ["random on floor N=2"],
+    }  # fmt: skip
 
 
 def test_paths_of_several_maps():

@@ -90,10 +90,19 @@ def test_the_files_of_a_run(capsys):
     assert (folder / "checkpoints" / "best.pt").is_file()
     assert "num_robots: 2" in (folder / "config.yaml").read_text()
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary) == {"trained", "random", "run"}
+    classical = {"cost_utility", "rrt_frontiers", "nearest_frontier"}
+    assert set(summary) == {"trained", "random", "difference", "run"} | classical
+    assert set(summary["difference"]["trained"]) == {"random"} | classical
+    for other in ("random", "cost_utility"):
+        for metric, found in summary["difference"]["trained"][other].items():
+            if metric in ("exploration_ratio", "coverage_auc", "path_length", "coverage_step_95_censored"):
+                apart = summary["trained"][metric]["mean"] - summary[other][metric]["mean"]
+                assert found["mean"] == pytest.approx(apart, abs=1e-6) and found["n"] == 4
+    assert summary["run"]["best_classical"]["2"] in classical
     assert summary["trained"]["exploration_ratio"]["n"] == summary["random"]["exploration_ratio"]["n"] == 4
     assert summary["run"]["maps"] == ["maze_small_70"]
     printed = capsys.readouterr().out
+    assert f"{summary['run']['best_classical']['2']}, the best classical planner on the validation maps" in printed
     assert "trained" in printed and "Next: maexp evaluate" in printed
 
 
@@ -107,6 +116,19 @@ def test_a_run_of_an_earlier_version_goes_on_with_columns_that_it_did_not_know(t
         log.write({"iteration": 3, "coverage": 0.5})
         with pytest.raises(RuntimeError, match="late was not among"):
             log.write({"iteration": 4, "late": 1.0})
+
+
+def test_a_checkpoint_and_classical_policies_play_the_same_episodes(capsys):
+    run("team", 1)
+    words = ["checkpoint=team", "policy=random,voronoi", "episodes=3", "num_envs=3", "num_robots=1,2"]
+    assert main(["evaluate", *words, "hydra.run.dir=both"]) == 0
+    told = json.loads(Path("both/results.json").read_text())
+    found = told["difference"]["trained N=2"]["voronoi N=2"]["coverage_auc"]
+    apart = told["trained N=2"]["coverage_auc"]["mean"] - told["voronoi N=2"]["coverage_auc"]["mean"]
+    assert found["mean"] == pytest.approx(apart, abs=1e-6) and found["n"] == 3
+    assert told["run"]["best_classical"] == {"1": "voronoi", "2": "voronoi"}
+    printed = capsys.readouterr().out
+    assert "The trained team N=1" in printed and "The trained team N=2" in printed
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "matrpo"])

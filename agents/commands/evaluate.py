@@ -12,6 +12,7 @@ from maexp.agents.actor import make_policy
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.run_folder import short
+from maexp.agents.comparison import choose_best, describe_differences
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.films import EPISODES, check_render, play_teams, write_film
@@ -30,11 +31,8 @@ PICTURES = 4
 def prepare(overrides: list[str]) -> Recipe:
     """For checkpoint=RUN: the run's settings as far as they matter here, then the new ones."""
     place = find_override(overrides, "checkpoint")
-    policy = find_override(overrides, "policy")
-    if place is not None and policy is not None:
-        raise UserError(f"policy={policy} and checkpoint={place} were both given: give one of them.")
-    if place is None and policy is None:
-        raise UserError("Nothing to evaluate: give checkpoint=RUN or policy=nearest_frontier.")
+    if place is None and find_override(overrides, "policy") is None:
+        raise UserError("Nothing to evaluate: give checkpoint=RUN, policy=nearest_frontier, or both.")
     if place is None:
         return Recipe(overrides)
     return continue_run(*find_checkpoint(place), overrides, "evaluate")
@@ -72,10 +70,14 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
-        policies = {name: name for name in policy_names(cfg)} or {"trained": load_policy(cfg, envs[0][0])}
+        policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0])}
+        policies |= {name: name for name in policy_names(cfg)}
+        best = {}
+        if cfg.checkpoint is not None:
+            best = {size: choose_best(cfg, suite, policy_names(cfg), size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
-    report(cfg, results, suite, where / "results.json")
+    report(cfg, results, suite, best, where / "results.json")
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
     written = ["results.json", *draw_results(results, where), "picture.png", "config.yaml"]
     if cfg.render:
@@ -107,7 +109,8 @@ def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[Evaluatio
     for name, policy in policies.items():
         with Progress(f"{name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
             settings = {"name": name, "seed": cfg.seed, "advance": progress.advance}
-            results.append(evaluate_recorded(bind(policy, env), env, cfg.episodes, **settings))
+            played = evaluate_recorded(bind(policy, env), env, cfg.episodes, **settings)
+            results.append(replace(played, learned=not isinstance(policy, str)))
     return results
 
 
@@ -134,11 +137,21 @@ def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Pa
     return films
 
 
-def report(cfg: Any, results: list[EvaluationResult], suite: MapSuite, path: Path, **extra: float) -> None:
-    """The table on the terminal and the JSON beside it."""
+def report(
+    cfg: Any, results: list[EvaluationResult], suite: MapSuite, best: dict[int, str | None], path: Path, **extra: float
+) -> None:
+    """The table on the terminal, how far the learned team is ahead of the best classical planner, and the JSON.
+
+    Args:
+        best: team size -> the classical planner that is the best on the validation maps, if that was asked
+    """
     seconds = sum(one.seconds for one in results)
+    known = {str(size): name for size, name in best.items() if name is not None}
+    extra |= {"best_classical": known} if known else {}
     write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
+    for sentence in describe_differences(results, best):
+        print(sentence)
 
 
 def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
@@ -147,7 +160,7 @@ def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
 
     whole = [one for one in results if not one.place]
     named = dict(zip(result_names(whole), whole, strict=True))
-    draw_coverage({name: (one.times, one.coverage) for name, one in named.items()}, where / "coverage.png")
+    draw_coverage({name: (one.times, one.coverage, one.maps) for name, one in named.items()}, where / "coverage.png")
     draw_summary({name: one.summary() for name, one in named.items()}, where / "metrics.png")
     draw_contributions({name: one.shares for name, one in named.items()}, where / "shares.png")
     return ["coverage.png", "metrics.png", "shares.png"]

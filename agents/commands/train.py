@@ -6,11 +6,13 @@ from typing import Any
 
 from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
+from maexp.agents.commands.evaluate import bind, draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable, short
+from maexp.agents.comparison import choose_best
 from maexp.agents.errors import UserError
 from maexp.agents.logs import check_logger
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.policies import POLICIES
+from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
@@ -57,6 +59,17 @@ def check(cfg: Any) -> None:
     team_sizes(cfg.num_robots)
     check_collector(cfg.collector)
     check_logger(cfg.logger)
+    for name in classical_names(cfg):
+        if name not in POLICIES:
+            raise UserError(f"classical={name} is unknown: choose of {', '.join(POLICIES)}.")
+    check_distinct("classical", classical_names(cfg))
+
+
+def classical_names(cfg: Any) -> list[str]:
+    """The classical policies played at the end."""
+    if cfg.classical is None:
+        return []
+    return [cfg.classical] if isinstance(cfg.classical, str) else [str(one) for one in cfg.classical]
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
@@ -88,19 +101,22 @@ def _describe(cfg: Any) -> str:
 
 
 def finish(done: TrainingRun) -> None:
-    """Evaluate the trained team and the random policy on the same episodes; write the summary and the pictures."""
+    """Evaluate the trained team beside random goals and classical planners; write the summary and the pictures."""
     cfg, where = done.cfg, done.folder
     written = ["config.yaml", "metrics.csv", "checkpoints/"]
     draw_curves(where)
     written.append("curves.png")
+    best: dict[int, str | None] = {}
     if cfg.episodes:
-        policies = {"trained": done.learner.policy, "random": "random"}
         device = choose_device(cfg, "train_device")
+        others = [] if cfg.planner.name == "direct" else ["random", *classical_names(cfg)]  # these pick goals
+        best = {size: choose_best(cfg, done.suite, others, size, device=device) for size in done.sizes}
+        policies = {"trained": done.learner.policy} | {name: name for name in others}
         envs = (make_env(cfg, done.suite.held_out, size, device=device) for size in done.sizes)
         results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
-        report(cfg, results, done.suite, where / "summary.json", training_seconds=round(done.seconds, 2))
+        report(cfg, results, done.suite, best, where / "summary.json", training_seconds=round(done.seconds, 2))
         written += ["summary.json", *draw_results(results, where)]
-    draw_rollout(cfg, done, where / "rollout.gif")
+    draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
     written.append("rollout.gif")
     print(f"Written to {short(where)}: {', '.join(written)}")
     print(f"Next: maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8, or maexp view {short(where)}")
@@ -113,15 +129,12 @@ def draw_curves(where: Path) -> None:
     draw(where / "metrics.csv", where / "curves.png")
 
 
-def draw_rollout(cfg: Any, done: TrainingRun, path: Path) -> None:
-    """A film of the trained team in the first held-out episode."""
-    import torch
-
+def draw_rollout(cfg: Any, done: TrainingRun, best: str | None, path: Path) -> None:
+    """A film of the trained team in the first held-out episode, beside the best classical planner if there is one."""
+    from maexp.agents.films import draw_film, play_teams
     from maexp.envs.film import write_gif
-    from maexp.envs.render import record_episode
 
     env = make_env(cfg, done.suite.held_out[:1], done.sizes[0], 1, device=choose_device(cfg, "train_device"))
-    with torch.random.fork_rng([]), torch.no_grad():
-        torch.manual_seed(cfg.seed)
-        env.set_episodes(torch.zeros(1, dtype=torch.int64, device=env.device))
-        write_gif(record_episode(env, done.learner.policy, every=None), path)
+    teams = {"trained": done.learner.policy} | ({} if best is None else {best: best})
+    episodes = [play_teams(env, bind(policy, env), name, seed=cfg.seed)[0] for name, policy in teams.items()]
+    write_gif(draw_film(episodes), path)

@@ -148,6 +148,7 @@ class TrainSettings(LearnerSettings):
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
+    classical: Any = setting(None, "planners played beside the trained team; default: three that are good and cheap")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")

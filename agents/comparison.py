@@ -1,0 +1,58 @@
+"""Who did better on the same episodes: differences, the best classical planner, and a plain sentence."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from maexp.agents.build import MapSuite, make_env
+from maexp.agents.evaluate import EvaluationResult, evaluate
+from maexp.agents.policies import CHOICES, POLICIES
+from maexp.agents.progress import Progress
+from maexp.agents.results import result_names
+
+CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
+DECIDES = "coverage_auc"
+
+
+def choose_best(cfg: Any, suite: MapSuite, names: Sequence[str], num_robots: int, **others: Any) -> str | None:
+    """The classical planner among `names` that sees most over time on the validation maps; None where there is none.
+
+    Args:
+        others: arguments of the env
+    """
+    planners = [name for name in names if name in CHOICES]
+    if len(planners) < 2:
+        return next(iter(planners), None)
+    count = min(CHOOSING, cfg.episodes)
+    env = make_env(cfg, suite.validation, num_robots, min(cfg.num_envs, count), **others)
+    scores = {}
+    with Progress("best classical planner on validation maps", count * len(planners)) as progress:
+        for name in planners:
+            played = evaluate(POLICIES[name](env), env, count, name=name, seed=cfg.seed, advance=progress.advance)
+            scores[name] = played.episodes[DECIDES].mean()
+    return max(scores, key=scores.get)
+
+
+def describe_differences(results: list[EvaluationResult], best: dict[int, str | None]) -> list[str]:
+    """A sentence for each learned team on all maps: how far it is ahead of the best classical planner of its size.
+
+    Args:
+        best: team size -> the planner
+    """
+    whole = [one for one in results if not one.place]
+    rivals = {one.num_robots: one for one in whole if one.policy == best.get(one.num_robots)}
+    return [
+        _describe(name, rivals[one.num_robots].policy, one.minus(rivals[one.num_robots]))
+        for name, one in zip(result_names(whole), whole, strict=True)
+        if one.learned and one.num_robots in rivals
+    ]
+
+
+def _describe(name: str, planner: str, found: dict[str, dict]) -> str:
+    auc, steps = found[DECIDES], found["coverage_step_95_censored"]
+    low, high = (100 * end for end in auc["ci95"])
+    points = f"{100 * auc['mean']:+.1f} points of coverage over time [{low:+.1f}, {high:+.1f}]"
+    where = "is ahead of" if low > 0 else "is behind" if high < 0 else "cannot be told from"
+    low, high = steps["ci95"]
+    later = f"{steps['mean']:+.0f} steps to 95 % [{low:+.0f}, {high:+.0f}]"
+    name = name.replace("trained", "The trained team", 1)
+    return f"{name} {where} {planner}, the best classical planner on the validation maps: {points}, {later}."
