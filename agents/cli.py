@@ -53,6 +53,12 @@ VERBS = {
         ("action", "file"),
         ("list", "make", "import", "check", "show"),
     ),
+    "irsim": Verb(
+        "plays a team in another simulator, ir-sim, with lidars and a map of its own, beside the same team in ours",
+        ("maexp irsim floor.yaml policy=cost_utility",
+         "maexp irsim floor.yaml range_noise=0.05 pose_noise=0.02 pose_drift=0.02 people=4"),
+        ("floor",),
+    ),
     "bench": Verb(
         "measures throughput, as a table and JSON",
         ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",

@@ -31,6 +31,7 @@ SMALLER = {  # verb -> what makes it small, last and so stronger
         "test_maps=1", "policy_per_map=null", "estimate=false", "workers=1",
     ),
     "view": (*PLACES, "renderer=painter", "size=200"),
+    "irsim": ("seconds=1", "beams=40", "num_robots=2", "people=1"),
     "bench": ("scenario.local_steps=3", "num_envs=2", "num_robots=2", "device=cpu", "seconds=0.05"),
 }
 MEANT = {  # placeholder -> what stands for it here
@@ -182,6 +183,8 @@ def test_command(line, folder, monkeypatch, capsys):
         monkeypatch.setattr(page.Page, "run", lambda page: None)
     if ".mcap" in line and not HAS_BAGS:
         pytest.skip("THE EXTRA maexp[rosbag] IS NOT INSTALLED: bags are not imported")
+    if line.startswith("maexp irsim"):
+        pytest.importorskip("irsim", reason="THE EXTRA maexp[irsim] IS NOT INSTALLED: no trial is run")
     words = small(line)
     set_stage(words)
     status = main(words)

@@ -1,0 +1,130 @@
+"""`maexp irsim`: a team on a floor in the simulator ir-sim, beside the same team in ours."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.files import write_json
+from maexp.agents.policies import POLICIES
+from maexp.agents.runtime import CHOICES
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.schema import given
+from maexp.envs import PointCloudMap, import_map
+from maexp.envs.environment import default_macro_steps
+from maexp.envs.film import write_gif
+from maexp.envs.scenarios import find_scenario
+
+FILM_SPEED = 4.0  # frames a second; one a decision
+
+
+def prepare(overrides: list[str]) -> Recipe:
+    return Recipe(overrides)
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
+    """Every trial has a new folder of its own."""
+    return claim()
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for what is missing or out of range, before a folder is made."""
+    check_counts(cfg, "num_robots")
+    check_counts(cfg, "episode", "people", "seed", least=0)
+    if not cfg.floor:
+        raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
+    known = [name for name in CHOICES if name in POLICIES]
+    if cfg.policy not in known:
+        raise UserError(f"policy={cfg.policy} is unknown: choose one of {', '.join(known)}.")
+    if importlib.util.find_spec("irsim") is None:
+        raise UserError('maexp irsim needs the simulator ir-sim: pip install "maexp[irsim]".')
+
+
+def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+    """Play the trial, then the same in our simulator; write what happened."""
+    from maexp.agents.irsim import ours
+    from maexp.agents.irsim.pictures import draw_curves, draw_moment
+    from maexp.agents.irsim.trial import run_trial
+
+    with blame_input():
+        world = import_map(cfg.floor, num_robots=cfg.num_robots, **given(cfg.importing))
+        config = make_config(cfg, world)
+        env = ours.make_team(world, cfg.num_robots, config)
+        starts = ours.draw_starts(env, cfg.episode)
+        frames: list[np.ndarray] = []
+        trial = run_trial(
+            world, cfg.policy, starts, config, lambda moment: frames.append(draw_moment(moment, config.body_radius))
+        )
+    curves = {"ir-sim": trial.coverage}
+    rows = {"ir-sim": measure(trial.coverage, config.seconds) | {"collisions": int(trial.collided.sum())}}
+    if cfg.ours:
+        curve, collided = ours.run_ours(env, cfg.policy, cfg.episode)
+        curves["ours"] = curve
+        rows["ours"] = measure(curve, config.seconds) | {"collisions": int(collided.sum())}
+    rows["ir-sim"] |= {
+        "path_length": trial.path.tolist(), "map_errors": trial.errors, "drift": trial.drift, "done_at": trial.done_at,
+    }  # fmt: skip
+    print_rows(rows)
+    for note in trial.notes:
+        print(f"planner: {note}")
+    run_info = {"floor": cfg.floor, "policy": cfg.policy, "num_robots": cfg.num_robots, "episode": cfg.episode}
+    content = {"run": run_info | asdict(config), "results": rows, "coverage": curves, "notes": trial.notes}
+    write_json(where / "results.json", content)
+    title = f"{world.name}: {cfg.num_robots} robots, {cfg.policy}"
+    written = [where / "results.json", draw_curves(curves, title, where / "coverage.png")]
+    written.append(write_gif(frames, where / "film.gif", FILM_SPEED))
+    print(f"Written: {', '.join(str(one) for one in written)}")
+    return 0
+
+
+def make_config(cfg: Any, world: PointCloudMap):
+    """The trial of these settings; what is not given is that of the floor's scenario."""
+    from maexp.agents.irsim.config import DT, TOLERANCE, TrialConfig
+
+    scenario = find_scenario(world.scenario)
+    steps = scenario.macro_steps or default_macro_steps([world], scenario)
+    # Our simulator measures from the points of walls, the middles of cells that are solid here.
+    clearance = scenario.collision_threshold - 0.5 * world.resolution if cfg.clearance is None else cfg.clearance
+    return TrialConfig(
+        seconds=steps * scenario.local_steps * DT if cfg.seconds is None else cfg.seconds,
+        radar_range=scenario.radar_range if cfg.radar_range is None else cfg.radar_range,
+        max_speed=scenario.max_speed,
+        max_accel=scenario.max_accel,
+        body_radius=max(clearance - TOLERANCE, 0.5 * clearance) if cfg.body_radius is None else cfg.body_radius,
+        clearance=clearance,
+        decide=scenario.local_steps * DT,
+        beams=cfg.beams,
+        cell=cfg.cell,
+        range_noise=cfg.range_noise,
+        pose_noise=cfg.pose_noise,
+        pose_drift=cfg.pose_drift,
+        people=cfg.people,
+        seed=cfg.seed,
+    )
+
+
+def measure(curve: list[float], seconds: float) -> dict[str, float | None]:
+    """Coverage at the end and on average over the time, and when 85 and 95 % were seen [s]; None: never."""
+    from maexp.agents.irsim.config import DT
+
+    values = np.array(curve)
+    whole = np.concatenate([values, np.full(max(round(seconds / DT) + 1 - len(values), 0), values[-1])])
+    result: dict[str, float | None] = {"coverage": float(values[-1]), "coverage_auc": float(whole.mean())}
+    for mark in (85, 95):
+        reached = np.flatnonzero(values >= mark / 100)
+        result[f"seconds_{mark}"] = float(reached[0] * DT) if len(reached) else None
+    return result
+
+
+def print_rows(rows: dict[str, dict]) -> None:
+    """One line a simulator."""
+    print(f"{'simulator':<11}{'seen':>8}{'mean':>8}{'85 % at':>10}{'95 % at':>10}{'collisions':>12}")
+    for name, row in rows.items():
+        marks = ["never" if row[f"seconds_{mark}"] is None else f"{row[f'seconds_{mark}']:.1f} s" for mark in (85, 95)]
+        print(f"{name:<11}{row['coverage']:>8.1%}{row['coverage_auc']:>8.1%}{marks[0]:>10}{marks[1]:>10}"
+              f"{row['collisions']:>12}")  # fmt: skip
