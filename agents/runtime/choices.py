@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from .frontiers import STRIDE
 from .grid import FREE, UNKNOWN, KnownGrid
 from .scene import Scene
 from .ways import cells_ahead
@@ -137,9 +138,14 @@ def _walk_branch(grid: KnownGrid, start: np.ndarray, end: np.ndarray) -> int:
 
 
 def choose_any(scene: Scene) -> np.ndarray:
-    """Each robot any target that it can get to."""
-    draw = scene.rng.random(scene.travel.shape)
-    return np.where(np.isfinite(scene.travel), draw, -1.0).argmax(-1)
+    """Each robot any target that it can get to, and that one again as long as it is there."""
+    start = scene.rng.bit_generator.seed_seq.entropy
+    draw = [
+        np.random.default_rng([start, robot, *block]).random()
+        for robot in scene.robots.tolist()
+        for block in (scene.targets.block + STRIDE).tolist()
+    ]
+    return np.where(np.isfinite(scene.travel), np.reshape(draw, scene.travel.shape), -1.0).argmax(-1)
 
 
 CHOICES: dict[str, Callable[[Scene], np.ndarray]] = {

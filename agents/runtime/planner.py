@@ -125,6 +125,7 @@ class TeamPlanner:
         known = read_grid(grid, resolution, origin, self.occupied, notes)
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+        _finite("time_left", time_left)
         scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
             notes.append("the grid holds no free cell yet: robots stay where they are")

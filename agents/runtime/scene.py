@@ -87,7 +87,7 @@ def look_at(
     kept = area * grid.cell**2 >= least
     targets, area, middle = targets.select(kept), area[kept], middle[kept]
     points = grid.centers(targets.cell)
-    way = distance.reshape(len(robots), -1)[:, targets.cell]
+    way = distance.reshape(len(robots), grid.known.size)[:, targets.cell]
     at = grid.from_map(team.at[robots])
     beside = np.maximum(1.5 * grid.cell, clearance_factor * radius)[:, None]
     return Scene(

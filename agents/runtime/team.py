@@ -106,10 +106,11 @@ def _read_speeds(velocities, names: tuple, notes: list[str]) -> np.ndarray:
 def _read_radius(radius, names: tuple) -> np.ndarray:
     if np.ndim(radius) == 0 and not isinstance(radius, Mapping):
         radius = [radius] * len(names)
-    values = [_numbers(one) for one in _match(radius, names, "robot_radius")]
-    for name, value in zip(names, values, strict=True):
+    given = _match(radius, names, "robot_radius")
+    values = [_numbers(one) for one in given]
+    for name, one, value in zip(names, given, values, strict=True):
         if value is None or value.ndim or not 0.0 < value < 1e3:
-            raise ValueError(f"robot_radius: {name!r} has {value}, and it must be a number of metres above 0")
+            raise ValueError(f"robot_radius: {name!r} has {one!r}, and it must be a number of metres above 0")
     return np.array(values, np.float64).reshape(len(names))
 
 
