@@ -77,7 +77,8 @@ def test_targets_ways_and_gains_are_those_of_the_kernels(name):
         disc = np.pi * (nav.radar_range / now.call["resolution"]) ** 2
         np.testing.assert_allclose(scene.gain * disc, area, rtol=1e-5)
         np.testing.assert_allclose(scene.middle, middle, atol=1e-4 * nav.radar_range)
-        first = nav.first_points(3.0)[0, alive][:, there >= 0].numpy() - now.call["origin"]
+        wanted = nav.target.expand(-1, len(alive), -1)
+        first = nav.points_on_way(wanted, 3.0)[0, alive][:, there >= 0].numpy() - now.call["origin"]
         for row in range(len(scene.robots)):
             cells = ways.cells_ahead(scene.passable[row], scene.distance[row], scene.targets.cell, 3.0)
             assert np.array_equal(cells >= 0, np.isfinite(travel[row]))

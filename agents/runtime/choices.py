@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,15 +22,15 @@ REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pul
 FAR = 1e12  # stands for no way where numbers must be finite
 
 
-def prefer(travel: np.ndarray, worth: np.ndarray) -> np.ndarray:
-    """`travel` without the targets that are not `worth` it, for robots that can get to one that is."""
-    kept = np.where(worth, travel, np.inf)
-    return np.where(np.isfinite(kept).any(-1, keepdims=True), kept, travel)
+def prefer(scene: Scene) -> Scene:
+    """`scene` without the targets that offer little, for robots that can get to one that offers more."""
+    kept = np.where(scene.gain >= LEAST_GAIN, scene.travel, np.float32(np.inf))
+    return replace(scene, travel=np.where(np.isfinite(kept).any(-1, keepdims=True), kept, scene.travel))
 
 
 def choose_nearest(scene: Scene) -> np.ndarray:
     """Each robot its nearest target (Yamauchi 1997)."""
-    return scene.travel.argmin(-1)
+    return prefer(scene).travel.argmin(-1)
 
 
 def choose_in_turn(scene: Scene, gain: np.ndarray, cost: np.ndarray) -> np.ndarray:
@@ -50,12 +51,14 @@ def choose_in_turn(scene: Scene, gain: np.ndarray, cost: np.ndarray) -> np.ndarr
 
 def choose_by_utility(scene: Scene) -> np.ndarray:
     """Unknown area around the target against the way there."""
+    scene = prefer(scene)
     gain = np.broadcast_to(scene.gain, scene.travel.shape)
     return choose_in_turn(scene, gain, BETA * scene.travel / scene.radar_range)
 
 
 def choose_by_area(scene: Scene) -> np.ndarray:
     """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
+    scene = prefer(scene)
     own = scene.travel.argmin(0) == np.arange(len(scene.at))[:, None]
     mine = np.where(own, scene.travel, np.inf)
     return np.where(np.isfinite(mine).any(-1), mine.argmin(-1), scene.travel.argmin(-1))
@@ -63,6 +66,7 @@ def choose_by_area(scene: Scene) -> np.ndarray:
 
 def choose_by_assignment(scene: Scene) -> np.ndarray:
     """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
+    scene = prefer(scene)
     chosen = scene.travel.argmin(-1)
     robot, target = linear_sum_assignment(np.where(np.isfinite(scene.travel), scene.travel, FAR))
     can = np.isfinite(scene.travel[robot, target])
@@ -75,6 +79,7 @@ def choose_by_force(scene: Scene) -> np.ndarray:
 
     As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
     """
+    scene = prefer(scene)
     reached = np.isfinite(scene.travel)
     first = [cells_ahead(p, d, scene.targets.cell, 3.0) for p, d in zip(scene.passable, scene.distance, strict=True)]
     ways = scene.grid.centers(np.maximum(np.stack(first), 0)) - scene.at[:, None]
@@ -92,6 +97,7 @@ def choose_by_force(scene: Scene) -> np.ndarray:
 
 def choose_by_tree(scene: Scene) -> np.ndarray:
     """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
+    scene = prefer(scene)
     ends = np.concatenate([_grow_tree(scene, robot) for robot in range(len(scene.at))])
     shift = scene.targets.block_of(ends % scene.grid.width, ends // scene.grid.width)
     found = (scene.targets.block[:, None] == shift).all(-1).any(1) & np.isfinite(scene.travel)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .choices import CHOICES, LEAST_GAIN, prefer
+from .choices import CHOICES
 from .grid import FREE, KnownGrid, read_grid
 from .scene import Scene, look_at
 from .team import Team, read_team
@@ -162,9 +162,8 @@ class TeamPlanner:
         if not travel.size:
             return chosen, notes
         parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots])
-        wanted = prefer(travel, scene.gain >= LEAST_GAIN)
         if not parked.all():
-            chosen[~parked] = self.choose(replace(scene, travel=wanted).of(~parked))
+            chosen[~parked] = self.choose(replace(scene, travel=travel).of(~parked))
         chosen[parked] = scene.travel[parked].argmin(-1)
         travel[parked] = scene.travel[parked]
         chosen[~np.isfinite(travel[np.arange(len(chosen)), chosen])] = -1
