@@ -31,6 +31,7 @@ class Settings:
         mask_collided: leave the actions of robots that had collided out of what the policy learns from
         minibatch_size: team steps per gradient step
         max_grad_norm: bound on the gradient of the policy, and on the critic's
+        anchor_coeff: after a warm start, weight of the divergence from its policy; falls linearly to 0
     """
 
     gamma: float = number(0.99, high=1.0)
@@ -46,6 +47,7 @@ class Settings:
     mask_collided: bool = flag(True)
     minibatch_size: int = whole(128)
     max_grad_norm: float = number(1.0, open_ends=True)
+    anchor_coeff: float = number(0.1)
 
     def __post_init__(self):
         check_ranges(self, "algorithm")
@@ -122,7 +124,8 @@ class TrustRegionSettings(Settings):
 class ActorCriticSettings(Settings):
     """Settings of advantage actor-critic: one pass, for its gradient is that of the acting policy.
 
-    Nothing bounds a step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
+    The pass is cut in minibatches, whose steps stay close to the policy that acted (logged as `kl`). Nothing bounds a
+    step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
 
     Attributes:
         epochs: passes over each batch

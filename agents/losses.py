@@ -18,6 +18,8 @@ from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, esti
 from maexp.agents.critics import TEAM_VALUE, VALUE
 from maexp.agents.distributions import Heads
 
+ANCHOR = ("agents", "anchor")
+
 
 class NonFiniteLoss(ArithmeticError):
     """A loss term or gradient is NaN or infinite; the message names it."""
@@ -32,15 +34,20 @@ def check_finite(name: str, value: Tensor) -> None:
         )
 
 
-def policy_divergence(batch: TensorDictBase, dist: Heads) -> Tensor:
+def policy_divergence(batch: TensorDictBase, dist: Heads, key: tuple[str, ...] = PARAMS) -> Tensor:
     """KL(policy that acted || dist) over the whole action, shape [*, robots].
 
+    Args:
+        batch: holds the parameters of the policy that acted
+        dist: of the policy that learns
+        key: where these parameters are; ANCHOR for those of the policy that `dist` is kept near
+
     Raises:
-        KeyError: the batch holds no ("agents", "params") of the policy that acted.
+        KeyError: they are not there.
     """
-    params = batch.get(PARAMS)
+    params = batch.get(key, None)
     if params is None:
-        raise KeyError(f"The batch lacks {PARAMS}; keep what the policy wrote while it acted.")
+        raise KeyError(f"The batch lacks {key}; keep what the policy wrote while it acted.")
     return dist.divergence_from(params)
 
 
@@ -72,7 +79,12 @@ class LivingRobots:
 
     Args:
         mask_collided: false counts them like the others
+
+    Attributes:
+        anchor_coeff: weight of the divergence from the policy of a warm start
     """
+
+    anchor_coeff = 0.0
 
     def __init__(self, *args, mask_collided: bool = True, **settings):
         super().__init__(*args, **settings)
@@ -99,9 +111,15 @@ class LivingRobots:
     def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
         return select_living(dist.entropy().unsqueeze(-1), self._alive)
 
-    def mean_divergence(self, batch: TensorDictBase, dist: Heads) -> Tensor:
-        """Of `dist` from the policy that acted, over the living."""
-        return select_living(policy_divergence(batch, dist).unsqueeze(-1), self.find_living(batch)).mean()
+    def mean_divergence(self, batch: TensorDictBase, dist: Heads, key: tuple[str, ...] = PARAMS) -> Tensor:
+        """Of `dist` from the policy that acted, over the living; arguments as in `policy_divergence`."""
+        return select_living(policy_divergence(batch, dist, key).unsqueeze(-1), self.find_living(batch)).mean()
+
+    def pull(self, batch: TensorDictBase, dist: Heads) -> dict[str, Tensor]:
+        """The term that keeps `dist` near the policy of a warm start, where the batch tells what that one would do."""
+        if ANCHOR not in batch.keys(True):
+            return {}
+        return {"loss_anchor": self.anchor_coeff * self.mean_divergence(batch, dist, ANCHOR)}
 
 
 class RobotValues:
@@ -138,14 +156,13 @@ class KLPenalty(LivingRobots):
     def _log_weight(self, tensordict, adv_shape):
         terms = super()._log_weight(tensordict, adv_shape)
         check_finite("loss_objective", terms[0])  # here, for TorchRL would draw from the broken policy next
-        self.__dict__["_divergence"] = self.mean_divergence(tensordict, terms[1]) if self.kl_coeff > 0 else None
+        self.__dict__["_extra"] = extra = self.pull(tensordict, terms[1])
+        if self.kl_coeff > 0:
+            extra["loss_kl"] = self.kl_coeff * self.mean_divergence(tensordict, terms[1])
         return terms
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        terms = super().forward(tensordict)
-        if self._divergence is not None:
-            terms.set("loss_kl", self.kl_coeff * self._divergence)
-        return terms
+        return super().forward(tensordict).update(self._extra)
 
     def adapt_penalty(self, divergence: float) -> None:
         """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""
@@ -201,8 +218,9 @@ class TRPOLoss(RobotValues, NormalisedValues, LivingRobots, PPOLoss):
         advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
         log_weight, dist, _, _ = self._log_weight(batch, adv_shape=advantage.shape[:-1])
         objective, entropy = -(log_weight.exp() * advantage).mean(), self._get_entropy(dist).mean()
-        self.__dict__["terms"] = {"loss_objective": objective.item(), "entropy": entropy.item()}
-        return objective - self.entropy_coeff * entropy, self.mean_divergence(batch, dist)
+        terms = {"loss_objective": objective} | self.pull(batch, dist)
+        self.__dict__["terms"] = {name: value.item() for name, value in terms.items()} | {"entropy": entropy.item()}
+        return sum(terms.values()) - self.entropy_coeff * entropy, self.mean_divergence(batch, dist)
 
     def divergence(self, batch: TensorDictBase) -> Tensor:
         """Mean divergence from the acting policy, a scalar with its graph."""
@@ -239,9 +257,9 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
             value = self.critic_network(tensordict.select(*self.critic_network.in_keys))
         target = tensordict.get(self.tensor_keys.value_target)
         value = value.get(self.tensor_keys.value)
-        self.__dict__["_explained"] = 1 - (target - value.detach()).var() / target.var().clamp_min(1e-8)
+        explained = 1 - (target - value.detach()).var() / target.var().clamp_min(1e-8)
         target, value, _ = self._critic_loss_inputs(target, value, None)
-        return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None
+        return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None, explained
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()
@@ -254,12 +272,13 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
         advantage = self._maybe_normalize_advantage(tensordict.get(self.tensor_keys.advantage), tensordict)
         log_prob, dist = self._log_probs(tensordict)
         entropy = self._get_entropy(dist).mean()
+        critic, _, explained = self.loss_critic(tensordict)
         terms = {
             "loss_objective": -(select_living(log_prob, self._alive) * advantage).mean(),
             "loss_entropy": -self.entropy_coeff * entropy,
-            "loss_critic": self.loss_critic(tensordict)[0].mean(),
+            "loss_critic": critic.mean(),
             "entropy": entropy.detach(),
             "kl": self.mean_divergence(tensordict, dist).detach(),
-            "explained_variance": self._explained,
+            "explained_variance": explained,
         }
-        return TensorDict(terms, batch_size=[])
+        return TensorDict(terms | self.pull(tensordict, dist), batch_size=[])

@@ -15,7 +15,7 @@ from torch import Tensor
 from maexp.agents.actor import ALIVE, GRID, MAP, PARAMS, POSE
 from maexp.agents.advantages import write_advantages
 from maexp.agents.encoder import compact, pools_pictures
-from maexp.agents.losses import check_finite
+from maexp.agents.losses import ANCHOR, check_finite
 from maexp.agents.trust_region import TRPO
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
@@ -55,6 +55,7 @@ class Updater:
         self.critic_params = [p for p in loss.critic_network_params.parameters()]
         self.critic_optimizer = torch.optim.Adam(self.critic_params, lr=settings.critic_lr, eps=1e-5)
         self.policy_optimizer = self.make_policy_optimizer()
+        self.anchor: TensorDictBase | None = None
 
     def make_policy_optimizer(self) -> torch.optim.Optimizer:
         """Adam for gradient steps; a trust region has its own."""
@@ -85,7 +86,8 @@ class Updater:
         return meter.means() | timings
 
     def set_progress(self, progress: float) -> None:
-        """Lower the learning rates linearly to `final_lr_share` at the end of the training."""
+        """Lower the learning rates linearly to `final_lr_share`, and the pull of a warm start to 0, at the end."""
+        self.loss.anchor_coeff = self.settings.anchor_coeff * (1 - progress)
         share = 1 - (1 - self.settings.final_lr_share) * progress
         for group in self.critic_optimizer.param_groups:
             group["lr"] = self.settings.critic_lr * share
@@ -94,15 +96,31 @@ class Updater:
                 group["lr"] = self.settings.lr * share
 
     def prepare(self, batch: TensorDictBase) -> TensorDictBase:
-        """Write advantages; return the team steps with what the losses read, flattened."""
+        """Write advantages; return the team steps with what the losses read, flattened.
+
+        Where another policy acted, as in a warm start, there is no more in them than what that one wrote.
+        """
         batch = write_advantages(self.loss, self._compact(batch.copy()))
         keys = self.loss.tensor_keys
         check_finite("the advantage", batch.get(keys.advantage))
         self._calibrate(batch)
-        needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys, PARAMS]
-        needed += [ALIVE] if ALIVE in batch.keys(True) else []
-        needed += [keys.advantage, keys.value_target, keys.value, *keys.action, *keys.sample_log_prob]
-        return batch.select(*needed).flatten()
+        needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
+        needed += [keys.advantage, keys.value_target, keys.value, *keys.action]
+        needed += [key for key in (ALIVE, PARAMS, *keys.sample_log_prob) if key in batch.keys(True)]
+        return self._add_anchor(batch.select(*needed).flatten())
+
+    def set_anchor(self) -> None:
+        """From now on keep the policy near what it is at this moment."""
+        self.anchor = self.loss.actor_network_params.data.clone()
+
+    @torch.no_grad()
+    def _add_anchor(self, steps: TensorDictBase) -> TensorDictBase:
+        if self.anchor is not None and self.settings.anchor_coeff > 0:
+            actor = self.loss.actor_network
+            with self.anchor.to_module(actor):
+                parts = [actor.get_dist_params(part)[PARAMS] for part in steps.select(*actor.in_keys).split(CHUNK)]
+            steps.set(ANCHOR, torch.cat(parts))
+        return steps
 
     def _compact(self, batch: TensorDictBase) -> TensorDictBase:
         """Pool the pictures once, where all networks that look at them would do so in every pass."""
@@ -141,18 +159,38 @@ class Updater:
         return norm.item()
 
     def state_dict(self) -> dict:
-        """Networks, running statistics and optimizers."""
-        return {
+        """Networks, running statistics, optimizers, and after a warm start its policy."""
+        state = {
             "loss": self.loss.state_dict(),
             "policy_optimizer": self.policy_optimizer.state_dict(),
             "critic_optimizer": self.critic_optimizer.state_dict(),
         }
+        if self.anchor is not None:
+            state["anchor"] = dict(self.anchor.flatten_keys(".").items())
+        return state
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what state_dict gave; the policy and critic given to make_loss change with it."""
         self.loss.load_state_dict(state["loss"])
         self.policy_optimizer.load_state_dict(state["policy_optimizer"])
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        if "anchor" in state:
+            self.anchor = TensorDict(state["anchor"]).unflatten_keys(".").to(self.policy_params[0].device)
+
+    def learn_values(self, steps: list[TensorDictBase], meter: Meter) -> None:
+        """One pass of the critic alone."""
+        for parts in self.minibatches(steps, self.settings.minibatch_size):
+            meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))
+
+    def _step_critic(self, terms: list[tuple]) -> dict[str, float]:
+        loss = sum(term[0].mean() for term in terms) / len(terms)
+        check_finite("loss_critic", loss)
+        self.critic_optimizer.zero_grad()
+        loss.backward()
+        norm = self.clip(self.critic_params, "critic")
+        self.critic_optimizer.step()
+        variance = sum(term[2].mean().item() for term in terms) / len(terms)
+        return {"loss_critic": loss.item(), "critic_gradient_norm": norm, "explained_variance": variance}
 
 
 class GradientUpdater(Updater):
@@ -198,8 +236,7 @@ class TrustRegionUpdater(Updater):
                 self._act_again(parts)
             meter.add(self.policy_optimizer.step(*self._closures(parts)) | self.loss.terms)
         for _ in range(self.settings.critic_epochs):
-            for parts in self.minibatches(steps, self.settings.minibatch_size):
-                meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))
+            self.learn_values(steps, meter)
 
     @torch.no_grad()
     def _act_again(self, parts: list[TensorDictBase]) -> None:
@@ -226,16 +263,6 @@ class TrustRegionUpdater(Updater):
             return sum(self.loss.divergence(part) for part in few) / len(few)
 
         return closure, fisher_closure
-
-    def _step_critic(self, terms: list[tuple]) -> dict[str, float]:
-        loss = sum(term[0].mean() for term in terms) / len(terms)
-        check_finite("loss_critic", loss)
-        self.critic_optimizer.zero_grad()
-        loss.backward()
-        norm = self.clip(self.critic_params, "critic")
-        self.critic_optimizer.step()
-        variance = sum(term[2].mean().item() for term in terms) / len(terms)
-        return {"loss_critic": loss.item(), "critic_gradient_norm": norm, "explained_variance": variance}
 
 
 def summary(outputs: list[TensorDict]) -> dict[str, float]:

@@ -10,6 +10,7 @@ from maexp.agents.commands.evaluate import bind, draw_results, evaluate_all, rep
 from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.comparison import choose_best
 from maexp.agents.errors import UserError
+from maexp.agents.imitation import check_warm_start, warm_start
 from maexp.agents.logs import check_logger
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
@@ -59,6 +60,8 @@ def check(cfg: Any) -> None:
     team_sizes(cfg.num_robots)
     check_collector(cfg.collector)
     check_logger(cfg.logger)
+    if not cfg.resume:
+        check_warm_start(cfg)
     for name in classical_names(cfg):
         if name not in POLICIES:
             raise UserError(f"classical={name} is unknown: choose of {', '.join(POLICIES)}.")
@@ -79,6 +82,8 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     write_config(training.settings, where, "train", overrides)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
           f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}", flush=True)  # fmt: skip
+    if cfg.warm_start and saved is None:
+        warm_start(training)
     train(training)
     if training.stopped:
         print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={short(where)}")

@@ -149,6 +149,8 @@ class TrainSettings(LearnerSettings):
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
     classical: Any = setting(None, "planners played beside the trained team; default: three that are good and cheap")
+    warm_start: str | None = setting(None, "policy to imitate first: a classical one, a run's folder or a checkpoint")
+    warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")
