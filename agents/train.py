@@ -22,7 +22,7 @@ from maexp.agents.logs import MetricsLog
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
 from maexp.agents.results import find_commit
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config, settings_of
 from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
 
@@ -246,8 +246,8 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
 
 def check_collector(settings: Any) -> None:
     """Raise UserError for settings of `collector` that do not go together."""
-    counts = ("workers",) if settings.steps is None else ("steps", "workers")
-    check_counts(settings, *counts, prefix="collector.")
+    check_steps(settings)
+    check_counts(settings, "workers", prefix="collector.")
     if settings.backend not in BACKENDS:
         raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
     if settings.backend == "single":

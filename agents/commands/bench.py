@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.overrides import move_sweeps
 from maexp.agents.settings.runs import Recipe
 
@@ -27,7 +27,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 def check(cfg: Any) -> None:
     """Raise UserError for counts out of range, and for settings that another measurement has."""
     check_counts(cfg, "num_envs")
-    check_counts(cfg.collector, "steps", prefix="collector.")
+    check_steps(cfg.collector)
     if not (cfg.seconds > 0 and math.isfinite(cfg.seconds)):
         raise UserError(f"seconds={cfg.seconds} must be a time to measure for, above 0 [s].")
     if cfg.num_robots is not None:

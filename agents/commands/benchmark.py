@@ -26,7 +26,7 @@ from maexp.agents.build import pick_device
 from maexp.agents.commands.run_folder import check_writable, short
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress, duration
-from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.checks import check_counts, check_steps
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
@@ -74,7 +74,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 def check(cfg: Any) -> None:
     """Raise UserError for counts out of range and unknown names."""
     check_counts(cfg, "num_envs", "num_robots", "total_frames", "checkpoint_every", "checkpoint_keep", "episodes")
-    check_counts(cfg.collector, "steps", prefix="collector.")
+    check_steps(cfg.collector)
     for name in ("workers", "iterations", "train_maps", "test_maps"):
         if cfg[name] is not None:
             check_counts(cfg, name)

@@ -16,6 +16,12 @@ def check_counts(node: Any, *names: str, least: int = 1, prefix: str = "") -> No
             raise UserError(f"{prefix}{name}={value} must be a whole number, {least} or more.")
 
 
+def check_steps(collector: Any) -> None:
+    """Raise UserError unless `collector.steps` is a whole number of at least 1, or null: those of an episode."""
+    if collector.steps is not None:
+        check_counts(collector, "steps", prefix="collector.")
+
+
 def check_seed(value: Any, name: str = "seed") -> None:
     """Raise UserError unless random numbers can start from it: other numbers would share those of a smaller one."""
     if type(value) is not int or not 0 <= value <= LAST_SEED:
