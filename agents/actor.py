@@ -52,7 +52,10 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
     spec = env.observation_spec
     missing = [key for key in observation_keys(config) if key not in spec.keys(True, True)]
     if missing:
-        raise ValueError(f"The environment's observation lacks {missing}; give the keys of ExplorationEnv.")
+        raise ValueError(
+            f"The environment's observation lacks {missing}; give the keys of ExplorationEnv "
+            "(those of pictures are there with observation.pictures=true)."
+        )
     actions = env.full_action_spec.keys(True, True)
     return ObservationShape(
         channels=spec[MAP].shape[-3], side=spec[GRID].shape[-1], regions=(*ACTION, "region") in actions

@@ -74,9 +74,13 @@ class RewardConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """What the picture of a robot shows: what it has ``seen`` itself, or what it ``known`` through communication."""
+    """What the picture of a robot shows: what it has ``seen`` itself, or what it ``known`` through communication.
+
+    Without ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost.
+    """
 
     map: Literal["seen", "known"] = "seen"
+    pictures: bool = True
 
 
 @dataclass(frozen=True)

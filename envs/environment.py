@@ -130,6 +130,8 @@ class ExplorationEnv(EnvBase):
         self.observation_config = one_config("observation", observation, ObservationConfig)
         if self.observation_config.map not in ("seen", "known"):
             raise ValueError(f"observation.map={self.observation_config.map!r} is unknown: choose seen or known")
+        if not isinstance(self.observation_config.pictures, bool):
+            raise ValueError(f"observation.pictures={self.observation_config.pictures!r} must be true or false")
         self.comm_config = check_comm(one_config("comm", comm, CommConfig))
         for m in maps:
             check_room(m, [r.collision_threshold for r in self.robot_configs])
@@ -147,7 +149,9 @@ class ExplorationEnv(EnvBase):
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
         direct = self.planner_config.name == "direct"
-        self.observation_spec = observation_spec(num_envs, num_robots, self.device)
+        self.observation_spec = observation_spec(
+            num_envs, num_robots, self.device, self.observation_config.pictures
+        )
         self.action_spec = action_spec(num_envs, num_robots, direct, self.device)
         self.reward_spec = reward_spec(num_envs, num_robots, self.device)
         self.done_spec = done_spec(num_envs, self.device)
@@ -165,7 +169,7 @@ class ExplorationEnv(EnvBase):
         if self._hook is not None:
             self._hook[0](self)
         done = self._done()
-        out = self.observe()
+        out = self.observe(mask)  # TorchRL takes the other envs' observation from what it had
         info = out["info"]
         for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a fresh episode has made none
             keep = mask.reshape(-1, 1) == 0
@@ -212,33 +216,35 @@ class ExplorationEnv(EnvBase):
         truncated = (state["macro_step"] >= self.macro_steps).unsqueeze(-1) & ~terminated
         return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
 
-    def observe(self) -> TensorDict:
+    def observe(self, mask: torch.Tensor | None = None) -> TensorDict:
         """What the teams see now, and info of the step just made.
 
-        Fresh tensors, never the simulation's own: collectors keep what they get.
+        Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures of these
+        envs only, the others' are black.
         """
         e, n, p, r = self.num_envs, self.num_robots, int(PIXELS), int(REGIONS)
-        picture = torch.zeros((e, n, 4, p, p), dtype=torch.uint8, device=self.device)
-        team = torch.zeros((e, 3, p, p), dtype=torch.uint8, device=self.device)
+        pictures = self.observation_config.pictures
+        picture, team = (blank((e, *one, p, p), self.device) if pictures else None for one in ((n, 4), (3,)))
         pose = torch.empty((e, n, 4), device=self.device)
         grid = torch.empty((e, n, 4, r, r), device=self.device)
-        self.simulation.observe(picture, team, pose, grid)
+        self.simulation.observe(picture, team, pose, grid, mask)
         state = self.simulation.tensors
         left = 1.0 - state["macro_step"] / self.macro_steps
         observation = {
-            "map": picture, "pose": pose, "grid": grid, "comm": state["comm"].clone(),
+            "pose": pose, "grid": grid, "comm": state["comm"].clone(),
             "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
             "alive": state["collided"] == 0,
-        }  # fmt: skip
+        } | ({"map": picture} if pictures else {})  # fmt: skip
         agents = TensorDict(
             {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},
             batch_size=[e, n], device=self.device,
         )  # fmt: skip
         parts = {
             "agents": agents,
-            "team": TensorDict({"map": team}, batch_size=[e], device=self.device),
             "info": TensorDict(self._info(), batch_size=[e], device=self.device),
         }
+        if pictures:
+            parts["team"] = TensorDict({"map": team}, batch_size=[e], device=self.device)
         return TensorDict(parts, batch_size=[e], device=self.device)
 
     def _info(self) -> dict[str, torch.Tensor]:
@@ -394,6 +400,17 @@ class ExplorationEnv(EnvBase):
         if mode != "rgb_array":
             raise ValueError(f"mode={mode!r} is unknown: this env renders rgb_array")
         return draw_teams([self.snapshot(team) for team in check_teams(self, index)], size)
+
+
+def blank(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    """Black pictures, uint8.
+
+    On the CPU NumPy's: its pages are zero until they are drawn on. `torch.zeros` shares 250 kB among OpenMP's threads
+    already, and waits for one that does not run where the machine is busy.
+    """
+    if device.type == "cpu":
+        return torch.from_numpy(np.zeros(shape, dtype=np.uint8))
+    return torch.zeros(shape, dtype=torch.uint8, device=device)
 
 
 def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:

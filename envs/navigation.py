@@ -6,7 +6,6 @@ envs at once, on the env's device, without a loop over envs or robots.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +17,7 @@ from maexp.kernels import targets
 from maexp.kernels.frontier import mark_frontier
 from maexp.kernels.geodesic import STRAIGHT, UNREACHED
 from maexp.kernels.known_grid import KnownGrids, PassableGrids
+from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
@@ -51,7 +51,7 @@ class Navigation:
         sim = env.simulation
         self.state, self.device = sim.tensors, env.device
         self.num_envs, self.num_robots = env.num_envs, env.num_robots
-        self.launch = partial(wp.launch, device=str(env.device))
+        self.launch = launch_on(env.device)
         nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
         self.grids, cells = nav
         limited = env.comm_config.limited
@@ -77,6 +77,7 @@ class Navigation:
         self._size_blocks(env, float(threshold.max()))
         self._make_views(cells)
         self._rays: dict[float, list[wp.array]] = {}
+        finish_filling(env.device)
         self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
         self.radar_range = max(r.range for r in env.radar_configs)
         self.clearance = float(sim.robot_tensors["clearance"].max())
@@ -185,6 +186,7 @@ class Navigation:
             steps, device = int(radius / self.finest) + 2, str(self.device)
             rays = [wp.zeros((targets.RAYS, steps), dtype=wp.vec2i, device=device)]
             rays.append(wp.zeros(targets.RAYS, dtype=wp.vec2, device=device))
+            finish_filling(device)
             self.launch(targets._spread_rays, (targets.RAYS, steps), inputs=[], outputs=rays)
             self._rays[radius] = rays
         return self._rays[radius]

@@ -148,7 +148,7 @@ def check_memory(env) -> None:
         ValueError: says how much is needed and free, and what to lower.
     """
     # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
-    pictures = 4 * (4 * env.num_robots + 3) * int(PIXELS) ** 2
+    pictures = 4 * (4 * env.num_robots + 3) * int(PIXELS) ** 2 * env.observation_config.pictures
     per_env = bytes_per_env(env) + pictures
     if env.device.type == "cuda":
         free = torch.cuda.mem_get_info(env.device)[0]

@@ -32,7 +32,7 @@ INFO_ROBOT = {
 """Entries of ``info`` of shape [E, N]; ``episode_reward_raw`` is the sum of terms before scaling by w and v."""
 
 
-def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
+def observation_spec(envs: int, robots: int, device: torch.device, pictures: bool = True) -> Composite:
     """Observation of every robot, the team's map, and info."""
     pixels, regions = int(PIXELS), int(REGIONS)
 
@@ -43,8 +43,10 @@ def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
     def real(*shape):
         return Unbounded(shape=shape, dtype=torch.float32, device=device)
 
+    own = {"map": picture(envs, robots, 4)} if pictures else {}
+    team = {"team": Composite(map=picture(envs, 3), shape=(envs,), device=device)} if pictures else {}
     observation = Composite(
-        map=picture(envs, robots, 4),
+        **own,
         pose=real(envs, robots, 4),
         grid=real(envs, robots, 4, regions, regions),
         comm=Binary(robots, shape=(envs, robots, robots), dtype=torch.bool, device=device),
@@ -57,7 +59,7 @@ def observation_spec(envs: int, robots: int, device: torch.device) -> Composite:
     info |= {name: _value((envs, robots), dtype, device) for name, dtype in INFO_ROBOT.items()}
     return Composite(
         agents=Composite(observation=observation, shape=(envs, robots), device=device),
-        team=Composite(map=picture(envs, 3), shape=(envs,), device=device),
+        **team,
         info=Composite(info, shape=(envs,), device=device),
         shape=(envs,),
         device=device,

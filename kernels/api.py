@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from maexp.kernels import merge, visibility
-from maexp.kernels.launches import lanes_on
+from maexp.kernels.launches import lanes_on, launch_on
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
 
@@ -127,16 +127,15 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     near, near_count = wp.from_torch(zeros(1, 1, 1)), wp.from_torch(zeros(1, 1))  # nobody else is there
     views = zeros(1, 1, count)
     listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
-    launch = wp.from_torch(free, dtype=wp.vec3).device
-    lanes = lanes_on(launch, 4096)
+    launch, lanes = launch_on(device), lanes_on(wp.device_from_torch(device), 4096)
     map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
-    wp.launch(
-        visibility._collect_occluders, dim=(1, 1), device=launch,
+    launch(
+        visibility._collect_occluders, dim=(1, 1),
         inputs=[maps, map_id, planar, robots, one, pose, center, facing, near, near_count],
         outputs=[bins, direction, limit, *counts, error],
     )  # fmt: skip
-    wp.launch(
-        visibility._scan_free, dim=(1, 1, lanes), device=launch,
+    launch(
+        visibility._scan_free, dim=(1, 1, lanes),
         inputs=[maps, map_id, planar, robots, lanes, one, pose, center, bins, direction, limit, *counts[:2]],
         outputs=[wp.from_torch(views), listed, counts[2], error],
     )  # fmt: skip
@@ -168,8 +167,8 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     known = torch.zeros_like(flags)
     active = torch.ones(seen.shape[0], dtype=torch.int32, device=seen.device)
     words, told = wp.from_torch(flags), wp.from_torch(torch.zeros_like(flags))
-    wp.launch(
-        merge._share_points, dim=(seen.shape[0], seen.shape[2]), device=words.device,
+    launch_on(words.device)(
+        merge._share_points, dim=(seen.shape[0], seen.shape[2]),
         inputs=[wp.from_torch(active), wp.from_torch(hears), words, told], outputs=[wp.from_torch(known)],
     )  # fmt: skip
     return unpack_flags(known, robots)

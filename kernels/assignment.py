@@ -7,6 +7,8 @@ Robots are added one after the other along a shortest augmenting path over reduc
 import torch
 import warp as wp
 
+from maexp.kernels.launches import launch_on
+
 FORBIDDEN = 1 << 24  # cost of a pair that cannot be; the sums of 40 robots still fit in int32
 
 wp_forbidden = wp.constant(wp.int32(FORBIDDEN))
@@ -94,11 +96,10 @@ def assign_targets(cost: torch.Tensor) -> torch.Tensor:
     scratch = [
         torch.empty((envs, 1 + n), dtype=torch.int32, device=cost.device) for n in (robots, *[width] * 5)
     ]
-    wp.launch(
+    launch_on(cost.device)(
         _assign_targets,
         envs,
         inputs=[wp.from_torch(padded)],
         outputs=[*map(wp.from_torch, scratch), wp.from_torch(match)],
-        device=str(cost.device),
     )
     return match.long()

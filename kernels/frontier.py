@@ -5,10 +5,11 @@ unknown one. What lies outside the grid is not unknown: nothing can ever be seen
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 import warp as wp
+
+from maexp.kernels.launches import finish_filling, launch_on
 
 UNKNOWN = 0
 FREE = 1
@@ -75,7 +76,7 @@ def mark_frontier(
         tallest: cells of the tallest grid along y.
         launch: launches or records ``launch(kernel, dim, inputs, outputs)``; on the arrays' device.
     """
-    launch = launch or partial(wp.launch, device=known.device)
+    launch = launch or launch_on(known.device)
     launch(_mark_frontier, (known.shape[0], tallest), [known, grid_of_row, width, height], [frontier])
 
 
@@ -105,11 +106,11 @@ def frontier_cells(known_free: torch.Tensor, known_obstacle: torch.Tensor) -> to
     known = known.view(batch, -1)
     frontier = torch.empty_like(known)
     device = wp.get_device(str(known.device))
+    maps = [wp.array(v, dtype=wp.int32, device=device) for v in ([0] * batch, [width], [height])]
+    finish_filling(device)
     mark_frontier(
         wp.from_torch(known),
-        wp.zeros(batch, dtype=wp.int32, device=device),
-        wp.array([width], dtype=wp.int32, device=device),
-        wp.array([height], dtype=wp.int32, device=device),
+        *maps,
         wp.from_torch(frontier),
         height,
     )

@@ -14,10 +14,11 @@ cells of all shortest ways to the goal have their exact distance.
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 import warp as wp
+
+from maexp.kernels.launches import finish_filling, launch_on
 
 STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
 DIAGONAL = 14  # weight of a step to a diagonal neighbour
@@ -276,12 +277,11 @@ def geodesic_distance(passable: torch.Tensor, sources: torch.Tensor) -> torch.Te
     if sources.numel():
         search.sources = wp.from_torch(sources)
     mask = (passable != 0).to(torch.uint8).reshape(batch, -1).contiguous()
+    maps = [wp.array(v, dtype=wp.int32, device=device) for v in (range(batch), [0] * batch, [width], [height])]
+    finish_filling(device)
     search.search(
-        partial(wp.launch, device=device),
+        launch_on(device),
         wp.from_torch(mask),
-        wp.array(range(batch), dtype=wp.int32, device=device),
-        wp.zeros(batch, dtype=wp.int32, device=device),
-        wp.array([width], dtype=wp.int32, device=device),
-        wp.array([height], dtype=wp.int32, device=device),
+        *maps,
     )
     return wp.to_torch(search.distance).view(batch, height, width)

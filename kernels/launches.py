@@ -1,10 +1,15 @@
-"""Recorded launches, replayed with little Python in between."""
+"""Where kernels are launched: on torch's current stream, at once, or recorded and replayed with little Python.
+
+Nothing else calls `wp.launch`: Warp's own stream on a GPU knows nothing of torch's, so tensors that torch has just
+filled, or is about to read, would be met too early or too late.
+"""
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any
 
+import torch
 import warp as wp
 
 KNOWN = wp.config.version.startswith("1.19.")
@@ -18,6 +23,28 @@ CPU_LANES = 1
 def lanes_on(device: wp.Device, most: int) -> int:
     """Threads that share the work of a robot or a row."""
     return CPU_LANES if device.is_cpu else most
+
+
+def current_stream(device: wp.Device) -> wp.Stream | None:
+    """Torch's current stream on a device; None on the CPU."""
+    return None if device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
+
+
+def launch_on(device: wp.Device | torch.device | str) -> Callable:
+    """``launch(kernel, dim, inputs, outputs)`` on a device, in order with what torch does there."""
+    device = wp.get_device(str(device))
+
+    def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence, outputs: Sequence) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, stream=current_stream(device))
+
+    return launch
+
+
+def finish_filling(device: wp.Device | torch.device | str) -> None:
+    """Wait for arrays that Warp has filled on its own stream before they are used on torch's."""
+    device = wp.get_device(str(device))
+    if not device.is_cpu:
+        wp.synchronize_device(device)
 
 
 @cache
@@ -36,7 +63,7 @@ class RecordedLaunch:
     def __init__(
         self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence, outputs: Sequence, device: wp.Device
     ):
-        self.kernel = kernel
+        self.kernel, self.device = kernel, device
         self.command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
         self.call: Any = None
         if KNOWN and device.is_cpu and self.command.block_dim == 1:
@@ -49,3 +76,10 @@ class RecordedLaunch:
             self.command.launch(stream)
         else:
             self.call()
+
+
+def replay(launches: list[RecordedLaunch]) -> None:
+    """Launch again, one after the other, in order with what torch does there."""
+    stream = current_stream(launches[0].device) if launches else None
+    for one in launches:
+        one.launch(stream)

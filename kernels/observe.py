@@ -58,6 +58,7 @@ def _draw_points(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),
     robot_count: int,
     team_bits: int,
     lanes: int,
@@ -78,6 +79,8 @@ def _draw_points(
     The pictures come in as zeros, so a point nobody has seen costs only its reading.
     """
     e, lane = wp.tid()
+    if mask[e] == 0:
+        return
     m = map_id[e]
     free_count = maps.free_begin[m + 1] - maps.free_begin[m]
     count = free_count + maps.boundary_begin[m + 1] - maps.boundary_begin[m]
@@ -121,6 +124,7 @@ def _list_bodies(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),
     # Robots:
     robots: Robots,
     # State in:
@@ -133,6 +137,8 @@ def _list_bodies(
 ):
     """List the pixels whose centres lie in the body of robot (e, i), and the one nearest to its centre."""
     e, i = wp.tid()
+    if mask[e] == 0:
+        return
     m = map_id[e]
     at = point_xy(center[e, i])
     length = robots.length[e, i]
@@ -172,6 +178,7 @@ def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.ar
 @wp.kernel
 def _draw_robots(
     # State in:
+    mask: wp.array(dtype=wp.int32),
     comm: wp.array3d(dtype=wp.bool),
     body_pixel: wp.array3d(dtype=wp.int32),
     body_count: wp.array2d(dtype=wp.int32),
@@ -182,6 +189,8 @@ def _draw_robots(
 ):
     """Draw bodies (own 255, others it hears 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
     e, i = wp.tid()
+    if mask[e] == 0:
+        return
     for other in range(body_count.shape[1]):
         if other != i and comm[e, i, other]:
             for k in range(body_count[e, other]):

@@ -10,14 +10,14 @@ free. Results depend on neither the number of shards nor that of blocks.
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import torch
 import warp as wp
 
 from maexp.kernels import collision, dynamics, merge, observe, planner, reset, reward, visibility
 from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.launches import RecordedLaunch, lanes_on
+from maexp.kernels.launches import RecordedLaunch, finish_filling, lanes_on, launch_on, replay
 from maexp.kernels.state import SCRATCH, STATE, allocate, memory_per_env, robots_struct, warp_views
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import Wavefront
@@ -238,54 +238,52 @@ class Shard:
             reset._start_env, envs, [s.mask, s.covered], [s.covered_before, s.active, s.fresh, s.overlap]
         )
 
-    def replay(self, launches: list[RecordedLaunch]) -> None:
-        stream = None if self.device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(self.sim.device))
-        for command in launches:
-            command.launch(stream)
-
     def run(self, start: int, count: int) -> None:
         """Local steps ``start`` to ``start + count`` of a macro step."""
         for k in range(start, start + count):
             if self.wavefront is not None and k % self.sim.settings.replan_steps == 0:
-                self.replay(self.wavefront.field_launches)
+                replay(self.wavefront.field_launches)
             if self.wavefront is not None:
-                self.replay(self.wavefront.waypoint_launches)
-            self.replay(self.step_launches)
+                replay(self.wavefront.waypoint_launches)
+            replay(self.step_launches)
 
     def observe(self, picture, team, pose, grid) -> None:
-        """Draw into fresh tensors of all envs (design 6.1: what leaves the env is never reused)."""
-        self.draw(partial(wp.launch, device=self.device), picture, team, pose, grid)
+        """Draw into fresh tensors of all envs (what leaves the env is never used again)."""
+        self.draw(launch_on(self.device), picture, team, pose, grid)
 
     def draw(self, launch: Callable, picture, team, pose, grid) -> None:
         """Pictures, poses and region offsets of this shard's envs, into tensors of all envs."""
         s, maps = self.view, self.sim.maps
         part = slice(self.first, self.last)
-        out = [
-            wp.from_torch(picture[part].flatten(3), dtype=wp.uint8),
-            wp.from_torch(team[part].flatten(2), dtype=wp.uint8),
-        ]
+        if picture is not None:
+            self.draw_pictures(launch, picture[part], team[part])
+        launch(
+            observe._observe_pose, dim=self.shape,
+            inputs=[maps, s.map_id, self.robots, s.pose, s.slip, s.center, s.goal],
+            outputs=[wp.from_torch(pose[part], dtype=wp.vec4), wp.from_torch(grid[part].flatten(3))],
+        )  # fmt: skip
+
+    def draw_pictures(self, launch: Callable, picture, team) -> None:
+        """Pictures of the envs of ``mask``, into tensors of this shard's envs."""
+        s, maps = self.view, self.sim.maps
+        out = [wp.from_torch(picture.flatten(3), dtype=wp.uint8), wp.from_torch(team.flatten(2), dtype=wp.uint8)]
         free, boundary = s.seen_free, s.seen_boundary
         if self.sim.settings.draw_known and self.sim.settings.comm_limited:
             free, boundary = s.known_free, s.known_boundary
         lanes = lanes_on(self.device, 1024)
         launch(
             observe._draw_points, dim=(self.shape[0], lanes),
-            inputs=[maps, s.map_id, self.shape[1], self.sim.team_bits, lanes,
+            inputs=[maps, s.map_id, s.mask, self.shape[1], self.sim.team_bits, lanes,
                     free, boundary, s.seen_free, s.viewers_free, s.viewers_boundary],
             outputs=out,
         )  # fmt: skip
         launch(
-            observe._list_bodies, dim=self.shape, inputs=[maps, s.map_id, self.robots, s.pose, s.center],
+            observe._list_bodies, dim=self.shape, inputs=[maps, s.map_id, s.mask, self.robots, s.pose, s.center],
             outputs=[s.body_pixel, s.body_count, s.error],
         )  # fmt: skip
         launch(
             observe._draw_robots, dim=self.shape,
-            inputs=[s.comm, s.body_pixel, s.body_count, s.local_step, s.track], outputs=[out[0]],
-        )  # fmt: skip
-        launch(
-            observe._observe_pose, dim=self.shape,
-            inputs=[maps, s.map_id, self.robots, s.pose, s.slip, s.center, s.goal],
-            outputs=[wp.from_torch(pose[part], dtype=wp.vec4), wp.from_torch(grid[part].flatten(3))],
+            inputs=[s.mask, s.comm, s.body_pixel, s.body_count, s.local_step, s.track], outputs=[out[0]],
         )  # fmt: skip
 
 
@@ -340,6 +338,7 @@ class Simulation:
             shard.prepare("goal_launches", "reset_launches")
         for block in self.blocks:
             block.prepare("wavefront", "step_launches")
+        finish_filling(wp.device_from_torch(self.device))
         self.pool = ThreadPoolExecutor(count) if count > 1 else None
 
     def split(self, count: int) -> list[Shard]:
@@ -366,24 +365,26 @@ class Simulation:
     def reset(self, mask: torch.Tensor) -> None:
         """Start a new episode in the envs where ``mask`` [E] is true."""
         self.tensors["mask"].copy_(mask)
-        self.each(self.shards, lambda shard: shard.replay(shard.reset_launches))
+        self.each(self.shards, lambda shard: replay(shard.reset_launches))
 
     def set_goals(self) -> None:
         """Take ``region`` and ``offset`` (or ``command``), and start the macro step's reward at zero."""
         self.tensors["terms"].zero_()
-        self.each(self.shards, lambda shard: shard.replay(shard.goal_launches))
+        self.each(self.shards, lambda shard: replay(shard.goal_launches))
 
     def step(self, start: int, count: int) -> None:
         """Run ``count`` local steps, the first being number ``start`` of the macro step."""
         self.each(self.blocks, lambda block: block.run(start, count))
 
-    def observe(self, picture, team, pose, grid) -> None:
+    def observe(self, picture, team, pose, grid, mask: torch.Tensor | None = None) -> None:
         """Fill the observation tensors.
 
         Args:
-            picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125].
+            picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125]; None: no pictures.
             pose, grid: float32 [E, N, 4] and [E, N, 4, 8, 8].
+            mask: int32 [E], the envs whose pictures are drawn; None: all.
         """
+        self.tensors["mask"].fill_(1) if mask is None else self.tensors["mask"].copy_(mask)
         self.each(self.shards, lambda shard: shard.observe(picture, team, pose, grid))
 
 

@@ -33,7 +33,7 @@ from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
-from maexp.kernels.launches import RecordedLaunch
+from maexp.kernels.launches import RecordedLaunch, current_stream
 from maexp.kernels.types import PIXELS, REGIONS
 
 TEAM_SIZES = [4]
@@ -132,7 +132,7 @@ def measure_kernels(env: ExplorationEnv, cfg: Any) -> list[dict]:
         state = advance(env, state, env.rand_action(state.clone())["agents", "action"])
     shard = env.simulation.shards[0]
     steps = record_steps(env, shard)
-    stream = None if shard.device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(env.device))
+    stream = current_stream(shard.device)
     run = Runner(env.device, stream)
     active = env.simulation.tensors["active"].clone()
     in_place, counts = run.in_place(steps, cfg.seconds / 2, lambda: count_moment(env, shard, active))

@@ -53,6 +53,8 @@ class TeamParallelEnv(ParallelEnv):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is unknown: choose rgb_array or None")
         self.env = ExplorationEnv(map, 1, num_robots, seed=seed, **settings)
+        if not self.env.observation_config.pictures:
+            raise ValueError("observation.pictures=False leaves out the state of a parallel env: leave it True")
         self.render_mode, self.collided = render_mode, collided
         self.metadata = self.metadata | {"render_fps": 10 / self.env.local_steps}
         self.possible_agents = [f"robot_{i}" for i in range(self.env.num_robots)]
