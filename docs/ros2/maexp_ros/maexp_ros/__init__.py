@@ -1,0 +1,1 @@
+"""A team of robots that explore, for ROS 2."""

@@ -1,0 +1,344 @@
+"""The ROS 2 package: its messages against the real definitions, its node against stand-ins for rclpy, tf and nav2."""
+
+import ast
+import importlib
+import sys
+import xml.etree.ElementTree as xml
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from maexp.agents.runtime import TeamPlanner
+
+pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
+from bag_writer import GRID, STORE, grid, transforms
+from rosbags.interfaces import Nodetype
+
+PACKAGE = Path(__file__).resolve().parents[1] / "docs" / "ros2" / "maexp_ros"
+ZERO = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+
+
+def blank(name: str):
+    """A message with the values that ROS gives it at first."""
+
+    def value(kind, about):
+        if kind == Nodetype.NAME:
+            return blank(about)
+        if kind == Nodetype.BASE:
+            return ZERO.get(about[0], 0)
+        inner, count = about
+        plain = inner[0] == Nodetype.BASE and inner[1][0] != "string"
+        return np.zeros(count, inner[1][0]) if plain else []
+
+    return STORE.types[name](**{field: value(*about) for field, about in STORE.fielddefs[name][1]})
+
+
+def passed_on(message):
+    """The message as another program would get it: written out and read again."""
+    raw = STORE.serialize_cdr(message, message.__msgtype__)
+    return STORE.deserialize_cdr(raw, message.__msgtype__)
+
+
+def made(name: str):
+    """What stands for a message's class."""
+
+    def make(**fields):
+        message = blank(name)
+        for field, value in fields.items():
+            setattr(message, field, value)
+        return message
+
+    return make
+
+
+def floor() -> np.ndarray:
+    """Two rooms of which the right one is unknown; rows along y."""
+    values = np.full((60, 100), -1, np.int8)
+    values[5:55, 5:60] = 0
+    values[5:55, [4, 60]] = 100
+    values[[4, 55], 4:61] = 100
+    values[25:35, 60:64] = 0
+    return values
+
+
+@pytest.fixture()
+def conversion(monkeypatch):
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    yield importlib.import_module("maexp_ros.conversion")
+    for name in [one for one in sys.modules if one.startswith("maexp_ros")]:
+        del sys.modules[name]
+
+
+def test_grids_and_poses(conversion):
+    values = floor()
+    read = conversion.read_grid(passed_on(grid(values, 0.1, (-2.0, 3.0), yaw=0.4)))
+    assert np.array_equal(read.values, values) and read.resolution == 0.1
+    assert read.origin == pytest.approx((-2.0, 3.0, 0.4))
+    stamped = passed_on(transforms([("map", "robot1/base_link", 3.0, (1.0, 2.0, 0.0), -2.5)])).transforms[0]
+    assert conversion.read_pose(stamped.transform) == pytest.approx((1.0, 2.0, -2.5))
+    placed = conversion.place_grid(read, (5.0, 1.0, np.pi / 2))
+    assert placed.origin == pytest.approx((5.0 - 3.0, 1.0 - 2.0, 0.4 + np.pi / 2))
+
+
+def test_grids_of_several_robots_are_merged(conversion):
+    values = floor()
+    left, right = values.copy(), values.copy()
+    left[:, 40:], right[:, :30] = -1, -1
+    part = conversion.Grid(right[:, 30:], 0.1, (3.0, 0.0, 0.0))
+    merged = conversion.merge_grids([conversion.Grid(left, 0.1, (0.0, 0.0, 0.0)), part])
+    assert np.array_equal(merged.values, values) and merged.origin == pytest.approx((0.0, 0.0, 0.0))
+    turned = conversion.Grid(np.rot90(values, k=-1).copy(), 0.1, (0.0, 6.0, -np.pi / 2))  # the same seen from its side
+    again = conversion.merge_grids([turned, conversion.Grid(np.full((1, 1), -1, np.int8), 0.1, (0.0, 0.0, 0.0))])
+    assert np.array_equal(again.values, values)
+    walls = conversion.Grid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
+    over = conversion.merge_grids([conversion.Grid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
+    assert (over[10:12, 10:12] == 100).all() and (over == 100).sum() == (values == 100).sum() + 4
+    assert conversion.merge_grids([walls]) is walls
+
+
+def test_goals_and_markers_are_real_messages(conversion):
+    way = np.array([[1.0, 1.0], [2.0, 1.0], [2.0, 3.0]])
+    pose = blank("geometry_msgs/msg/PoseStamped")
+    conversion.fill_pose(pose.pose, *way[-1], conversion.heading_of(way))
+    got = passed_on(pose).pose
+    assert (got.position.x, got.position.y) == (2.0, 3.0)
+    assert conversion.read_yaw(got.orientation) == pytest.approx(np.pi / 2)
+    point, array = made("geometry_msgs/msg/Point"), blank("visualization_msgs/msg/MarkerArray")
+    array.markers = [blank("visualization_msgs/msg/Marker") for _ in range(3)]
+    conversion.fill_way(array.markers[0], point, 1, way)
+    conversion.fill_goal(array.markers[1], 1, way[-1])
+    conversion.fill_targets(array.markers[2], point, way)
+    line, ball, targets = passed_on(array).markers
+    assert (line.type, ball.type, targets.type) == (4, 2, 7)
+    assert [(p.x, p.y) for p in line.points] == [tuple(corner) for corner in way] and len(targets.points) == 3
+    assert (line.ns, ball.ns, ball.id) == ("ways", "goals", 1) and ball.color.a > 0 and ball.scale.x == 0.3
+
+
+class Moment:
+    """rclpy.time.Time and Duration [s]."""
+
+    def __init__(self, seconds: float = 0.0):
+        self.nanoseconds = int(seconds * 1e9)
+
+    def __sub__(self, other):
+        return Moment((self.nanoseconds - other.nanoseconds) * 1e-9)
+
+    def __gt__(self, other):
+        return self.nanoseconds > other.nanoseconds
+
+    def to_msg(self):
+        time = blank("builtin_interfaces/msg/Time")
+        time.sec, time.nanosec = divmod(self.nanoseconds, 10**9)
+        return time
+
+    @classmethod
+    def from_msg(cls, stamp):
+        return cls(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+class StandIn:
+    """What the node sees of ROS: parameters, topics, tf, actions; `told` is its log."""
+
+    def __init__(self, **parameters):
+        self.parameters, self.now, self.told = parameters, 100.0, []
+        self.topics, self.tf, self.sent, self.published = {}, {}, [], []
+        self.waiting, self.ready, self.accepts = [], True, True
+
+    def place(self, name: str, x: float, y: float, yaw: float = 0.0) -> None:
+        entry = ("map", f"{name}/base_link", self.now, (x, y, 0.0), yaw)
+        self.tf[f"{name}/base_link"] = passed_on(transforms([entry])).transforms[0]
+
+    def node_class(ros):
+        class Node:
+            def __init__(self, name):
+                self.name = name
+
+            def declare_parameter(self, name, default):
+                ros.parameters.setdefault(name, default)
+
+            def get_parameter(self, name):
+                return SimpleNamespace(value=ros.parameters[name])
+
+            def create_subscription(self, kind, topic, call, qos):
+                ros.topics[topic] = call
+
+            def create_publisher(self, kind, topic, depth):
+                return SimpleNamespace(publish=ros.published.append)
+
+            def create_timer(self, period, call):
+                ros.timer = (period, call)
+
+            def get_clock(self):
+                return SimpleNamespace(now=lambda: Moment(ros.now))
+
+            def get_logger(self):
+                def log(text, **_):
+                    ros.told.append(text)
+
+                return SimpleNamespace(info=log, warning=log, error=log)
+
+            def destroy_node(self):
+                pass
+
+        return Node
+
+    def action_class(ros):
+        class ActionClient:
+            def __init__(self, node, kind, name):
+                self.name = name
+
+            def server_is_ready(self):
+                return ros.ready
+
+            def send_goal_async(self, message):
+                ros.sent.append((self.name, message))
+                ended = SimpleNamespace(add_done_callback=ros.waiting.append)
+                handle = SimpleNamespace(accepted=ros.accepts, get_result_async=lambda: ended)
+                return SimpleNamespace(add_done_callback=lambda call: call(SimpleNamespace(result=lambda: handle)))
+
+        return ActionClient
+
+    def buffer_class(ros):
+        class Buffer:
+            def lookup_transform(self, target, source, time):
+                if source not in ros.tf:
+                    raise ros.TransformError(f"{source} does not exist")
+                return ros.tf[source]
+
+        return Buffer
+
+    class TransformError(Exception):
+        pass
+
+    def modules(self) -> dict[str, ModuleType]:
+        def module(**names):
+            found = ModuleType("stand-in")
+            found.__dict__.update(names)
+            return found
+
+        goal = SimpleNamespace(Goal=lambda: SimpleNamespace(pose=blank("geometry_msgs/msg/PoseStamped")))
+        words = SimpleNamespace(RELIABLE=1, TRANSIENT_LOCAL=1)
+        return {
+            "rclpy": module(init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None),
+            "rclpy.action": module(ActionClient=self.action_class()),
+            "rclpy.duration": module(Duration=lambda seconds: Moment(seconds)),
+            "rclpy.node": module(Node=self.node_class()),
+            "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
+            "rclpy.time": module(Time=Moment),
+            "tf2_ros": module(
+                Buffer=self.buffer_class(), TransformException=self.TransformError, TransformListener=lambda *_: None
+            ),
+            "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
+            "nav_msgs.msg": module(OccupancyGrid=STORE.types[GRID]),
+            "nav2_msgs.action": module(NavigateToPose=goal),
+            "visualization_msgs.msg": module(
+                Marker=made("visualization_msgs/msg/Marker"), MarkerArray=made("visualization_msgs/msg/MarkerArray")
+            ),
+        }
+
+
+@pytest.fixture()
+def team(conversion, monkeypatch):
+    """A node of two robots, and what it sees of ROS."""
+    ros = StandIn(robots=["a", "b"], radar_range=3.0, robot_radius=0.2)
+    for name, stand_in in ros.modules().items():
+        monkeypatch.setitem(sys.modules, name, stand_in)
+    return importlib.import_module("maexp_ros.team_node").TeamNode(), ros
+
+
+def test_the_node_sends_goals(team):
+    node, ros = team
+    node.decide()
+    assert not ros.sent  # no map yet
+    ros.topics["/map"](passed_on(grid(floor(), 0.1)))
+    ros.place("a", 1.0, 1.5)
+    ros.place("b", 1.0, 4.0)
+    node.decide()
+    assert {name for name, _ in ros.sent} <= {"/a/navigate_to_pose", "/b/navigate_to_pose"} and ros.sent
+    expected = TeamPlanner("cost_utility", radar_range=3.0, robot_radius=0.2, occupied=65.0).plan(
+        floor(), 0.1, (0.0, 0.0, 0.0), {"a": (1.0, 1.5, 0.0), "b": (1.0, 4.0, 0.0)}, now=100.0
+    )
+    for name, message in ros.sent:
+        at = message.pose.pose.position
+        goal = expected.goals[expected.names.index(name.split("/")[1])]
+        assert (at.x, at.y) == pytest.approx(tuple(goal)) and message.pose.header.frame_id == "map"
+        assert passed_on(message.pose).header.stamp.sec == 100
+    assert len(passed_on(ros.published[-1]).markers) == 2 + 2 * len(ros.sent)
+    before = len(ros.sent)
+    node.decide()
+    assert len(ros.sent) == before  # on their way there
+    while ros.waiting:
+        ros.waiting.pop()(None)
+    node.decide()
+    assert len(ros.sent) == 2 * before  # nav2 ended them: sent anew
+
+
+def test_what_is_missing_is_said(team):
+    node, ros = team
+    ros.topics["/map"](grid(floor(), 0.1))
+    ros.place("a", 1.0, 1.5)
+    node.decide()
+    assert [name for name, _ in ros.sent] == ["/a/navigate_to_pose"]
+    assert any("b/base_link does not exist" in one for one in ros.told)
+    ros.now += 10.0
+    node.decide()
+    assert any("a/base_link: its pose is too old" in one for one in ros.told)
+    ros.place("a", 1.0, 1.5)
+    ros.ready, node.goals = False, {}
+    node.decide()
+    assert "a: nav2 is not there yet" in ros.told and len(ros.sent) == 1
+    ros.ready, ros.accepts = True, False
+    node.decide()
+    assert len(ros.sent) == 2 and not node.goals  # refused: may be sent again
+
+
+def test_done_is_said_once(team):
+    node, ros = team
+    values = floor()
+    values[25:35, 60:64] = 100
+    ros.topics["/map"](grid(values, 0.1))
+    ros.place("a", 1.0, 1.5)
+    ros.place("b", 1.0, 4.0)
+    node.decide(), node.decide()
+    assert not ros.sent and sum("done: nothing" in one for one in ros.told) == 1
+
+
+def test_maps_of_two_robots_whose_frames_tf_knows(team):
+    node, ros = team
+    values = floor()
+    for name, part, shift in (("a", values[:30], 0.0), ("b", values[30:], 3.0)):
+        message = grid(part, 0.1)
+        message.header.frame_id = f"{name}/map"
+        node.grids[name] = message
+        entry = ("map", f"{name}/map", 0.0, (0.0, shift, 0.0), 0.0)  # old, but maps stand still
+        ros.tf[f"{name}/map"] = transforms([entry]).transforms[0]
+    assert np.array_equal(node._grid().values, values)
+
+
+def test_the_package_is_whole():
+    described = xml.parse(PACKAGE / "package.xml").getroot()
+    assert described.find("name").text == "maexp_ros" and described.find("license").text == "MIT"
+    wanted = {one.text for one in described.findall("exec_depend")}
+    setup = (PACKAGE / "setup.py").read_text()
+    calls = [node for node in ast.walk(ast.parse(setup)) if isinstance(node, ast.Constant)]
+    for part in ("launch/team.launch.py", "config/team.yaml", "rviz/team.rviz"):
+        assert (PACKAGE / part).is_file() and any(node.value == part for node in calls), part
+    assert (PACKAGE / "resource" / "maexp_ros").is_file() and "team = maexp_ros.team_node:main" in setup
+    for name in ("maexp_ros/team_node.py", "launch/team.launch.py"):
+        tree = ast.parse((PACKAGE / name).read_text())
+        modules = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
+        ours = {"__future__", "functools", "pathlib", "maexp"}
+        assert {module.split(".")[0] for module in modules} - ours <= wanted, name
+    yaml.safe_load((PACKAGE / "rviz" / "team.rviz").read_text())
+
+
+def test_parameters_are_those_of_the_file(team):
+    module = sys.modules["maexp_ros.team_node"]
+    written = yaml.safe_load((PACKAGE / "config" / "team.yaml").read_text())["team"]["ros__parameters"]
+    assert set(written) == set(module.PARAMETERS)
+    assert {name: type(value) for name, value in written.items()} == {
+        name: type(value) for name, value in module.PARAMETERS.items()
+    }
