@@ -49,7 +49,7 @@ ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
 WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
 NOT_OURS = (
     "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.golden", "MAEXP_",
-    "python -m maexp.envs.scenarios.",
+    "python -m maexp.envs.scenarios.", "python -m maexp.agents.runtime",
 )  # fmt: skip
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""
 

@@ -74,31 +74,32 @@ def flood(passable: np.ndarray, sources: np.ndarray) -> np.ndarray:
         index = np.zeros(passable.size, np.int32)
         index[used] = np.arange(len(used), dtype=np.int32)
         found = dijkstra(_graph(passable, used, index), indices=index[np.asarray(sources)[valid]])
-        found[~np.isfinite(found)] = UNREACHED
-        distance[valid[:, None], used] = found
+        for robot, lengths in zip(valid, found, strict=True):
+            distance[robot, used] = np.minimum(lengths, UNREACHED)
     return distance.reshape(-1, *passable.shape)
 
 
 def _graph(passable: np.ndarray, used: np.ndarray, index: np.ndarray) -> csr_array:
     """Steps between passable cells: row and column = number among `used`, value = weight."""
-    open_to = _neighbours(passable)[used]
+    open_to = _neighbours(passable).reshape(-1, len(STEPS))[used]
     start, step = np.nonzero(open_to)
     end = used[start] + (STEPS[:, 1] * passable.shape[1] + STEPS[:, 0])[step]
-    factor = np.where(passable.ravel()[end] == TIGHT, TIGHT_FACTOR, 1)
+    weight = np.stack([WEIGHTS, TIGHT_FACTOR * WEIGHTS]).astype(np.float64)
     first = np.zeros(len(used) + 1, np.int32)
-    np.cumsum(open_to.sum(1), out=first[1:])
-    return csr_array((WEIGHTS[step].astype(np.float64) * factor, index[end], first), shape=(len(used),) * 2)
+    np.cumsum(np.bincount(start, minlength=len(used)), out=first[1:])
+    tight = passable.ravel()[end] == TIGHT
+    return csr_array((weight[tight.view(np.int8), step], index[end], first), shape=(len(used),) * 2)
 
 
 def _neighbours(passable: np.ndarray) -> np.ndarray:
-    """Whether a step of `STEPS` leads from every cell to a passable one, bool [H * W, 8]."""
+    """Whether a step of `STEPS` leads from every cell to a passable one, bool [H, W, 8]."""
     height, width = passable.shape
     wide = np.pad(passable != BLOCKED, 1)
     result = np.empty((height, width, len(STEPS)), bool)
     for k, (u, v) in enumerate(STEPS):
         result[..., k] = wide[1 + v : 1 + v + height, 1 + u : 1 + u + width]
     result[..., 4:] &= result[..., BESIDE[0]] & result[..., BESIDE[1]]
-    return result.reshape(-1, len(STEPS))
+    return result
 
 
 def cells_ahead(passable: np.ndarray, distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
@@ -122,12 +123,7 @@ def cells_ahead(passable: np.ndarray, distance: np.ndarray, cells: np.ndarray, a
 def trace(passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     """The cells of a shortest way from the source to a reached cell, corners and both ends only, int64 [k]."""
     ways = _WayBack(passable, distance)
-    at = ways.enter(np.array([end]))
-    way = [at]
-    while ways.distance[at[0]] > 0:
-        at = ways.step(at)
-        way.append(at)
-    way = ways.leave(np.concatenate(way[::-1]))
+    way = ways.leave(ways.follow(int(ways.enter(np.array([end]))[0])))[::-1]
     turn = np.diff(way)
     return way[np.concatenate([[True], turn[1:] != turn[:-1], [True]])] if len(way) > 1 else way
 
@@ -157,3 +153,19 @@ class _WayBack:
         reached = near < UNREACHED
         fits[:, 4:] &= reached[:, BESIDE[0]] & reached[:, BESIDE[1]]
         return at + self.steps[fits.argmax(1)]
+
+    def follow(self, at: int) -> np.ndarray:
+        """All cells from one to the source, int64 [k]: as `step` goes, faster for a single way."""
+        distance, tight, way = memoryview(self.distance), memoryview(self.tight), [at]
+        steps, weights = self.steps.tolist(), WEIGHTS.tolist()
+        sides = list(zip(*BESIDE, strict=True))
+        while (here := distance[at]) > 0:
+            factor = TIGHT_FACTOR if tight[at] else 1
+            for k, step in enumerate(steps):
+                if distance[at + step] == here - factor * weights[k] and (
+                    k < 4 or all(distance[at + steps[side]] < UNREACHED for side in sides[k - 4])
+                ):
+                    at += step
+                    break
+            way.append(at)
+        return np.array(way)

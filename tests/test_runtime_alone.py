@@ -1,0 +1,50 @@
+"""The runtime where nothing but NumPy and SciPy is installed; its page and its measurement work there, too."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Runs Python where only NumPy, SciPy and this package can be imported."""
+    site = tmp_path_factory.mktemp("site")
+    for name in ("numpy", "scipy"):
+        home = Path(importlib.util.find_spec(name).origin).parent
+        for part in (home, home.parent / f"{name}.libs"):
+            if part.exists():
+                (site / part.name).symlink_to(part)
+    (site / "maexp").mkdir()
+    for room in ("agents", "conf", "envs", "kernels"):
+        (site / "maexp" / room).symlink_to(ROOT / room)
+
+    def run(*words: str) -> subprocess.CompletedProcess:
+        env = {"PYTHONPATH": str(site), "PATH": os.environ["PATH"], "OMP_NUM_THREADS": "1"}
+        return subprocess.run([sys.executable, "-S", *words], capture_output=True, text=True, env=env)
+
+    return run
+
+
+def test_torch_is_not_there(alone):
+    done = alone("-c", "import maexp.envs")
+    assert "ModuleNotFoundError" in done.stderr  # else the tests below would prove nothing
+
+
+def test_the_page(alone):
+    (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "deploy.md").read_text(), re.MULTILINE | re.DOTALL)
+    done = alone("-c", code + "\nassert plan.active.all() and not plan.notes, plan")
+    assert done.returncode == 0 and done.stdout.startswith("left [") and "right [" in done.stdout, done.stderr
+
+
+def test_the_measurement(alone):
+    done = alone("-m", "maexp.agents.runtime", "--metres", "20", "--calls", "2")
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0 and lines[0] == "3 robots, 200 x 200 cells of 0.1 m", done.stderr
+    assert len(lines) == 8 and all(" ms, at most " in line for line in lines[1:])
