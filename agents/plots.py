@@ -45,7 +45,7 @@ METRICS = (
     ("success_rate", "Success rate", "%", 100),
     ("coverage_step_85", "Time to 85 % coverage", "local steps of 0.1 s", 1),
     ("coverage_step_95", "Time to 95 % coverage", "local steps of 0.1 s", 1),
-    ("coverage_step_95_censored", "Time to 95 %, the limit where never", "local steps of 0.1 s", 1),
+    ("coverage_step_95_censored", "Time to 95 % or the limit", "local steps of 0.1 s", 1),
     ("mutual_overlap_85", "Overlap at 85 % coverage", "%", 100),
     ("mutual_overlap_95", "Overlap at 95 % coverage", "%", 100),
     ("collisions", "Collisions", "robots per episode", 1),

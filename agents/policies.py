@@ -18,12 +18,15 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from maexp.envs import ExplorationEnv
+from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.targets import Scene, TargetTracker, keyed_uniform
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 
 REGION_COUNT = 64
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
 LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
+LEAST_TRUE_GAIN = 0.1  # the same of what is truly to be seen
 RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
@@ -121,19 +124,46 @@ class FrontierPlanner:
         choose: `Scene` -> int64 [E, N], the target of each robot.
     """
 
+    least_gain = LEAST_GAIN
+
     def __init__(self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor]):
         self.choose, self.tracker = choose, TargetTracker(env)
+
+    def look(self) -> Scene:
+        """What there is to choose from."""
+        return self.tracker.look(compact=True)
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
-        scene = self.tracker.look(compact=True)
-        scene = replace(scene, travel=_prefer(scene.travel, scene.gain >= LEAST_GAIN))
+        scene = self.look()
+        scene = replace(scene, travel=_prefer(scene.travel, scene.gain >= self.least_gain))
         chosen = self.choose(scene).unsqueeze(-1)
         found = scene.travel.gather(2, chosen).isfinite()
         cell, block = scene.cells().gather(2, chosen), scene.block.gather(2, chosen)
         toward = scene.middle.gather(2, chosen.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
         return self.tracker.take(torch.where(found, block, -1).squeeze(-1), cell.squeeze(-1), toward)
+
+
+class OraclePlanner(FrontierPlanner):
+    """`cost_utility` that is told how much of the true map each target would show: a reference, no competitor."""
+
+    least_gain = LEAST_TRUE_GAIN
+
+    def __init__(self, env: ExplorationEnv):
+        super().__init__(env, choose_by_utility)
+        grids = [open_cells(build_nav_grid(one)) for one in env.maps]
+        shape = (len(grids), self.tracker.nav.known.shape[-1])
+        self.open = torch.zeros(shape, dtype=torch.bool, device=env.device)
+        for row, one in zip(self.open, grids, strict=True):
+            row[: len(one)] = torch.from_numpy(one).to(env.device)
+
+    def look(self) -> Scene:
+        scene, nav = super().look(), self.tracker.nav
+        seen = torch.where(nav.known == UNKNOWN, UNKNOWN, FREE)
+        truth = torch.where(self.open[nav.state["map_id"].long()].unsqueeze(1), seen, OBSTACLE).to(torch.uint8)
+        gain, middle = self.tracker.outlook(nav.cell, truth)
+        return replace(scene, gain=gain, middle=middle)
 
 
 def _prefer(travel: torch.Tensor, worth: torch.Tensor) -> torch.Tensor:
@@ -178,5 +208,9 @@ CHOICES: dict[str, Callable[[Scene], torch.Tensor]] = {
 POLICIES: dict[str, Callable[[ExplorationEnv], TensorDictModule]] = {
     "random": partial(_as_module, RandomPolicy),
     **{name: partial(_as_module, partial(FrontierPlanner, choose=choose)) for name, choose in CHOICES.items()},
+    "oracle": partial(_as_module, OraclePlanner),
 }
 """Name -> callable(env) -> policy."""
+
+REFERENCES = ("random", "oracle")
+"""Neither is a planner that a learned policy competes with: one knows nothing, the other the true map."""

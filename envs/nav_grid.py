@@ -81,6 +81,14 @@ def build_nav_grid(map: PointCloudMap) -> NavGrid:
     )
 
 
+def open_cells(grid: NavGrid) -> np.ndarray:
+    """Cells that a map leaves free, bool [width * height]: neither a boundary point's nor outside."""
+    free = np.zeros(len(grid.stand_in), dtype=bool)
+    free[grid.free_cell] = True
+    free[grid.boundary_cell] = False
+    return free[grid.stand_in] & (grid.stand_in >= 0)
+
+
 def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids, int]:
     """Device arrays over several maps, and the cells of the largest (points in the order of `Maps`)."""
     begin = np.cumsum([0] + [len(g.stand_in) for g in grids])

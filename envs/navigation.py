@@ -158,22 +158,26 @@ class Navigation:
     def size(self) -> torch.Tensor:
         return self._size.view(self.num_envs, self.rows, -1)
 
-    def look_around(self, radius: float, cells: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    def look_around(
+        self, radius: float, cells: torch.Tensor | None = None, known: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """What could be seen for the first time from every target, within ``radius`` [m] and in front of known walls.
 
         Args:
             radius: how far [m].
             cells: int64 [E, R, M], from where; -1 = nowhere. None: from the targets of all blocks.
+            known: uint8 [E, R, C], what is taken for known. None: what is.
 
         Returns:
             float32 [E, R, K or M], unknown cells; float32 [E, R, K or M, 2], their middle, from the target [m].
         """
         start = self._target if cells is None else cells.flatten(0, 1).to(torch.int32).contiguous()
+        grid = self.known_grids.known if known is None else wp.from_torch(known.flatten(0, 1).contiguous())
         area = torch.empty(start.shape, device=self.device)
         middle = torch.empty((*start.shape, 2), device=self.device)
         self.launch(
             targets._look_around, tuple(area.shape),
-            inputs=[self.grids, self.known_grids.grid_of_row, self.known_grids.known, wp.from_torch(start),
+            inputs=[self.grids, self.known_grids.grid_of_row, grid, wp.from_torch(start),
                     *self._spread_rays(radius), float(radius)],
             outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
         )  # fmt: skip

@@ -102,19 +102,27 @@ class TargetTracker:
         block = nav.block.clamp_min(0).expand(-1, robots, -1) if compact else None
         points = nav.points(cells.clamp_min(0)).expand(-1, robots, -1, -1)
         travel = self._give_up(nav.travel(cells), points, block)
-        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        area, middle = nav.look_around(nav.radar_range, cells if compact else None)
+        gain, middle = self.outlook(cells if compact else None)
         size = nav.size.expand(-1, robots, -1)
         return Scene(
             travel=travel,
             points=points,
             size=(size.gather(2, block) if compact else size).float(),
-            gain=(area / disc.view(-1, 1, 1)).expand(-1, robots, -1),
-            middle=middle.expand(-1, robots, -1, -1),
+            gain=gain,
+            middle=middle,
             alive=nav.alive(),
             nav=nav,
             block=block,
         )
+
+    def outlook(
+        self, cells: torch.Tensor | None = None, known: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """`Scene.gain` and `Scene.middle`; arguments as in `Navigation.look_around`."""
+        nav, robots = self.nav, self.env.num_robots
+        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
+        area, middle = nav.look_around(nav.radar_range, cells, known)
+        return (area / disc.view(-1, 1, 1)).expand(-1, robots, -1), middle.expand(-1, robots, -1, -1)
 
     def take(
         self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor

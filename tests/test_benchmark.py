@@ -19,12 +19,22 @@ import pytest
 from rich.console import Console
 from scipy.stats import mannwhitneyu
 
-from maexp.agents.benchmark.cell import read_result
+from maexp.agents.benchmark.cell import CellResult, read_result
 from maexp.agents.benchmark.compare import compare_all, improvement, win_shares
+from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
 from maexp.agents.benchmark.paper_results import COLUMNS, PAPER
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, compose_settings, list_cells
 from maexp.agents.benchmark.pool import WorkerPool
-from maexp.agents.benchmark.table import ROWS, best, pool_column, print_tables, table_csv, table_latex, table_markdown
+from maexp.agents.benchmark.table import (
+    ROWS,
+    best,
+    best_columns,
+    pool_column,
+    print_tables,
+    table_csv,
+    table_latex,
+    table_markdown,
+)
 from maexp.agents.cli import main
 from maexp.agents.commands.benchmark import prepare
 from maexp.agents.logs import read_metrics
@@ -99,7 +109,8 @@ def test_files_and_summaries(whole):
         assert (whole / name).stat().st_size > 200, name
     summary = json.loads((whole / "summary.json").read_text())
     flat = json.loads((whole / "summaries" / "maze_small.json").read_text())
-    assert set(flat) == {"voronoi", "random", "mappo", "run"} and summary["maze_small"]["mappo"] == flat["mappo"]
+    assert set(flat) == {"voronoi", "random", "mappo", "difference", "run"}
+    assert summary["maze_small"]["mappo"] == flat["mappo"]
     pooled = np.concatenate([read_result(whole, one, "held_out").episodes["exploration_ratio"] for one in CELLS[2::3]])
     coverage = flat["mappo"]["exploration_ratio"]
     assert coverage["n"] == 6 == len(pooled)
@@ -316,7 +327,7 @@ def column(policy: str, seed: int = 0, **values: list[float]):
     return pool_column(policy, "held_out", [(seed, episodes)])
 
 
-ER, CS = ROWS[0], ROWS[1]
+ER, CS = (next(row for row in ROWS if row.label == label) for label in ("ER", "CS85"))
 
 
 def test_best_goes_by_direction_and_by_what_is_printed():
@@ -370,6 +381,53 @@ def test_the_terminals_table_fits_100_columns(tables):
     text = out.getvalue()
     assert max(map(len, text.splitlines())) <= 100
     assert "2200 ± 800" in text.replace("  ", " ") and "441 ± 57" in text and "…" not in text
+
+
+# Less the best classical planner
+
+
+def played(policy: str, coverage: list, seed: int = 0, maps: list | None = None) -> tuple[Cell, CellResult]:
+    values = np.array(coverage)
+    episodes = {"coverage_auc": values, "coverage_step_95_censored": -100 * values, "collisions": 0 * values}
+    names = None if maps is None else np.array(maps)
+    return Cell("maze", policy, seed), CellResult(episodes, np.zeros(1), values[:, None], {}, names)
+
+
+def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training():
+    maps = ["a", "a", "b", "b"]
+    planner = [played("voronoi", [0.1, 0.2, 0.6, 0.9], seed, maps) for seed in (0, 1, 2)]
+    alike = [played("ippo", [0.2, 0.3, 0.7, 1.0], seed, maps) for seed in (2, 0)]
+    found = subtract("ippo", alike, planner)["coverage_auc"]
+    assert (found["n"], found["mean"]) == (8, pytest.approx(0.1)) and found["ci95"] == [pytest.approx(0.1)] * 2
+    unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8], 1, maps)]
+    found = subtract("ippo", unlike, planner)["coverage_auc"]
+    assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
+    assert subtract("ippo", [played("ippo", [0.5], 7)], planner) == {}
+    text = differences_markdown("voronoi", {"ippo": subtract("ippo", alike, planner)})
+    assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
+
+
+def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():
+    one, other = [played("voronoi", [0.5, 0.7])], [played("hungarian", [0.9, 0.1]), played("hungarian", [0.9, 0.4], 1)]
+    assert find_best({"voronoi": one, "hungarian": other, "rrt_frontiers": []}) == "voronoi" and find_best({}) is None
+
+
+def test_planners_play_validation_maps_and_the_report_says_who_is_best(whole):
+    voronoi, random = CELLS[0], CELLS[1]
+    assert {voronoi.policy, random.policy} == {"voronoi", "random"}
+    voronoi, random = sorted((voronoi, random), key=lambda one: one.policy != "voronoi")
+    assert set(read_result(whole, voronoi, "validation").maps) <= {f"maze_small_{k}" for k in range(51, 64)}
+    assert not (cell_folder(whole, random) / "validation.json").exists()
+    flat = json.loads((whole / "summaries" / "maze_small.json").read_text())
+    assert flat["run"]["best_classical"] == "voronoi" and set(flat["difference"]["mappo"]) == {"voronoi", "random"}
+    apart = flat["mappo"]["coverage_auc"]["mean"] - flat["voronoi"]["coverage_auc"]["mean"]
+    assert flat["difference"]["mappo"]["voronoi"]["coverage_auc"]["mean"] == pytest.approx(apart)
+    assert "Less voronoi, the best classical planner on the validation maps" in (whole / "table.md").read_text()
+
+
+def test_what_knows_the_map_is_never_the_best():
+    columns = [column("oracle", exploration_ratio=[0.99, 0.99]), column("ippo"), column("random")]
+    assert best_columns(columns, ER) == {"ippo", "random"}
 
 
 # Who is better than whom

@@ -9,6 +9,7 @@ from maexp.agents.policies import (
     CHOICES,
     POLICIES,
     FrontierPlanner,
+    OraclePlanner,
     Scene,
     _prefer,
     choose_by_area,
@@ -20,6 +21,7 @@ from maexp.agents.policies import (
 )
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RobotConfig, make_map
 from maexp.envs.navigation import Navigation
+from maexp.kernels import visible_points
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
 
@@ -175,6 +177,31 @@ def test_goals_under_dwa_are_in_sight_and_in_reach():
                 line = a + np.linspace(0.2, 1.0, 20)[:, None] * (b - a)
                 cells = np.floor(line + 0.5).astype(int)
                 assert passable[e][cells[:, 1] * w + cells[:, 0]].mean() > 0.9
+
+
+def test_the_oracle_is_told_what_is_truly_to_be_seen():
+    """Cells of free points in range and sight that nobody has seen: none beyond walls that are not known yet."""
+    env = make_env(3, maps=[make_map("maze_small", 0)], num_robots=2)
+    env.reset()
+    oracle = OraclePlanner(env)
+    told, guessed = oracle.look(), oracle.tracker.look(compact=True)
+    disc = np.pi * 10.0**2
+    compared = 0
+    for e in range(3):
+        shot = env.snapshot(e)
+        place, seen = shot["map"], shot["seen_free"].any(axis=0)
+        for k in (guessed.travel[e, 0].isfinite()).nonzero().ravel().tolist():
+            point = guessed.points[e, 0, k].numpy()
+            origin = np.append(point, 0.0).astype(np.float32)
+            visible = visible_points(
+                torch.from_numpy(place.free), torch.from_numpy(place.obstacles), torch.from_numpy(origin), 10.0,
+                obstacle_radius=0.5**0.5,
+            ).numpy()  # fmt: skip
+            want = (visible & ~seen).sum() / disc
+            assert told.gain[e, 0, k] == pytest.approx(want, abs=0.25 * want + 0.03)
+            compared += want > 0.1
+    assert compared > 5 and told.gain.max() < guessed.gain.max()
+    assert told.gain.sum() < 0.8 * guessed.gain.sum()
 
 
 class Places:

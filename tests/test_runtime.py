@@ -57,7 +57,7 @@ def test_numbers_are_those_of_the_kernels_and_policies():
         (choices, policies, ("BETA", "LEAST_GAIN", "RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
     ):
         assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
-    assert set(CHOICES) == set(policies.POLICIES)
+    assert set(CHOICES) == set(policies.POLICIES) - {"oracle"}  # no robot knows the true map
 
 
 @pytest.mark.parametrize("name", CASES)

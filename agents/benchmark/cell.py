@@ -15,10 +15,11 @@ from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.commands.run_folder import short
+from maexp.agents.comparison import CHOOSING
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
 from maexp.agents.files import write_file, write_json
-from maexp.agents.policies import POLICIES
+from maexp.agents.policies import CHOICES, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run
 from maexp.agents.train import TrainingRun, train, write_config
@@ -27,6 +28,8 @@ from maexp.envs.recorder import CoverageRecorder
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 CURVE = ("curve_seconds", "curve_coverage")
+VALIDATION = "validation"
+"""Maps that a classical planner plays first: they say which one is the best."""
 
 
 @dataclass
@@ -38,12 +41,14 @@ class CellResult:
         seconds: times of the coverage curve [s], shape [records]
         coverage: [episodes, records] in [0, 1]
         run: what was run
+        maps: the map of each episode, names [episodes]; None: an earlier version did not note it
     """
 
     episodes: dict[str, np.ndarray]
     seconds: np.ndarray
     coverage: np.ndarray
     run: dict
+    maps: np.ndarray | None = None
 
 
 class EnvShelf:
@@ -83,7 +88,7 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
         if run.stopped:
             return False
         policy, trained = run.learner.policy, {"training_seconds": round(run.seconds, 2)}
-    for suite in suites:
+    for suite in [VALIDATION] * (cell.policy in CHOICES) + suites:
         if not finished(where, cell, suite):
             play_suite(cfg, settings, cell, suite, policy, folder, shelf, trained)
     return True
@@ -96,25 +101,27 @@ def play_suite(
     with blame_input():
         maps = getattr(load_maps(settings.scenario, train=suite == "trained"), _ATTRIBUTE[suite])
         key = f"{cell.scenario} {cell.seed} {cell.map} {suite}"
-        size = min(cfg.num_envs, cfg.episodes)
+        episodes = min(CHOOSING, cfg.episodes) if suite == VALIDATION else cfg.episodes
+        size = min(cfg.num_envs, episodes)
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
         bound = POLICIES[cell.policy](env) if policy is None else policy
     begin = time.perf_counter()
-    with Progress(f"evaluating on {suite}", cfg.episodes) as progress:
+    with Progress(f"evaluating on {suite}", episodes) as progress:
         with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
             result = evaluate(
-                bound, env, cfg.episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
+                bound, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
             )
-    seconds, coverage = recorder.curves(cfg.episodes)
+    seconds, coverage = recorder.curves(episodes)
     arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
+    arrays["maps"] = result.maps
     described = describe_run(settings, maps, time.perf_counter() - begin) | trained
-    described |= {"algorithm": cell.policy if cell.trains else None, "episodes": cfg.episodes, "maps_are": suite}
+    described |= {"algorithm": cell.policy if cell.trains else None, "episodes": episodes, "maps_are": suite}
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
 
 
-_ATTRIBUTE = {"held_out": "held_out", "trained": "train"}
+_ATTRIBUTE = {"held_out": "held_out", "trained": "train", VALIDATION: "validation"}
 
 
 def write_result(folder: Path, suite: str, arrays: dict[str, np.ndarray], summary: dict) -> None:
@@ -136,10 +143,11 @@ def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
             arrays = {name: file[name] for name in file.files}
         seconds, coverage = (arrays.pop(name) for name in CURVE)
         run = {name: summary["run"][name] for name in RUN} | summary["run"]
+        maps = arrays.pop("maps", None)
         episodes = {name: arrays[name] for name in summary[cell.policy]} | arrays
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
             f"{short(folder / suite)}.json and .npz cannot be read ({type(error).__name__}): remove the .json, and "
             f"maexp benchmark resume={short(where)} plays {cell.name} again."
         ) from error
-    return CellResult(episodes, seconds, coverage, run)
+    return CellResult(episodes, seconds, coverage, run, maps)

@@ -116,7 +116,7 @@ def _measure_learner(cfg: Any, cell: Cell) -> tuple[float, float]:
     settings, _ = cell_config(cfg, cell)
     if find_scenario(cell.scenario).build is not None:
         settings.scenario.maps = [0]
-        settings.scenario.held_out = [0]
+        settings.scenario.held_out, settings.scenario.held_out_count = [0], None
     with blame_input():
         env = make_env(settings, load_maps(settings.scenario).train, settings.num_robots)
         learner = make_learner(settings, env)

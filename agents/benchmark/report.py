@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.agents.benchmark.cell import CellResult, finished, read_result
+from maexp.agents.benchmark.cell import VALIDATION, CellResult, finished, read_result
+from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.agents.benchmark.plan import SUITES, Cell, as_list
 from maexp.agents.benchmark.table import (
@@ -20,6 +21,7 @@ from maexp.agents.benchmark.table import (
 )
 from maexp.agents.commands.run_folder import short
 from maexp.agents.files import write_json, write_text
+from maexp.agents.policies import CHOICES
 from maexp.agents.results import PACKAGES, find_commit
 
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
@@ -71,6 +73,10 @@ class Report:
             return
         written = ["table.csv", "table.md", "table.tex", "summary.json", *self.draw(tables)]
         print_tables(tables)
+        for scenario, columns in tables.items():
+            rival = self._rival(scenario)
+            if rows := against(self.differences(scenario, columns), rival):
+                print("\n".join(differences_text(scenario, rival, rows)))
         if self.cfg.preset == "smoke":
             print(SMOKE)
         print(f"Written to {short(self.where)}: {', '.join(written)}")
@@ -103,7 +109,7 @@ class Report:
         key = (scenario, policy, suite, *(cell for cell, _ in found))
         if key not in self._columns:
             pairs = [(cell.seed, result.episodes) for cell, result in found]
-            self._columns[key] = pool_column(policy, suite, pairs)
+            self._columns[key] = pool_column(policy, suite, pairs, [result.maps for _, result in found])
         return self._columns[key]
 
     def write_tables(self) -> dict[str, list[Column]]:
@@ -111,14 +117,39 @@ class Report:
         tables = self.tables()
         if tables:
             write_text(self.where / "table.csv", table_csv(tables))
-            write_text(self.where / "table.md", table_markdown(tables, self.heading()))
+            rivals = {scenario: self._rival(scenario) for scenario in tables}
+            apart = {scenario: self.differences(scenario, columns) for scenario, columns in tables.items()}
+            below = {
+                scenario: differences_markdown(rivals[scenario], rows)
+                for scenario in tables if (rows := against(apart[scenario], rivals[scenario]))
+            }  # fmt: skip
+            write_text(self.where / "table.md", table_markdown(tables, self.heading(), below))
             write_text(self.where / "table.tex", table_latex(tables, self.heading()))
+            content = {}
             for scenario, columns in tables.items():
                 named = {one.name: one.summary for one in columns}
-                write_json(self.where / "summaries" / f"{scenario}.json", named | {"run": self.describe([scenario])})
-            content = {scenario: {one.name: one.summary for one in columns} for scenario, columns in tables.items()}
-            write_json(self.where / "summary.json", content | {"run": self.describe(list(tables))})
+                named |= {"difference": apart[scenario]} if apart[scenario] else {}
+                content[scenario] = named
+                run = self.describe([scenario]) | {"best_classical": rivals[scenario]}
+                write_json(self.where / "summaries" / f"{scenario}.json", named | {"run": run})
+            run = self.describe(list(tables)) | {"best_classical": rivals}
+            write_json(self.where / "summary.json", content | {"run": run})
         return tables
+
+    def _rival(self, scenario: str) -> str | None:
+        """The best classical planner on the validation maps."""
+        planners = [name for name in dict.fromkeys(one.policy for one in self.cells) if name in CHOICES]
+        return find_best({name: self.results(scenario, name, VALIDATION) for name in planners})
+
+    def differences(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
+        """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b, for every trained a and all others on the same maps."""
+        found: dict[str, dict] = {}
+        for one in (one for one in columns if one.policy in ALGORITHMS):
+            for other in (other for other in columns if other is not one and other.suite == one.suite):
+                mine, theirs = (self.results(scenario, column.policy, one.suite) for column in (one, other))
+                if apart := subtract(one.policy, mine, theirs):
+                    found.setdefault(one.name, {})[other.name] = apart
+        return found
 
     def heading(self) -> str:
         """A sentence on what the tables show."""
@@ -212,6 +243,15 @@ def pool_curves(results: list[CellResult]) -> tuple[np.ndarray, np.ndarray]:
     times = np.unique(np.concatenate([one.seconds for one in results]))
     coverage = [np.stack([np.interp(times, one.seconds, curve) for curve in one.coverage]) for one in results]
     return times, np.concatenate(coverage)
+
+
+def against(apart: dict[str, dict], rival: str | None) -> dict[str, dict]:
+    """policy -> its difference to `rival` on the same maps, of what `Report.differences` found."""
+    rows = {
+        name: [found for other, found in others.items() if other.split(" (")[0] == rival]  # less the mark of its maps
+        for name, others in apart.items()
+    }
+    return {name: found[0] for name, found in rows.items() if found}
 
 
 def _points(scenario: str, columns: list[Column]) -> list[tuple]:

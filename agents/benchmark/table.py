@@ -10,8 +10,9 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
+from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.envs.metrics import summarise
+from maexp.envs.metrics import resample_weights, summarise
 
 
 @dataclass(frozen=True)
@@ -36,18 +37,26 @@ class Row:
 
 ROWS = (
     Row("exploration_ratio", "ER", "%", 1, 100, 1),
+    Row("coverage_auc", "AUC", "%", 1, 100, 1),
     Row("coverage_step_85", "CS85", "steps", -1, 1, 0),
     Row("coverage_step_95", "CS95", "steps", -1, 1, 0),
+    Row("coverage_step_95_censored", "to 95", "steps", -1, 1, 0),
     Row("mutual_overlap_85", "MO85", "%", -1, 100, 1),
     Row("mutual_overlap_95", "MO95", "%", -1, 100, 1),
     Row("reward_variance", "RV", "", -1, 1, 0),
 )
+SHOWN = [row for row in ROWS if row.metric not in ("mutual_overlap_95", "reward_variance")]  # there is room for six
+ORACLE = "oracle"
 SHORT = {"held_out": "", "trained": " (training maps)"}
 NOTES = (
-    "ER: exploration ratio, more is better. CS85, CS95: local steps until 85, 95 % coverage; MO85, MO95: share of the "
-    "seen points that two or more robots saw, at that moment; RV: spread of the reward over robots; less is better.",
-    "Mean ± standard deviation over episodes, [bootstrap 95 % interval of the mean]. CS and MO: over the episodes that "
-    "got there, (how many/of all); a policy that seldom gets there shows its luckiest episodes.",
+    "ER: exploration ratio; AUC: mean coverage over all local steps of a full episode; more is better. CS85, CS95: "
+    "local steps until 85, 95 % coverage; to 95: the same with the limit for episodes that did not get there; MO85, "
+    "MO95: share of the seen points that two or more robots saw, at that moment; RV: spread of the reward over robots; "
+    "less is better.",
+    "Mean ± standard deviation over episodes, [bootstrap 95 % interval of the mean; maps, the episodes on each and the "
+    "seeds of training are resampled]. CS and MO: over the episodes that got there, (how many/of all); a policy that "
+    "seldom gets there shows its luckiest episodes.",
+    "oracle knows what is truly to be seen from each target: a reference, no competitor, never bold.",
     "Bold: the best mean of a row as printed; several where they tie. paper: Table II, trained and tested on the same "
     "map; its indoor and outdoor maps are scans, ours are generated.",
 )
@@ -74,16 +83,40 @@ class Column:
         return self.policy + SHORT[self.suite]
 
 
-def pool_column(policy: str, suite: str, cells: list[tuple[int, dict[str, np.ndarray]]]) -> Column:
-    """The column of a policy from the (seed, episodes) of its cells."""
-    metrics = list(cells[0][1])
+def pool_column(
+    policy: str,
+    suite: str,
+    cells: list[tuple[int, dict[str, np.ndarray]]],
+    maps: list[np.ndarray | None] | None = None,
+) -> Column:
+    """The column of a policy from the (seed, episodes) of its cells, and each episode's map where that is known."""
+    counts = [len(episodes["exploration_ratio"]) for _, episodes in cells]
+    cells = [  # an earlier version knew fewer metrics
+        (seed, {row.metric: np.full(count, np.nan) for row in ROWS} | episodes)
+        for count, (seed, episodes) in zip(counts, cells, strict=True)
+    ]
+    metrics = [name for name in cells[0][1] if all(name in episodes for _, episodes in cells)]
     pooled = {name: np.concatenate([episodes[name] for _, episodes in cells]) for name in metrics}
     seeds: dict[int, dict[str, float]] = {}
     for seed in dict.fromkeys(seed for seed, _ in cells):
         same = [episodes for one, episodes in cells if one == seed]
         seeds[seed] = {name: _mean(np.concatenate([one[name] for one in same])) for name in metrics}
-    summary = {name: summarise(values) for name, values in pooled.items()}
+    weights = weigh(policy, [seed for seed, _ in cells], counts, maps)
+    summary = {name: summarise(values, weights) for name, values in pooled.items()}
     return Column(policy, suite, summary, len(pooled["exploration_ratio"]), seeds)
+
+
+def weigh(policy: str, seeds: list[int], counts: list[int], maps: list | None) -> np.ndarray | None:
+    """Resamples of maps, of the episodes on each and, where a policy was trained, of the seeds of its trainings.
+
+    Args:
+        policy: whose
+        seeds, counts: of each cell, and its episodes
+        maps: the map of each episode, for each cell; None: not known, there are no such resamples
+    """
+    if maps is None or any(one is None for one in maps):
+        return None
+    return resample_weights(np.concatenate(maps), *([np.repeat(seeds, counts)] if policy in ALGORITHMS else []))
 
 
 def _mean(values: np.ndarray) -> float:
@@ -104,7 +137,8 @@ def best_columns(columns: list[Column], row: Row) -> set[str]:
     """Names of the columns that are bold in a row; each set of maps is compared by itself."""
     found: set[str] = set()
     for suite in dict.fromkeys(one.suite for one in columns):
-        found |= best({one.name: one.summary[row.metric]["mean"] for one in columns if one.suite == suite}, row)
+        rivals = [one for one in columns if one.suite == suite and one.policy != ORACLE]
+        found |= best({one.name: one.summary[row.metric]["mean"] for one in rivals}, row)
     return found
 
 
@@ -153,16 +187,16 @@ def draw_table(scenario: str, columns: list[Column]) -> Table:
     table = Table(title=f"{scenario}: {columns[0].total} episodes a policy", title_justify="left", box=box.SIMPLE_HEAD,
                   pad_edge=False, collapse_padding=True, padding=(0, 1))  # fmt: skip
     table.add_column("policy", no_wrap=True)
-    for row in ROWS:
+    for row in SHOWN:
         table.add_column(row.title.replace(" steps", ""), justify="right", no_wrap=True)
-    bold = {row.metric: best_columns(columns, row) for row in ROWS}
+    bold = {row.metric: best_columns(columns, row) for row in SHOWN}
     for column in columns:
         cells = []
-        for row in ROWS:
+        for row in SHOWN:
             cell = Text(value_text(column, row), style="bold" if column.name in bold[row.metric] else "")
             cells.append(cell.append(f"\n{_narrow(column, row)}", style="not bold dim"))
         table.add_row(column.name.replace(" (", "\n("), *cells)
-        published = [paper_text(scenario, column, row, row.digits) for row in ROWS]
+        published = [paper_text(scenario, column, row, row.digits) for row in SHOWN]
         if any(published):
             table.add_row(Text("  paper", style="dim"), *(Text(one or "-", style="dim") for one in published))
     return table
@@ -225,8 +259,13 @@ def _csv_number(value) -> str:
     return value if value == "" else f"{value:.6g}"
 
 
-def table_markdown(tables: dict[str, list[Column]], heading: str = "") -> str:
-    """A table per scenario as in the paper: metrics as rows, policies as columns. `heading`: what was run."""
+def table_markdown(tables: dict[str, list[Column]], heading: str = "", below: dict[str, str] | None = None) -> str:
+    """A table per scenario as in the paper: metrics as rows, policies as columns.
+
+    Args:
+        heading: what was run
+        below: scenario -> what stands below its table
+    """
     parts = [heading] if heading else []
     for scenario, columns in tables.items():
         lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
@@ -235,6 +274,8 @@ def table_markdown(tables: dict[str, list[Column]], heading: str = "") -> str:
             bold = best_columns(columns, row)
             cells = [_markdown_cell(scenario, one, row, bold) for one in columns]
             lines.append(f"| {row.title} | {' | '.join(cells)} |")
+        if scenario in (below or {}):
+            lines += ["", below[scenario]]
         parts.append("\n".join(lines))
     return "\n\n".join([*parts, *NOTES]) + "\n"
 

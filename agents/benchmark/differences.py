@@ -1,0 +1,75 @@
+"""How far the trained policies of a benchmark are ahead of the best classical planner, on the same episodes."""
+
+import numpy as np
+
+from maexp.agents.benchmark.cell import CellResult
+from maexp.agents.benchmark.plan import Cell
+from maexp.agents.benchmark.table import weigh
+from maexp.agents.comparison import DECIDES
+from maexp.envs.metrics import summarise
+
+Played = list[tuple[Cell, CellResult]]
+SHOWN = (("coverage_auc", "AUC, points", 100, 1), ("coverage_step_95_censored", "to 95, steps", 1, 0),
+         ("collisions", "robots lost", 1, 2))  # fmt: skip
+"""Metric, title, scale and digits of what is shown of a difference."""
+
+
+def subtract(policy: str, one: Played, other: Played) -> dict[str, dict]:
+    """{metric: {mean, std, ci95, n}} of a policy's episodes less the same episodes of another; {}: they share none."""
+    theirs = {(cell.seed, cell.map): result for cell, result in other}
+    pairs = [(cell.seed, mine, theirs[cell.seed, cell.map]) for cell, mine in one if (cell.seed, cell.map) in theirs]
+    if not pairs:
+        return {}
+    maps, counts = [mine.maps for _, mine, _ in pairs], [len(mine.coverage) for _, mine, _ in pairs]
+    weights = weigh(policy, [seed for seed, _, _ in pairs], counts, maps)
+    shared = [name for name in pairs[0][1].episodes if all(name in x.episodes for _, *both in pairs for x in both)]
+    return {
+        name: summarise(np.concatenate([mine.episodes[name] - his.episodes[name] for _, mine, his in pairs]), weights)
+        for name in shared
+    }
+
+
+def find_best(played: dict[str, Played]) -> str | None:
+    """The policy that saw most over time; None where there is none.
+
+    Args:
+        played: policy -> what it played on validation maps
+    """
+    scores = {
+        policy: np.mean([result.episodes[DECIDES].mean() for _, result in cells])
+        for policy, cells in played.items()
+        if cells
+    }
+    return max(scores, key=scores.get, default=None)
+
+
+def difference_cells(found: dict[str, dict]) -> list[str]:
+    """+1.2 [0.3, 2.1] of each metric in `SHOWN`."""
+    return [_cell(found[metric], scale, digits) for metric, _, scale, digits in SHOWN]
+
+
+def _cell(one: dict, scale: float, digits: int) -> str:
+    low, high = (f"{scale * end:+.{digits}f}" for end in one["ci95"])
+    return f"{scale * one['mean']:+.{digits}f} [{low}, {high}]"
+
+
+def differences_markdown(rival: str, rows: dict[str, dict]) -> str:
+    """A table of trained policies less the best classical planner.
+
+    Args:
+        rival: that planner
+        rows: policy -> its difference
+    """
+    lines = [f"Less {rival}, the best classical planner on the validation maps, episode by episode:", ""]
+    lines += ["| | " + " | ".join(title for _, title, _, _ in SHOWN) + " |", "| --- |" + " --- |" * len(SHOWN)]
+    lines += [f"| {name} | {' | '.join(difference_cells(found))} |" for name, found in rows.items()]
+    return "\n".join(lines)
+
+
+def differences_text(scenario: str, rival: str, rows: dict[str, dict]) -> list[str]:
+    """The same as lines for the terminal."""
+    lines = [f"{scenario}: less {rival}, the best classical planner on the validation maps, episode by episode"]
+    for name, found in rows.items():
+        parts = [f"{title} {text}" for (_, title, _, _), text in zip(SHOWN, difference_cells(found), strict=True)]
+        lines.append(f"  {name}: {'; '.join(parts)}")
+    return lines
