@@ -14,6 +14,7 @@ from typing import Any
 
 from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner, set_steps
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
+from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import evaluate
@@ -105,6 +106,11 @@ class TrainingRun:
         return {name: value for name, value in settings.items() if name != "resume"}
 
     @cached_property
+    def checksums(self) -> dict[str, str]:
+        """Of the maps trained on and held out, by their names."""
+        return checksums(self.suite.train) | checksums(self.suite.held_out)
+
+    @cached_property
     def followers(self) -> list[str]:
         """The settings that no word had set and that the scenario supplied."""
         return find_followers(compose_config("train", self.overrides))
@@ -134,6 +140,7 @@ class TrainingRun:
             "settings": self.settings,
             "followers": self.followers,
             "commit": find_commit(),
+            "maps": self.checksums,
             "iteration": self.iteration,
             "best": self.best,
             "average": self.average,
@@ -150,6 +157,7 @@ class TrainingRun:
     def restore(self, saved: dict) -> None:
         """Go on where `save` was called."""
         check_action(saved, self.cfg)
+        warn_of_changed_maps(saved, self.suite.train)
         load_matching(self.learner.policy, saved["policy"])
         self.learner.updater.load_state_dict(saved["updater"])
         self.restore_experience(saved)
@@ -343,8 +351,8 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def write_config(settings: dict, folder: Path, verb: str, overrides: list[str]) -> None:
-    """config.yaml: the command and the commit as comments, then all settings with their values."""
+def write_config(settings: dict, folder: Path, verb: str, overrides: list[str], **others: Any) -> None:
+    """config.yaml: the command and the commit as comments, then all settings with their values, then `others`."""
     command = f"# maexp {verb} {' '.join(overrides)}".rstrip()
     commit = f"# commit {find_commit()}\n" if find_commit() else ""
-    write_text(folder / "config.yaml", f"{command}\n{commit}{to_yaml(settings)}")
+    write_text(folder / "config.yaml", f"{command}\n{commit}{to_yaml(settings | others)}")

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import make_env, make_learner, model_settings
 from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.settings import legacy
@@ -194,15 +195,21 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("maexp.agents.commands.train.finish", lambda done: None)
     assert main(["train", *words, "total_frames=6", "hydra.run.dir=run"]) == 0
     path, saved = find_checkpoint("run")
-    assert saved["settings"] == OmegaConf.to_container(OmegaConf.load("run/config.yaml"))
+    written = OmegaConf.to_container(OmegaConf.load("run/config.yaml"))
+    maps = [make_map("maze_small", index) for index in (0, 64)]
+    assert written.pop("map_checksums") == saved["maps"] == checksums(maps)
+    assert saved["settings"] == written
     assert "null" not in Path("run/config.yaml").read_text()
     saved["settings"]["reward"]["explore"] = 0.0  # as if the default had been another then
     saved["settings"]["robot"]["max_speed"] = 1.0
     torch.save(saved, path)
     assert main(["evaluate", "checkpoint=run", "episodes=2", "hydra.run.dir=played"]) == 0
+    assert "changed" not in capsys.readouterr().err
     played = OmegaConf.load("played/config.yaml")
     assert (played.reward.explore, played.robot.max_speed, played.scenario.macro_steps) == (0.0, 1.0, 3)
+    torch.save(saved | {"maps": saved["maps"] | {"maze_small_0": "0123"}}, path)  # as if it had been another then
     assert main(["train", "resume=run", "total_frames=12"]) == 0
+    assert "maze_small_0 has changed since the run was started" in capsys.readouterr().err
     assert find_checkpoint("run")[1]["settings"]["reward"]["explore"] == 0.0
     assert find_checkpoint("run")[1]["followers"] == saved["followers"]
 
@@ -228,3 +235,18 @@ def test_a_smoke_preset_is_over_at_once():
 def test_a_preset_does_not_change_a_run():
     with pytest.raises(UserError, match="preset=paper stands for many settings, and those of run.pt are kept"):
         play(save(), "preset=paper")
+
+
+# Maps
+
+
+def test_maps_that_changed_are_named():
+    maps = [make_map("maze_small", index) for index in range(2)]
+    saved = {"maps": checksums(maps)}
+    object.__setattr__(maps[1], "free", maps[1].free[:-1])
+    with pytest.warns(UserWarning, match="^maze_small_1 has changed since"):
+        warn_of_changed_maps(saved, maps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_changed_maps(saved, maps[:1])
+        warn_of_changed_maps({}, maps)

@@ -11,6 +11,7 @@ import torch
 from maexp.agents.actor import make_policy
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checksums import warn_of_changed_maps
 from maexp.agents.commands.run_folder import short
 from maexp.agents.comparison import choose_best, describe_differences
 from maexp.agents.errors import UserError, blame_input
@@ -72,7 +73,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         if policy_names(cfg) and cfg.observation.pictures is None:  # classical planners look at no pictures
             cfg.observation.pictures = False
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
-        policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0])}
+        policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0], maps)}
         policies |= {name: name for name in policy_names(cfg)}
         best = {}
         if cfg.checkpoint is not None:
@@ -91,10 +92,11 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def load_policy(cfg: Any, env: Any) -> Any:
-    """The policy of a checkpoint; its weights fit any team size."""
+def load_policy(cfg: Any, env: Any, maps: list) -> Any:
+    """The policy of a checkpoint, for any team size; says which of the `maps` it will play on have changed since."""
     saved = find_checkpoint(cfg.checkpoint)[1]
     check_action(saved, cfg)
+    warn_of_changed_maps(saved, maps)
     policy = make_policy(env, model_settings(cfg))
     load_matching(policy, saved["policy"])
     return policy

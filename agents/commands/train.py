@@ -79,7 +79,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
     saved = _resumable(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
-    write_config(training.settings, where, "train", overrides)
+    write_config(training.settings, where, "train", overrides, map_checksums=training.checksums)
     print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
           f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}", flush=True)  # fmt: skip
     if cfg.warm_start and saved is None:

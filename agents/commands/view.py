@@ -132,7 +132,7 @@ def find_subject(cfg: Any, where: Path) -> tuple[list[Episode], PointCloudMap | 
         return [], find_map(cfg, place)
     maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
     env = make_env(cfg, maps, cfg.num_robots)
-    policy, name = (cfg.policy, cfg.policy) if cfg.checkpoint is None else (load_policy(cfg, env), "trained")
+    policy, name = (cfg.policy, cfg.policy) if cfg.checkpoint is None else (load_policy(cfg, env, maps), "trained")
     first = cfg.episode or 0
     episodes = play_teams(env, bind(policy, env), name, first=first, seed=cfg.seed)
     (where / EPISODES).mkdir()

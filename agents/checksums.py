@@ -1,0 +1,32 @@
+"""Checksums of maps: a run that goes on or is played on a map that has changed since says so."""
+
+import hashlib
+import warnings
+
+from maexp.envs import PointCloudMap
+
+
+def checksum(world: PointCloudMap) -> str:
+    """Sixteen hexadecimal digits that follow from the points of a map."""
+    digest = hashlib.sha256()
+    for points in (world.free, world.obstacles, world.boundary):
+        digest.update(str(points.shape).encode() + points.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
+    """Name and checksum of every map."""
+    return {one.name: checksum(one) for one in maps}
+
+
+def warn_of_changed_maps(saved: dict, maps: list[PointCloudMap]) -> None:
+    """Say which of `maps` are not what they were when the checkpoint `saved` was written."""
+    before = saved.get("maps", {})
+    changed = [name for name, one in checksums(maps).items() if before.get(name, one) != one]
+    if changed:
+        more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+        verb = "has" if len(changed) == 1 else "have"
+        warnings.warn(
+            f"{', '.join(changed[:3])}{more} {verb} changed since the run was started: its results are of other maps",
+            stacklevel=2,
+        )
