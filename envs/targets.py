@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
 STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
+BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
+LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, are worth less than others
+WAIT = 0.5  # by so much of a disc, where a robot gets to one with more
 SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 
 
@@ -66,6 +69,58 @@ class Scene:
         index = self.block.view(there.shape).expand(values.shape)
         blocks = values.new_zeros((*values.shape[:2], self.nav.num_blocks, *values.shape[3:]))
         return blocks.scatter_add_(2, index, torch.where(there, values, 0.0))
+
+
+def value_targets(scene: Scene) -> torch.Tensor:
+    """What every target is worth to every robot by itself, in radar discs, float32 [E, N, K]; -inf: out of reach.
+
+    Unknown area against the way there (Burgard et al. 2005). Targets with little to see wait for better ones, but not
+    at any price: a far way to a good one costs more.
+    """
+    return _value(scene.gain, scene.travel / scene.nav.radar_range, scene.travel.isfinite())
+
+
+def _value(gain: torch.Tensor, travel: torch.Tensor, some: torch.Tensor) -> torch.Tensor:
+    worth = gain >= LEAST_GAIN
+    waits = ~worth & (worth & some).any(-1, keepdim=True)
+    return torch.where(some, gain - BETA * travel - WAIT * waits, -torch.inf)
+
+
+def plan_in_turn(
+    gain: torch.Tensor, travel: torch.Tensor, some: torch.Tensor, point: torch.Tensor, hears: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Robots choose one after the other, the one with the most to win first; a target taken lowers the gain of others
+    that can be seen from there (Burgard et al. 2005). One round per robot, all envs together.
+
+    Args:
+        gain, travel: float32 [E, N, M], of a candidate: what is to be seen [discs], and the way there [radar ranges].
+        some: bool [E, N, M], which candidates there are.
+        point: float32 [E, N, M, 2], where they are [radar ranges].
+        hears: bool [E, N, N], robots whose choices a robot gets to know.
+
+    Returns:
+        each candidate's value when it is its robot's turn, float32 [E, N, M]; the candidate taken, int64 [E, N] (0 for
+        robots without any); the share of the gain that was claimed before, float32 [E, N, M].
+    """
+    env = torch.arange(len(gain), device=gain.device)
+    taken = torch.zeros(gain.shape[:2], dtype=torch.int64, device=gain.device)
+    score, claimed, left = torch.zeros_like(gain), torch.zeros_like(gain), torch.ones_like(gain)
+    waiting = some.any(-1)
+    fixed = torch.where(some, _value(gain, travel, some), 0.0) - gain
+    for _ in range(gain.shape[1]):
+        value = gain * left + fixed
+        best, index = torch.where(some, value, -torch.inf).max(-1)
+        robot = torch.where(waiting, best, -torch.inf).argmax(1)
+        acts = waiting[env, robot]
+        k = index[env, robot]
+        score[env, robot] = torch.where(acts.unsqueeze(-1), value[env, robot], score[env, robot])
+        claimed[env, robot] = torch.where(acts.unsqueeze(-1), 1.0 - left[env, robot], claimed[env, robot])
+        taken[env, robot] = torch.where(acts, k, taken[env, robot])
+        waiting[env, robot] = False
+        gap = (point - point[env, robot, k].view(-1, 1, 1, 2)).norm(dim=-1)
+        told = (acts.unsqueeze(-1) & hears[env, :, robot]).unsqueeze(-1)
+        left = torch.where(told, left * gap.clamp(max=1.0), left)
+    return score, taken, claimed
 
 
 class TargetTracker:

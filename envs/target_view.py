@@ -1,0 +1,233 @@
+"""What a learned choice among frontier targets sees: for every robot its best candidates, with features that do not
+depend on the map.
+
+Lengths count in radar ranges and areas in radar discs, so that one policy fits every scenario and team size. The
+features of a candidate contain what the classical planner `cost_utility` would think of it: a policy starts from there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, plan_in_turn, value_targets
+
+if TYPE_CHECKING:
+    from maexp.envs.environment import ExplorationEnv
+
+FAR = 4.0  # lengths between targets and robots count up to so many radar ranges
+WAY_AHEAD = 3.0  # cells from a robot to the point that tells where its way begins
+
+FEATURES = (
+    # What cost_utility thinks of it: value when it is the robot's turn, value without the others, whether it takes it,
+    # share of the gain that robots before it have claimed, and how far off [ranges] the nearest other robot goes.
+    "score", "value", "planned", "claimed", "plan_gap",
+    # The way: length [ranges], 1 / (1 + length), straight distance [ranges], way / distance - 1.
+    "travel", "nearness", "distance", "detour",
+    # What is to be seen from there [discs], frontier cells [10], whether it is worth going to at once; gain of the
+    # candidates within 1 and 2.5 ranges of it [1 and 4 discs].
+    "gain", "size", "worth", "gain_near", "gain_around",
+    # Cosine and sine of where it lies, where the way begins and where the unknown beyond it lies, from the heading;
+    # how far the middle of the unknown is from it [ranges].
+    "ahead", "aside", "way_ahead", "way_aside", "unknown_ahead", "unknown_aside", "unknown_far",
+    # The others: least way of one of them [ranges], that less the own way, whether the own is the shortest, distance to
+    # the own last target and to the nearest last target of another [ranges].
+    "rival", "lead", "nearest", "own_last", "mates_last",
+    # Of the robot and its team, the same for all candidates: candidates [10], speed [of the limit], way driven until
+    # the next decision [ranges], time left [of the episode], log(1 + what is known [discs]), others that move [4].
+    "count", "speed", "drive", "time_left", "known", "mates",
+)  # fmt: skip
+"""Names of the last axis of the features, with their units."""
+
+
+class TargetView:
+    """The candidates of every robot of an env: `observe` lists them, `take` drives to some.
+
+    M candidates per robot, those of the highest value first; masked where there are fewer.
+
+    Args:
+        env: only read.
+        count: M.
+
+    Attributes:
+        state: tensors that later decisions depend on, besides those of the tracker.
+    """
+
+    def __init__(self, env: ExplorationEnv, count: int):
+        self.env, self.count, self.tracker = env, count, TargetTracker(env)
+        shape, device = (env.num_envs, env.num_robots), env.device
+        self.state = {
+            "last": torch.zeros((*shape, 2), device=device),  # where each robot's latest target was [m]
+            "has_last": torch.zeros(shape, dtype=torch.bool, device=device),
+            "block": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # the candidates' numbers
+            "cell": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # and grid cells
+            "point": torch.zeros((*shape, count, 2), device=device),  # and where they are [m]
+            "toward": torch.zeros((*shape, count, 2), device=device),  # middle of the unknown, from there [m]
+            "mask": torch.zeros((*shape, count), dtype=torch.bool, device=device),
+        }
+
+    @torch.no_grad()
+    def observe(self) -> dict[str, torch.Tensor]:
+        """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them there are.
+
+        Without any (the robot has collided, or knows no way to a frontier) the first candidate stands for driving
+        anywhere; its features are 0.
+        """
+        s, scene = self.state, self.tracker.look()
+        nav = scene.nav
+        s["has_last"] = s["has_last"] & (nav.state["macro_step"] != 0).unsqueeze(-1)
+        value = value_targets(scene)
+        block = _best(value, self.count)
+        some = (scene.travel.isfinite() & scene.alive.unsqueeze(-1)).gather(2, block)
+        some[..., value.shape[-1] :] = False
+        s["block"], s["mask"] = block, some
+        s["cell"] = scene.spread(nav.target).gather(2, block)
+        s["point"], s["toward"] = _pick(scene.points, block), _pick(scene.middle, block)
+        columns = self._columns(scene, block, some)
+        features = torch.stack([columns[name].expand(block.shape) for name in FEATURES], -1)
+        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": some.clone()}
+
+    def take(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Send every robot to a candidate, int64 [E, N]; region int64 [E, N] and offset float32 [E, N, 2] of the goals.
+
+        Raises:
+            ValueError: an index that is none.
+        """
+        if bool(((index < 0) | (index >= self.count)).any()):
+            raise ValueError(f"action target={int(index.min())}..{int(index.max())}: give 0 to {self.count - 1}")
+        s, index = self.state, index.unsqueeze(-1)
+        found = s["mask"].gather(2, index).squeeze(-1)
+        s["has_last"], s["last"] = found, _pick(s["point"], index).squeeze(2)
+        chosen = torch.where(found, s["block"].gather(2, index).squeeze(-1), -1)
+        cell = s["cell"].gather(2, index).squeeze(-1)
+        return self.tracker.take(chosen, cell, _pick(s["toward"], index).squeeze(2))
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Everything that later decisions depend on, copied."""
+        parts = (("target_view", self.state), ("target", self.tracker.state))
+        return {f"{prefix}_{name}": value.clone() for prefix, part in parts for name, value in part.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on where `state_dict` was taken."""
+        for prefix, part in (("target_view", self.state), ("target", self.tracker.state)):
+            for name in part:
+                part[name] = state[f"{prefix}_{name}"].to(part[name].device).clone()
+
+    def _columns(self, scene: Scene, block: torch.Tensor, some: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Every feature by name, shapes that expand to [E, N, M]."""
+        travel = torch.where(some, scene.travel.gather(2, block), 0.0) / scene.nav.radar_range
+        near = _Near(self, scene, block, some, travel)
+        return near.plan() | near.way() | near.worth() | near.bearings() | near.others() | near.team()
+
+
+class _Near:
+    """The features of the candidates of one moment, group by group."""
+
+    def __init__(self, view: TargetView, scene: Scene, block: torch.Tensor, some: torch.Tensor, travel: torch.Tensor):
+        self.view, self.scene, self.block, self.some, self.travel = view, scene, block, some, travel
+        nav = scene.nav
+        self.nav, self.reach = nav, nav.radar_range
+        self.point = view.state["point"]
+        self.to = self.point - nav.centers().unsqueeze(2)
+        self.distance = self.to.norm(dim=-1) / self.reach
+        self.gain = scene.gain.gather(2, block)
+        robots = block.shape[1]
+        own = torch.eye(robots, dtype=torch.bool, device=block.device)
+        self.own = own.view(1, robots, 1, robots)
+        self.mate = (nav.state["comm"] & ~own).unsqueeze(2)  # [E, N, 1, N]: robots that this one hears
+
+    def plan(self) -> dict[str, torch.Tensor]:
+        """What the classical planner would do, each robot hearing only those it hears."""
+        scene, block = self.scene, self.block
+        some = self.some
+        hears = self.nav.state["comm"]
+        score, taken, claimed = plan_in_turn(self.gain, self.travel, some, self.point / self.reach, hears)
+        where = _pick(self.point, taken.unsqueeze(-1)).squeeze(2)
+        counts = self.mate & some.any(-1).view(len(block), 1, 1, -1)
+        return {
+            "score": score,
+            "value": value_targets(scene).gather(2, block).clamp_min(-FAR),
+            "planned": torch.zeros_like(score).scatter_(2, taken.unsqueeze(-1), 1.0),
+            "claimed": claimed,
+            "plan_gap": self._nearest_of(where, counts),
+        }
+
+    def way(self) -> dict[str, torch.Tensor]:
+        return {
+            "travel": self.travel,
+            "nearness": 1.0 / (1.0 + self.travel),
+            "distance": self.distance,
+            "detour": (self.travel / self.distance.clamp_min(0.1)).clamp(max=FAR) - 1.0,
+        }
+
+    def worth(self) -> dict[str, torch.Tensor]:
+        gain = torch.where(self.some, self.gain, 0.0).unsqueeze(2)
+        gap = (self.point.unsqueeze(3) - self.point.unsqueeze(2)).norm(dim=-1) / self.reach
+        return {
+            "gain": self.gain,
+            "size": self.scene.size.gather(2, self.block) / 10.0,
+            "worth": (self.gain >= LEAST_GAIN).float(),
+            "gain_near": ((gap < 1.0) * gain).sum(-1),
+            "gain_around": ((gap < 2.5) * gain).sum(-1) / 4.0,
+        }
+
+    def bearings(self) -> dict[str, torch.Tensor]:
+        heading = self.nav.state["pose"][..., 3]
+        ahead = torch.stack((heading.cos(), heading.sin()), -1).unsqueeze(2)
+        wanted = torch.where(self.some, self.view.state["cell"], -1)
+        way = self.nav.points_on_way(wanted, WAY_AHEAD) - self.nav.centers().unsqueeze(2)
+        toward = self.view.state["toward"]
+        columns = {"unknown_far": toward.norm(dim=-1) / self.reach}
+        for name, vector in (("", self.to), ("way_", way), ("unknown_", toward)):
+            unit = vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+            columns[f"{name}ahead"] = (unit * ahead).sum(-1)
+            columns[f"{name}aside"] = unit[..., 1] * ahead[..., 0] - unit[..., 0] * ahead[..., 1]
+        return columns
+
+    def others(self) -> dict[str, torch.Tensor]:
+        scene, s = self.scene, self.view.state
+        envs, robots, count = self.block.shape
+        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.travel() / self.reach, torch.inf)
+        theirs = ways.unsqueeze(1).expand(-1, robots, -1, -1)
+        theirs = theirs.gather(3, self.block.unsqueeze(2).expand(-1, -1, robots, -1)).transpose(2, 3)
+        rival = theirs.masked_fill(~self.mate, torch.inf).amin(-1)
+        last = s["has_last"].view(envs, 1, 1, robots)
+        return {
+            "rival": rival.clamp(max=2 * FAR),
+            "lead": (rival - self.travel).clamp(-FAR, FAR),
+            "nearest": (self.travel <= rival).float(),
+            "own_last": self._nearest_of(s["last"], self.own & last),
+            "mates_last": self._nearest_of(s["last"], self.mate & last),
+        }
+
+    def team(self) -> dict[str, torch.Tensor]:
+        nav, env, tracker = self.nav, self.view.env, self.view.tracker
+        speed, limit = tracker.speed(), env.simulation.robot_tensors["max_speed"]
+        cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
+        columns = {
+            "count": self.some.sum(-1) / 10.0,
+            "speed": speed / limit,
+            "drive": tracker.drive(speed) / self.reach,
+            "time_left": (1.0 - nav.state["macro_step"].float() / env.macro_steps).unsqueeze(-1),
+            "known": (1.0 + cells / (math.pi * self.reach**2)).log(),
+            "mates": (self.mate.squeeze(2) & self.scene.alive.unsqueeze(1)).sum(-1) / 4.0,
+        }
+        return {name: value.unsqueeze(-1).float() for name, value in columns.items()}
+
+    def _nearest_of(self, where: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
+        """Distance [ranges], at most `FAR`, from every candidate to the nearest of ``where`` [E, N, 2] that counts."""
+        gap = (self.point.unsqueeze(3) - where.view(len(where), 1, 1, -1, 2)).norm(dim=-1) / self.reach
+        return gap.masked_fill(~counts, FAR).amin(-1).clamp(max=FAR)
+
+
+def _best(value: torch.Tensor, count: int) -> torch.Tensor:
+    """Numbers of the `count` highest values of each robot, int64 [E, N, count]; 0 where there are no more."""
+    block = value.topk(min(count, value.shape[-1]), dim=-1).indices
+    return torch.nn.functional.pad(block, (0, count - block.shape[-1]))
+
+
+def _pick(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Entries [E, N, M, 2] of [E, N, K, 2]."""
+    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))
