@@ -74,13 +74,16 @@ class RewardConfig:
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """What the picture of a robot shows: what it has ``seen`` itself, or what it ``known`` through communication.
+    """What a robot sees.
 
-    Without ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost.
+    ``map`` is what its picture shows: what it has ``seen`` itself, or ``known`` through communication. Without
+    ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost. ``targets`` is
+    how many frontier targets it is shown to choose from, 0 for none (`maexp.envs.target_view`).
     """
 
     map: Literal["seen", "known"] = "seen"
     pictures: bool = True
+    targets: int = 0
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class CommConfig:
         return self.line_of_sight or math.isfinite(self.range)
 
 
+MOST_TARGETS = 256  # that a robot is shown
 WAVEFRONT_CLEARANCE = 2.0  # clearance factor of the wavefront planner (measured in docs/planners.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
 
@@ -157,6 +161,18 @@ def check_reward(config: RewardConfig) -> RewardConfig:
         if f.name not in ("time_on", "charge_rest") and not number:
             raise ValueError(f"reward.{f.name}={value!r} must be a finite number, 0 or more")
     return config
+
+
+def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None:
+    """The settings must be known, and targets need a planner that drives to goals."""
+    _check_choice("observation.map", config.map, ("seen", "known"))
+    if not isinstance(config.pictures, bool):
+        raise ValueError(f"observation.pictures={config.pictures!r} must be true or false")
+    count = config.targets
+    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_TARGETS:
+        raise ValueError(f"observation.targets={count!r} must be a whole number from 0 to {MOST_TARGETS}")
+    if count and planner.name == "direct":
+        raise ValueError(f"observation.targets={count} needs planner=wavefront or dwa: direct drives to no goals")
 
 
 def check_comm(config: CommConfig) -> CommConfig:

@@ -18,6 +18,7 @@ from maexp.envs.config import (
     RewardConfig,
     RobotConfig,
     check_comm,
+    check_observation,
     check_reward,
     complete_planner,
     complete_radar,
@@ -30,6 +31,7 @@ from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
 from maexp.envs.starts import STARTS, check_room, check_starts, fixed_starts
+from maexp.envs.target_view import TargetView
 from maexp.kernels import unpack_flags
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
@@ -128,10 +130,7 @@ class ExplorationEnv(EnvBase):
         self.planner_config = complete_planner(one_config("planner", planner, PlannerConfig), scenario)
         self.reward_config = check_reward(one_config("reward", reward, RewardConfig))
         self.observation_config = one_config("observation", observation, ObservationConfig)
-        if self.observation_config.map not in ("seen", "known"):
-            raise ValueError(f"observation.map={self.observation_config.map!r} is unknown: choose seen or known")
-        if not isinstance(self.observation_config.pictures, bool):
-            raise ValueError(f"observation.pictures={self.observation_config.pictures!r} must be true or false")
+        check_observation(self.observation_config, self.planner_config)
         self.comm_config = check_comm(one_config("comm", comm, CommConfig))
         for m in maps:
             check_room(m, [r.collision_threshold for r in self.robot_configs])
@@ -148,9 +147,11 @@ class ExplorationEnv(EnvBase):
             self.set_starts(starts)
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
+        targets = self.observation_config.targets
+        self.target_view = TargetView(self, targets) if targets else None
         direct = self.planner_config.name == "direct"
         self.observation_spec = observation_spec(
-            num_envs, num_robots, self.device, self.observation_config.pictures
+            num_envs, num_robots, self.device, self.observation_config.pictures, targets
         )
         self.action_spec = action_spec(num_envs, num_robots, direct, self.device)
         self.reward_spec = reward_spec(num_envs, num_robots, self.device)
@@ -207,8 +208,19 @@ class ExplorationEnv(EnvBase):
             state["error"] |= bad.to(torch.int32) * int(ERROR_ACTION)
             state["command"].copy_(torch.nan_to_num(control))
         else:
-            state["region"].copy_(action["region"])
-            state["offset"].copy_(action["offset"])
+            region, offset = self._find_goals(action)
+            state["region"].copy_(region)
+            state["offset"].copy_(offset)
+
+    def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
+        """Region and offset of the action, or of the targets that it names instead."""
+        if "target" not in action.keys():
+            if self.target_view is not None:
+                self.target_view.forget()
+            return action["region"], action["offset"]
+        if self.target_view is None:
+            raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
+        return self.target_view.take(action["target"])
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors
@@ -235,6 +247,9 @@ class ExplorationEnv(EnvBase):
             "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
             "alive": state["collided"] == 0,
         } | ({"map": picture} if pictures else {})  # fmt: skip
+        if self.target_view is not None:
+            seen = self.target_view.observe()
+            observation |= {"targets": seen["features"], "targets_mask": seen["mask"]}
         agents = TensorDict(
             {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},
             batch_size=[e, n], device=self.device,
@@ -320,14 +335,17 @@ class ExplorationEnv(EnvBase):
 
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""
-        return {name: self.simulation.tensors[name].clone() for name in STATE}
+        state = {name: self.simulation.tensors[name].clone() for name in STATE}
+        return state | ({} if self.target_view is None else self.target_view.state_dict())
 
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
         earlier = {name: torch.full_like(own[name], value) for name, value in LATER.items()}
         state_dict = earlier | dict(state_dict)
-        wrong = [n for n in STATE if n not in state_dict or state_dict[n].shape != own[n].shape]
+        wanted = {name: own[name] for name in STATE}
+        wanted |= {} if self.target_view is None else self.target_view.state_dict()
+        wrong = [n for n, one in wanted.items() if n not in state_dict or state_dict[n].shape != one.shape]
         if wrong:
             raise ValueError(
                 f"the saved simulator state does not fit this env ({', '.join(wrong[:3])}): "
@@ -336,6 +354,8 @@ class ExplorationEnv(EnvBase):
         for name in STATE:
             own[name].copy_(state_dict[name])
         self._fix_starts()
+        if self.target_view is not None:
+            self.target_view.load_state_dict(state_dict)
 
     # Looking in
 

@@ -3,6 +3,7 @@
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
+from maexp.envs.target_view import FEATURES
 from maexp.kernels.types import PIXELS, REGIONS
 
 INFO_ENV = {
@@ -32,8 +33,10 @@ INFO_ROBOT = {
 """Entries of ``info`` of shape [E, N]; ``episode_reward_raw`` is the sum of terms before scaling by w and v."""
 
 
-def observation_spec(envs: int, robots: int, device: torch.device, pictures: bool = True) -> Composite:
-    """Observation of every robot, the team's map, and info."""
+def observation_spec(
+    envs: int, robots: int, device: torch.device, pictures: bool = True, targets: int = 0
+) -> Composite:
+    """Observation of every robot, with so many frontier targets to choose from, the team's map, and info."""
     pixels, regions = int(PIXELS), int(REGIONS)
 
     def picture(*shape):
@@ -55,6 +58,10 @@ def observation_spec(envs: int, robots: int, device: torch.device, pictures: boo
         shape=(envs, robots),
         device=device,
     )
+    if targets:
+        observation["targets"] = real(envs, robots, targets, len(FEATURES))
+        mask = (envs, robots, targets)
+        observation["targets_mask"] = Binary(targets, shape=mask, dtype=torch.bool, device=device)
     info = {name: _value((envs, 1), dtype, device) for name, dtype in INFO_ENV.items()}
     info |= {name: _value((envs, robots), dtype, device) for name, dtype in INFO_ROBOT.items()}
     return Composite(

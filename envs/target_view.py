@@ -104,6 +104,11 @@ class TargetView:
         cell = s["cell"].gather(2, index).squeeze(-1)
         return self.tracker.take(chosen, cell, _pick(s["toward"], index).squeeze(2))
 
+    def forget(self) -> None:
+        """Another policy acts: nobody knows which targets its robots go to."""
+        self.state["has_last"] = torch.zeros_like(self.state["has_last"])
+        self.tracker.state["chosen"] = torch.full_like(self.tracker.state["chosen"], -1)
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Everything that later decisions depend on, copied."""
         parts = (("target_view", self.state), ("target", self.tracker.state))
