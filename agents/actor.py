@@ -10,6 +10,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from maexp.agents.distributions import ACTION, Heads, RegionHeads
 from maexp.agents.model import ModelConfig, model_config
 from maexp.agents.networks import TargetGenerator
+from maexp.agents.target_networks import TargetChooser
 
 MAP = ("agents", "observation", "map")
 POSE = ("agents", "observation", "pose")
@@ -17,8 +18,12 @@ GRID = ("agents", "observation", "grid")
 COMM = ("agents", "observation", "comm")
 TIME_LEFT = ("agents", "observation", "time_left")
 ALIVE = ("agents", "observation", "alive")
+TARGETS = ("agents", "observation", "targets")
+TARGETS_MASK = ("agents", "observation", "targets_mask")
+COVERAGE = ("info", "coverage")
 PARAMS = ("agents", "params")
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
+TARGET_HEADS = {"target": distributions.Categorical}
 CONTROL_HEADS = {"control": IndependentNormal}
 PARAM_NAMES = {distributions.Categorical: ("logits",), IndependentNormal: ("loc", "scale")}
 
@@ -40,6 +45,8 @@ class ObservationShape:
 
 def observation_keys(config: ModelConfig) -> list[tuple[str, ...]]:
     """What policy and critics read, in the order of their networks' arguments."""
+    if config.action == "targets":
+        return [TARGETS, TARGETS_MASK, COMM]
     return [MAP, POSE, GRID, COMM, *([TIME_LEFT, ALIVE] if config.sees_time else [])]
 
 
@@ -51,6 +58,8 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
     """
     spec = env.observation_spec
     missing = [key for key in observation_keys(config) if key not in spec.keys(True, True)]
+    if TARGETS in missing:
+        raise ValueError("A policy that chooses among targets must see some: set observation.targets to how many.")
     if missing:
         raise ValueError(
             f"The environment's observation lacks {missing}; give the keys of ExplorationEnv "
@@ -63,19 +72,28 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
 
 
 class ActionParams(nn.Module):
-    """Puts what the target generator returns under the names that the distributions expect.
+    """Puts what a network returns under the names that the distributions expect.
 
     One tensordict rather than one key each: else the actor would count ("agents", "params") as its input.
     """
 
-    def __init__(self, network: TargetGenerator, heads: dict[str, type]):
+    def __init__(self, network: nn.Module, heads: dict[str, type]):
         super().__init__()
         self.network = network
         self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor) -> TensorDict:
-        values = self.network(picture, pose, grid, comm, *state)
-        return TensorDict(dict(zip(self.names, values, strict=True)), batch_size=comm.shape[:-2])
+    def forward(self, *observation: Tensor) -> TensorDict:
+        values = self.network(*observation)
+        lead = observation[0].shape[: values[0].ndim - 2]
+        return TensorDict(dict(zip(self.names, values, strict=True)), batch_size=lead)
+
+
+def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Module, dict[str, type]]:
+    """The network of a policy, and the heads of its action."""
+    if config.action == "targets":
+        return TargetChooser(config), TARGET_HEADS
+    heads = REGION_HEADS if shape.regions else CONTROL_HEADS
+    return TargetGenerator(config, shape.channels, shape.side, shape.regions), heads
 
 
 def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
@@ -91,9 +109,8 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
     """
     config = model_config(model)
     shape = observation_shape(env, config)
-    network = TargetGenerator(config, shape.channels, shape.side, shape.regions)
-    heads = REGION_HEADS if shape.regions else CONTROL_HEADS
-    joint = shape.regions and config.offsets == "per_region"
+    network, heads = build_network(config, shape)
+    joint = heads is REGION_HEADS and config.offsets == "per_region"
     module = TensorDictModule(ActionParams(network, heads), in_keys=observation_keys(config), out_keys=[PARAMS])
     actor = ProbabilisticActor(
         module,

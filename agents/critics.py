@@ -8,10 +8,20 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from maexp.agents.actor import observation_keys, observation_shape
+from maexp.agents.actor import (
+    ALIVE,
+    COMM,
+    COVERAGE,
+    TARGETS,
+    TARGETS_MASK,
+    TIME_LEFT,
+    observation_keys,
+    observation_shape,
+)
 from maexp.agents.encoder import CellEncoder, add_state
 from maexp.agents.mixers import make_mixer
 from maexp.agents.model import ModelConfig, model_config
+from maexp.agents.target_networks import TargetReader
 
 VALUE = ("agents", "state_value")
 TEAM_VALUE = ("team", "state_value")
@@ -26,7 +36,12 @@ class RobotEncoder(nn.Module):
         channels: channels of the picture
         side: regions along one axis
         team: look at all robots' pictures (merged) instead of the own one alone
+
+    Attributes:
+        first_rank: dimensions of its first input from the robots on
     """
+
+    first_rank = 4
 
     def __init__(self, config: ModelConfig, channels: int, side: int, team: bool):
         super().__init__()
@@ -38,8 +53,9 @@ class RobotEncoder(nn.Module):
         )
         self.wide = nn.Sequential(nn.Linear(config.width * ((side + 1) // 2) ** 2, config.critic_hidden), nn.ReLU())
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
-        """Batch of teams [batch, robots, ...] to [batch, robots, critic_hidden]."""
+    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor) -> Tensor:
+        """Batch of teams [batch, robots, ...] to [batch, robots, critic_hidden]; `state` as in `add_state`."""
+        pose = add_state(pose, *state)
         heard = torch.full_like(comm, self.team)
         cells = self.cells(picture, pose, grid, heard).transpose(-1, -2).unflatten(-1, (self.side, self.side))
         return self.wide(self.narrow(cells.flatten(0, 1))).unflatten(0, comm.shape[:2])
@@ -50,16 +66,15 @@ class Critic(nn.Module):
 
     Args:
         config: sizes
-        channels: channels of the picture
-        side: regions along one axis
+        encoder: observations of a team [batch, robots, ...] to [batch, robots, critic_hidden]
         kind: local, team or mixed
         mixer: vdn or qmix, for mixed
     """
 
-    def __init__(self, config: ModelConfig, channels: int, side: int, kind: str, mixer: str = "qmix"):
+    def __init__(self, config: ModelConfig, encoder: nn.Module, kind: str, mixer: str = "qmix"):
         super().__init__()
         self.team = kind == "team"
-        self.encoder = RobotEncoder(config, channels, side, self.team)
+        self.encoder = encoder
         hidden = config.critic_hidden
         inputs = 3 * hidden if self.team else hidden
         self.value = nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, 1))
@@ -70,10 +85,10 @@ class Critic(nn.Module):
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
 
-    def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor):
-        """Shapes as in TargetGenerator.forward."""
-        lead, pose = comm.shape[:-2], add_state(pose, *state)
-        parts = (value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid, comm))
+    def forward(self, *observation: Tensor):
+        """What the encoder reads, with any leading shape [*, robots, ...]."""
+        lead = observation[0].shape[: -self.encoder.first_rank]
+        parts = (value.reshape(-1, *value.shape[len(lead) :]) for value in observation)
         features = robots = self.encoder(*parts)
         if self.team:
             around = torch.cat((robots.mean(1, keepdim=True), robots.amax(1, keepdim=True)), dim=-1)
@@ -108,9 +123,14 @@ def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: st
     """
     if kind not in KINDS:
         raise ValueError(f"critic kind {kind!r} is unknown; choose one of {', '.join(KINDS)}.")
-    config = model_config(model)
+    config, team = model_config(model), kind == "team"
     shape = observation_shape(env, config)
-    network = Critic(config, shape.channels, shape.side, kind, mixer)
+    if config.action == "targets":
+        encoder, inputs = TargetReader(config, team), [TARGETS, TARGETS_MASK, COMM, TIME_LEFT, ALIVE]
+        inputs += [COVERAGE] * team
+    else:
+        encoder, inputs = RobotEncoder(config, shape.channels, shape.side, team), observation_keys(config)
+    network = Critic(config, encoder, kind, mixer)
     keys = [VALUE, TEAM_VALUE] if kind == "mixed" else [VALUE]
-    critic = TensorDictModule(network, in_keys=observation_keys(config), out_keys=keys)
+    critic = TensorDictModule(network, in_keys=inputs, out_keys=keys)
     return critic.to(env.device) if env.device is not None else critic

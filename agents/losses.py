@@ -129,7 +129,10 @@ class RobotValues:
 
     def setup(self, gamma: float, lmbda: float, finite_horizon: bool) -> None:
         """Name the keys and build the estimators; the bare one is told the values instead of the network."""
+        heads = list(self.actor_network.dist_sample_keys)  # lists, of one head too: TorchRL then selects by key
         self.set_keys(
+            action=heads,
+            sample_log_prob=list(self.actor_network.log_prob_keys),
             advantage=ADVANTAGE,
             value_target=TEAM_TARGET if self.team_value else TARGET,
             value=TEAM_VALUE if self.team_value else VALUE,

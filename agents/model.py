@@ -2,14 +2,20 @@
 
 from dataclasses import dataclass
 
-from maexp.agents.settings.ranges import check_ranges, choice, flag, whole
+from maexp.agents.settings.ranges import check_ranges, choice, flag, number, whole
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Sizes shared by the policy and the critics.
+    """What a policy chooses, and the sizes that it shares with the critics.
 
     Attributes:
+        action: what a robot chooses: a region of the map and an offset, or one of its frontier "targets" (the env shows
+            them with observation.targets). Those of `target_...` and `score_weight` belong to the latter, the
+            other sizes but `critic_hidden` to regions.
+        target_width: features per target.
+        target_heads: attention heads; must divide `target_width`.
+        score_weight: of the classical planner's value of a target in its logit, where one radar disc is 1.
         stem: how the picture becomes small. "pool" averages blocks of 4 x 4 pixels (no weights, fast on a
             CPU); "conv" learns two strided convolutions on the full picture, as in the paper.
         channels: feature maps of the convolutions.
@@ -25,6 +31,10 @@ class ModelConfig:
         critic_hidden: width of the critic's hidden layers.
     """
 
+    action: str = choice("regions", "targets")
+    target_width: int = whole(48, most=4096)
+    target_heads: int = whole(2, most=64)
+    score_weight: float = number(50.0)
     stem: str = choice("pool", "conv")
     channels: int = whole(16, most=4096)
     grid_features: int = whole(16, most=4096)
@@ -43,6 +53,12 @@ class ModelConfig:
                 f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; choose a divisor."
             )
 
+        if self.target_width % self.target_heads:
+            raise ValueError(
+                f"model.target_heads={self.target_heads} does not divide model.target_width={self.target_width}; "
+                "choose a divisor."
+            )
+
     @property
     def width(self) -> int:
         """Features per cell (D in the paper)."""
@@ -51,6 +67,7 @@ class ModelConfig:
 
 PRESETS = {
     "small": ModelConfig(),
+    "targets": ModelConfig(action="targets"),
     "paper": ModelConfig(
         stem="conv",
         channels=32,

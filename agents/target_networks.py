@@ -1,0 +1,123 @@
+"""Choice among frontier targets: networks over the candidates of every robot (`maexp.envs.target_view`).
+
+Candidates of one robot attend to each other, then robots in contact to each other, so that one set of weights serves
+any number of candidates and any team. What the classical planner thinks of a candidate goes straight into its logit: an
+untrained policy makes that planner's choices, and learns where to differ.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from maexp.agents.model import ModelConfig
+from maexp.agents.networks import contact_bias
+from maexp.envs.target_view import FEATURES
+
+SCORE = FEATURES.index("score")
+OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
+NEVER = -1e9  # logit of what cannot be chosen
+COUNT = 10.0  # candidates that sums are measured in
+
+
+class Attention(nn.Module):
+    """Residual self-attention over a set: [batch, members, width], with `bias` added to the scores."""
+
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.LayerNorm(width)
+        self.project = nn.Linear(width, 3 * width)
+        self.out = nn.Linear(width, width)
+
+    def forward(self, members: Tensor, bias: Tensor) -> Tensor:
+        """`bias` [batch, members or 1, members] is 0 where a member is looked at and -inf elsewhere."""
+        query, key, value = self.project(self.norm(members)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias.unsqueeze(1))
+        return members + self.out(mixed.transpose(1, 2).flatten(-2))
+
+
+class TargetEncoder(nn.Module):
+    """Every candidate as a vector that knows of the robot's other candidates and of the robots in contact."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        width, heads = config.target_width, config.target_heads
+        self.inputs = nn.Sequential(nn.Linear(len(FEATURES), width), nn.ReLU(), nn.Linear(width, width))
+        self.among_targets = Attention(width, heads)
+        self.among_robots = Attention(width, heads)
+        self.merge = nn.Sequential(nn.LayerNorm(2 * width), nn.Linear(2 * width, width), nn.ReLU())
+
+    def forward(self, features: Tensor, some: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
+        """Vectors of the candidates [batch, robots, M, width] and of the robots [batch, robots, width].
+
+        Args:
+            features: shape [batch, robots, M, F]
+            some: which candidates there are, bool [batch, robots, M]; the first where there is none
+            comm: who hears whom, bool [batch, robots, robots]
+        """
+        team, flat = features.shape[:2], some.flatten(0, 1)
+        hidden = torch.zeros(flat.shape, device=flat.device).masked_fill(~flat, -torch.inf).unsqueeze(1)
+        targets = self.among_targets(self.inputs(features).flatten(0, 1), hidden)
+        weight = flat.unsqueeze(-1).to(targets.dtype)
+        mean = ((targets * weight).sum(1) / weight.sum(1)).unflatten(0, team)
+        robots = self.among_robots(mean, contact_bias(comm))
+        targets = targets.unflatten(0, team)
+        return self.merge(torch.cat((targets, robots.unsqueeze(2).expand_as(targets)), dim=-1)), robots
+
+
+class TargetChooser(nn.Module):
+    """Observations of a team to the logits of every robot's candidates, for any leading shape [*, robots]."""
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.score_weight = config.score_weight
+        self.encoder = TargetEncoder(config)
+        self.head = nn.Linear(config.target_width, 1)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
+
+    def forward(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor]:
+        """Logits [*, robots, M] of (features [*, robots, M, F], mask [*, robots, M], comm [*, robots, robots])."""
+        lead = comm.shape[:-2]
+        features, mask, comm = (part.reshape(-1, *part.shape[len(lead) :]) for part in (features, mask, comm))
+        some = first_if_none(mask)
+        targets, _ = self.encoder(features, some, comm)
+        logits = self.score_weight * features[..., SCORE] + OUTPUT_GAIN * self.head(targets).squeeze(-1)
+        return (logits.masked_fill(~some, NEVER).reshape(*lead, *mask.shape[1:]),)
+
+
+class TargetReader(nn.Module):
+    """Each robot's candidates as one vector, for critics: [batch, robots, critic_hidden].
+
+    Args:
+        config: sizes
+        team: look at the candidates of all robots, whoever hears whom, and at the coverage
+
+    Attributes:
+        first_rank: dimensions of its first input from the robots on
+    """
+
+    first_rank = 3
+
+    def __init__(self, config: ModelConfig, team: bool):
+        super().__init__()
+        self.team = team
+        self.encoder = TargetEncoder(config)
+        extra = 2 + team
+        self.wide = nn.Sequential(nn.Linear(2 * config.target_width + extra, config.critic_hidden), nn.ReLU())
+
+    def forward(self, features: Tensor, mask: Tensor, comm: Tensor, *state: Tensor) -> Tensor:
+        """`state`: time_left [batch, robots, 1], alive [batch, robots], and for `team` coverage [batch, 1]."""
+        some = first_if_none(mask)
+        targets, robots = self.encoder(features, some, comm | self.team)
+        total = (targets * mask.unsqueeze(-1)).sum(2) / COUNT
+        time_left, alive, *coverage = state
+        parts = [total, robots, time_left, alive.unsqueeze(-1).to(total.dtype)]
+        parts += [one.unsqueeze(1).expand(-1, total.shape[1], -1) for one in coverage]
+        return self.wide(torch.cat(parts, dim=-1))
+
+
+def first_if_none(mask: Tensor) -> Tensor:
+    """`mask` [*, M], with the first entry where there is none: it stands for driving anywhere."""
+    first = torch.arange(mask.shape[-1], device=mask.device) == 0
+    return mask | (first & ~mask.any(-1, keepdim=True))
