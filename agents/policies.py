@@ -19,14 +19,11 @@ from tensordict.nn import TensorDictModule
 
 from maexp.envs import ExplorationEnv
 from maexp.envs.nav_grid import build_nav_grid, open_cells
-from maexp.envs.targets import Scene, TargetTracker, keyed_uniform
+from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, keyed_uniform, plan_in_turn, value_targets
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 
 REGION_COUNT = 64
-BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
-LEAST_TRUE_GAIN = 0.1  # the same of what is truly to be seen
 RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
@@ -35,35 +32,12 @@ REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pul
 
 def choose_nearest(scene: Scene) -> torch.Tensor:
     """Each robot its nearest target (Yamauchi 1997)."""
-    return scene.travel.argmin(-1)
-
-
-def choose_in_turn(scene: Scene, gain: torch.Tensor, cost: torch.Tensor) -> torch.Tensor:
-    """Pairs in order of gain - cost; a target taken lowers the gain of others that can be seen from there.
-
-    One round per robot: it depends on the rounds before, all envs take it together (Burgard et al. 2005). Robots
-    without a way to any target (those that have collided) are left over, and get target 0.
-    """
-    robots = scene.travel.shape[1]
-    chosen = torch.zeros_like(scene.travel[..., 0], dtype=torch.long)
-    waiting = torch.ones_like(scene.alive)
-    env = torch.arange(len(chosen), device=chosen.device)
-    for _ in range(robots):
-        value = torch.where(waiting.unsqueeze(-1), gain - cost, -torch.inf)
-        most, best = value.flatten(1).max(1)
-        robot, target = best // value.shape[2], best % value.shape[2]
-        some = most > -torch.inf  # else only those are left, and `robot` is any
-        chosen[env, robot] = torch.where(some, target, chosen[env, robot])
-        waiting[env, robot] &= ~some
-        here = scene.points[env, robot, target]
-        far = (scene.points - here.view(-1, 1, 1, 2)).norm(dim=-1) / scene.nav.radar_range
-        gain = gain * far.clamp(max=1.0)
-    return chosen
+    return _prefer(scene).travel.argmin(-1)
 
 
 def choose_by_utility(scene: Scene) -> torch.Tensor:
-    """Unknown area around the target against the way there."""
-    return choose_in_turn(scene, scene.gain, BETA * scene.travel / scene.nav.radar_range)
+    """Unknown area around the target against the way there; a target taken lowers what others near it offer."""
+    return _choose_in_turn(scene, scene.gain, value_targets(scene))
 
 
 def choose_by_tree(scene: Scene) -> torch.Tensor:
@@ -74,12 +48,19 @@ def choose_by_tree(scene: Scene) -> torch.Tensor:
     found = found | ~found.any(-1, keepdim=True)  # no tree of the team found any: all frontiers count
     near = (scene.points - nav.centers().unsqueeze(2)).norm(dim=-1) <= nav.radar_range
     gain = scene.gain * torch.where(near, RRT_HYSTERESIS, 1.0)
-    cost = torch.where(found, BETA * scene.travel / nav.radar_range, torch.inf)
-    return choose_in_turn(scene, gain, cost)
+    value = value_targets(scene) + gain - scene.gain
+    return _choose_in_turn(scene, gain, torch.where(found, value, -torch.inf))
+
+
+def _choose_in_turn(scene: Scene, gain: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    """`plan_in_turn` of a team in which everyone knows what the others choose."""
+    hears = torch.ones((*scene.alive.shape, scene.alive.shape[1]), dtype=torch.bool, device=gain.device)
+    return plan_in_turn(gain, value, scene.points / scene.nav.radar_range, hears)[1]
 
 
 def choose_by_area(scene: Scene) -> torch.Tensor:
     """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
+    scene = _prefer(scene)
     travel = torch.where(scene.alive.unsqueeze(-1), scene.travel, torch.inf)
     own = travel.argmin(1, keepdim=True) == torch.arange(travel.shape[1], device=travel.device).view(1, -1, 1)
     mine = torch.where(own, travel, torch.inf)
@@ -89,6 +70,7 @@ def choose_by_area(scene: Scene) -> torch.Tensor:
 
 def choose_by_assignment(scene: Scene) -> torch.Tensor:
     """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
+    scene = _prefer(scene)
     finite = scene.travel.isfinite()
     scale = 100.0 / scene.nav.cell_of_env().view(-1, 1, 1)  # hundredths of a cell
     cost = torch.where(finite, (scene.travel * scale).clamp(max=FORBIDDEN - 1), FORBIDDEN).to(torch.int32)
@@ -101,7 +83,7 @@ def choose_by_force(scene: Scene) -> torch.Tensor:
 
     As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
     """
-    nav = scene.nav
+    scene, nav = _prefer(scene), scene.nav
     at = nav.centers()
     ways = nav.points_on_way(scene.cells(), 3.0) - at.unsqueeze(2)
     ways = ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-6)
@@ -124,8 +106,6 @@ class FrontierPlanner:
         choose: `Scene` -> int64 [E, N], the target of each robot.
     """
 
-    least_gain = LEAST_GAIN
-
     def __init__(self, env: ExplorationEnv, choose: Callable[[Scene], torch.Tensor]):
         self.choose, self.tracker = choose, TargetTracker(env)
 
@@ -137,7 +117,6 @@ class FrontierPlanner:
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
         scene = self.look()
-        scene = replace(scene, travel=_prefer(scene.travel, scene.gain >= self.least_gain))
         chosen = self.choose(scene).unsqueeze(-1)
         found = scene.travel.gather(2, chosen).isfinite()
         cell, block = scene.cells().gather(2, chosen), scene.block.gather(2, chosen)
@@ -147,8 +126,6 @@ class FrontierPlanner:
 
 class OraclePlanner(FrontierPlanner):
     """`cost_utility` that is told how much of the true map each target would show: a reference, no competitor."""
-
-    least_gain = LEAST_TRUE_GAIN
 
     def __init__(self, env: ExplorationEnv):
         super().__init__(env, choose_by_utility)
@@ -166,10 +143,10 @@ class OraclePlanner(FrontierPlanner):
         return replace(scene, gain=gain, middle=middle)
 
 
-def _prefer(travel: torch.Tensor, worth: torch.Tensor) -> torch.Tensor:
-    """`travel` without the targets that are not `worth` it, for robots that can get to one that is."""
-    kept = travel.masked_fill(~worth, torch.inf)
-    return torch.where(kept.isfinite().any(-1, keepdim=True), kept, travel)
+def _prefer(scene: Scene) -> Scene:
+    """`scene` without the targets that offer little, for robots that can get to one that offers more."""
+    kept = scene.travel.masked_fill(scene.gain < LEAST_GAIN, torch.inf)
+    return replace(scene, travel=torch.where(kept.isfinite().any(-1, keepdim=True), kept, scene.travel))
 
 
 class RandomPolicy:

@@ -145,15 +145,15 @@ class _Near:
 
     def plan(self) -> dict[str, torch.Tensor]:
         """What the classical planner would do, each robot hearing only those it hears."""
-        scene, block = self.scene, self.block
         some = self.some
-        hears = self.nav.state["comm"]
-        score, taken, claimed = plan_in_turn(self.gain, self.travel, some, self.point / self.reach, hears)
+        value = value_targets(self.scene).gather(2, self.block)
+        open_value = torch.where(some, value, -torch.inf)
+        score, taken, claimed = plan_in_turn(self.gain, open_value, self.point / self.reach, self.nav.state["comm"])
         where = _pick(self.point, taken.unsqueeze(-1)).squeeze(2)
-        counts = self.mate & some.any(-1).view(len(block), 1, 1, -1)
+        counts = self.mate & some.any(-1).view(len(some), 1, 1, -1)
         return {
             "score": score,
-            "value": value_targets(scene).gather(2, block).clamp_min(-FAR),
+            "value": value.clamp_min(-FAR),
             "planned": torch.zeros_like(score).scatter_(2, taken.unsqueeze(-1), 1.0),
             "claimed": claimed,
             "plan_gap": self._nearest_of(where, counts),

@@ -77,24 +77,21 @@ def value_targets(scene: Scene) -> torch.Tensor:
     Unknown area against the way there (Burgard et al. 2005). Targets with little to see wait for better ones, but not
     at any price: a far way to a good one costs more.
     """
-    return _value(scene.gain, scene.travel / scene.nav.radar_range, scene.travel.isfinite())
-
-
-def _value(gain: torch.Tensor, travel: torch.Tensor, some: torch.Tensor) -> torch.Tensor:
-    worth = gain >= LEAST_GAIN
+    some, worth = scene.travel.isfinite(), scene.gain >= LEAST_GAIN
     waits = ~worth & (worth & some).any(-1, keepdim=True)
-    return torch.where(some, gain - BETA * travel - WAIT * waits, -torch.inf)
+    value = scene.gain - BETA * scene.travel / scene.nav.radar_range - WAIT * waits
+    return torch.where(some, value, -torch.inf)
 
 
 def plan_in_turn(
-    gain: torch.Tensor, travel: torch.Tensor, some: torch.Tensor, point: torch.Tensor, hears: torch.Tensor
+    gain: torch.Tensor, value: torch.Tensor, point: torch.Tensor, hears: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Robots choose one after the other, the one with the most to win first; a target taken lowers the gain of others
     that can be seen from there (Burgard et al. 2005). One round per robot, all envs together.
 
     Args:
-        gain, travel: float32 [E, N, M], of a candidate: what is to be seen [discs], and the way there [radar ranges].
-        some: bool [E, N, M], which candidates there are.
+        gain: float32 [E, N, M], what is to be seen from a candidate.
+        value: float32 [E, N, M], what it is worth as long as nobody has claimed any of that; -inf: there is none.
         point: float32 [E, N, M, 2], where they are [radar ranges].
         hears: bool [E, N, N], robots whose choices a robot gets to know.
 
@@ -105,10 +102,11 @@ def plan_in_turn(
     env = torch.arange(len(gain), device=gain.device)
     taken = torch.zeros(gain.shape[:2], dtype=torch.int64, device=gain.device)
     score, claimed, left = torch.zeros_like(gain), torch.zeros_like(gain), torch.ones_like(gain)
+    some = value > -torch.inf
     waiting = some.any(-1)
-    fixed = torch.where(some, _value(gain, travel, some), 0.0) - gain
+    rest = torch.where(some, value, 0.0) - gain
     for _ in range(gain.shape[1]):
-        value = gain * left + fixed
+        value = gain * left + rest
         best, index = torch.where(some, value, -torch.inf).max(-1)
         robot = torch.where(waiting, best, -torch.inf).argmax(1)
         acts = waiting[env, robot]

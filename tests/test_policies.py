@@ -1,5 +1,7 @@
 """Classical planners: they finish, they are batched without a trace of the batch, and they choose as they say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,17 +12,16 @@ from maexp.agents.policies import (
     POLICIES,
     FrontierPlanner,
     OraclePlanner,
-    Scene,
     _prefer,
     choose_by_area,
     choose_by_assignment,
     choose_by_force,
-    choose_in_turn,
+    choose_by_utility,
     choose_nearest,
-    keyed_uniform,
 )
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RobotConfig, make_map
 from maexp.envs.navigation import Navigation
+from maexp.envs.targets import Scene, keyed_uniform, plan_in_turn, value_targets
 from maexp.kernels import visible_points
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
@@ -243,9 +244,16 @@ INF = float("inf")
 
 
 def test_targets_with_little_to_see_wait():
-    travel = torch.tensor([[[1.0, 2.0, INF], [1.0, INF, INF]]])
-    worth = torch.tensor([[[False, True, True]] * 2])
-    assert _prefer(travel, worth).tolist() == [[[INF, 2.0, INF], [1.0, INF, INF]]]
+    scene = replace(scene_of([[[1.0, 2.0, INF], [1.0, INF, INF]]]), gain=torch.tensor([[[0.2, 0.4, 0.4]] * 2]))
+    assert _prefer(scene).travel.tolist() == [[[INF, 2.0, INF], [1.0, INF, INF]]]
+
+
+def test_a_target_with_little_to_see_waits_for_a_better_one_but_not_at_any_price():
+    gain = torch.tensor([[[0.2, 0.4]]])
+    near, far = (replace(scene_of([[[1.0, way]]]), gain=gain) for way in (10.0, 400.0))
+    assert choose_by_utility(near).tolist() == [[1]]
+    assert choose_by_utility(far).tolist() == [[0]]
+    torch.testing.assert_close(value_targets(near), torch.tensor([[[0.2 - 0.003 - 0.5, 0.4 - 0.03]]]))
 
 
 def test_voronoi_keeps_to_the_own_area_and_ignores_the_dead():
@@ -265,7 +273,13 @@ def test_choices_in_turn_spread_the_team():
     travel = [[[1.0, 1.0, 6.0], [1.0, 1.0, 6.0]]]
     scene = scene_of(travel, points=[points])
     gain = torch.tensor([[[1.0, 0.9, 0.8]] * 2])
-    assert choose_in_turn(scene, gain, scene.travel / 10.0).tolist() == [[0, 2]]  # 1 is in sight of 0
+    heard, alone = torch.ones(1, 2, 2, dtype=torch.bool), torch.eye(2, dtype=torch.bool).unsqueeze(0)
+    value, points = gain - scene.travel / 10.0, scene.points / 10.0
+    score, taken, claimed = plan_in_turn(gain, value, points, heard)
+    assert taken.tolist() == [[0, 2]]  # 1 is in sight of 0
+    torch.testing.assert_close(claimed, torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.8, 0.0]]]))
+    torch.testing.assert_close(score, value - gain * claimed)
+    assert plan_in_turn(gain, value, points, alone)[1].tolist() == [[0, 0]]  # who hears nothing shares nothing
 
 
 @pytest.mark.parametrize("name", CHOICES)
