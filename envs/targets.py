@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
 STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
 BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, are worth less than others
-WAIT = 0.5  # by so much of a disc, where a robot gets to one with more
+LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, are hardly worth a way of their own
 SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 
 
@@ -74,13 +73,11 @@ class Scene:
 def value_targets(scene: Scene) -> torch.Tensor:
     """What every target is worth to every robot by itself, in radar discs, float32 [E, N, K]; -inf: out of reach.
 
-    Unknown area against the way there (Burgard et al. 2005). Targets with little to see wait for better ones, but not
-    at any price: a far way to a good one costs more.
+    Unknown area against the way there (Burgard et al. 2005).
     """
-    some, worth = scene.travel.isfinite(), scene.gain >= LEAST_GAIN
-    waits = ~worth & (worth & some).any(-1, keepdim=True)
-    value = scene.gain - BETA * scene.travel / scene.nav.radar_range - WAIT * waits
-    return torch.where(some, value, -torch.inf)
+    return torch.where(
+        scene.travel.isfinite(), scene.gain - BETA * scene.travel / scene.nav.radar_range, -torch.inf
+    )
 
 
 def plan_in_turn(
