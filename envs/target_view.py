@@ -24,7 +24,7 @@ FEATURES = (
     # What cost_utility thinks of it: value when it is the robot's turn, value without the others, whether it takes it,
     # share of the gain that robots before it have claimed, and how far off [ranges] the nearest other robot goes.
     "score", "value", "planned", "claimed", "plan_gap",
-    # The way: length [ranges], 1 / (1 + length), straight distance [ranges], way / distance - 1.
+    # The way: log(1 + length [ranges]), 1 / (1 + length), straight distance [ranges], way / distance - 1.
     "travel", "nearness", "distance", "detour",
     # What is to be seen from there [discs], frontier cells [10], whether it is worth going to at once; gain of the
     # candidates within 1 and 2.5 ranges of it [1 and 4 discs].
@@ -161,7 +161,7 @@ class _Near:
 
     def way(self) -> dict[str, torch.Tensor]:
         return {
-            "travel": self.travel,
+            "travel": self.travel.log1p(),
             "nearness": 1.0 / (1.0 + self.travel),
             "distance": self.distance,
             "detour": (self.travel / self.distance.clamp_min(0.1)).clamp(max=FAR) - 1.0,

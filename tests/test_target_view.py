@@ -1,0 +1,169 @@
+"""What a choice among frontier targets sees, and that naming a target drives there."""
+
+import math
+
+import pytest
+import torch
+from oracle.targets import columns as oracle_columns
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from maexp.agents.policies import POLICIES
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs.target_view import FEATURES
+from maexp.envs.targets import BETA
+
+MAPS = [make_map("maze_small", k) for k in (0, 3)]
+COUNT = 40  # no team knows more targets
+TARGETS, MASK = ("agents", "observation", "targets"), ("agents", "observation", "targets_mask")
+ACTION = ("agents", "action", "target")
+
+
+def make_env(num_envs: int = 4, targets: int = COUNT, maps=MAPS, **settings) -> ExplorationEnv:
+    settings = {"seed": 5, "planner": PlannerConfig(name="wavefront")} | settings
+    observation = ObservationConfig(targets=targets)
+    return ExplorationEnv(maps, num_envs=num_envs, num_threads=1, observation=observation, **settings)
+
+
+def column(td, name: str) -> torch.Tensor:
+    return td[TARGETS][..., FEATURES.index(name)]
+
+
+def choose(td) -> torch.Tensor:
+    """The candidate with the highest classical score."""
+    return torch.where(td[MASK], column(td, "score"), -math.inf).argmax(-1)
+
+
+def play(env, steps: int, td=None) -> list:
+    td, seen = env.reset() if td is None else td, []
+    for _ in range(steps):
+        td[ACTION] = choose(td)
+        td = env.step(td)["next"]
+        seen.append(td)
+    return seen
+
+
+def test_specs_hold_and_features_are_finite():
+    env = make_env()
+    check_env_specs(env)
+    for td in play(env, 4):
+        assert torch.isfinite(td[TARGETS]).all() and td[TARGETS].abs().max() < 20.0
+        assert (td[TARGETS][~td[MASK]] == 0).all()
+        assert td[MASK].any(-1)[td["agents", "observation", "alive"]].float().mean() > 0.5
+
+
+@pytest.mark.parametrize("planner", ["wavefront", "dwa"])
+def test_the_highest_score_is_what_cost_utility_takes(planner):
+    """On the same episodes, to the bit: what a learned policy starts from is the classical planner."""
+    env = make_env(planner=PlannerConfig(name=planner), targets=256)
+    other = ExplorationEnv(MAPS, num_envs=4, seed=5, planner=PlannerConfig(name=planner), num_threads=1)
+    policy, td = POLICIES["cost_utility"](other), other.reset()
+    mine = env.reset()
+    for _ in range(5):
+        mine, td = play(env, 1, mine)[0], step_mdp(other.step(policy(td)))
+        assert torch.equal(env.simulation.tensors["goal"], other.simulation.tensors["goal"])
+        assert torch.equal(mine["agents", "observation", "pose"], td["agents", "observation", "pose"])
+
+
+def test_columns_mean_what_their_names_say():
+    env = make_env()
+    td = play(env, 3)[-1]
+    view, mask = env.target_view, td[MASK]
+    nav, reach = view.tracker.nav, 10.0
+    gap = view.state["point"] - nav.centers().unsqueeze(2)
+    assert mask.any()
+    torch.testing.assert_close(column(td, "distance")[mask], gap.norm(dim=-1)[mask] / reach)
+    travel, gain = column(td, "travel").expm1(), column(td, "gain")
+    assert (travel >= column(td, "distance") - 0.2)[mask].all(), "a way is no shorter than the straight line"
+    torch.testing.assert_close(column(td, "value")[mask], (gain - BETA * travel)[mask])
+    torch.testing.assert_close(column(td, "score")[mask], (gain * (1 - column(td, "claimed")) - BETA * travel)[mask])
+    heading = torch.atan2(gap[..., 1], gap[..., 0]) - nav.state["pose"][..., 3:]
+    torch.testing.assert_close(column(td, "ahead")[mask], heading.cos()[mask], atol=1e-5, rtol=0)
+    torch.testing.assert_close(column(td, "aside")[mask], heading.sin()[mask], atol=1e-5, rtol=0)
+    left = td["agents", "observation", "time_left"].expand_as(travel)
+    torch.testing.assert_close(column(td, "time_left")[mask], left[mask])
+    assert (column(td, "planned").sum(-1) == mask.any(-1)).all(), "every robot plans one target"
+    rival = column(td, "rival")
+    clear = mask & (rival < 8.0) & ((rival - travel).abs() > 1e-3)
+    assert clear.any() and ((travel < rival) == (column(td, "nearest") > 0))[clear].all()
+
+
+def test_one_more_env_changes_nothing():
+    three, four = play(make_env(3), 4), play(make_env(4), 4)
+    for a, b in zip(three, four, strict=True):
+        assert torch.equal(a[TARGETS], b[TARGETS][:3]) and torch.equal(a[MASK], b[MASK][:3])
+
+
+def test_a_reset_of_some_envs_leaves_the_others():
+    env, alike = make_env(), make_env()
+    td, same = play(env, 3)[-1], play(alike, 3)[-1]
+    reset = torch.tensor([[False], [True], [False], [True]])
+    after = env.reset(td.clone().set("_reset", reset))
+    assert torch.equal(after[TARGETS][[0, 2]], td[TARGETS][[0, 2]])
+    kept = play(env, 3, after)[-1]
+    want = play(alike, 3, same)[-1]
+    assert torch.equal(kept[TARGETS][[0, 2]], want[TARGETS][[0, 2]])
+
+
+def test_a_saved_state_goes_on_bit_for_bit():
+    env, fresh = make_env(), make_env()
+    td = play(env, 3)[-1]
+    fresh.load_state_dict(env.state_dict())
+    for a, b in zip(play(env, 3, td.clone()), play(fresh, 3, td.clone()), strict=True):
+        assert torch.equal(a[TARGETS], b[TARGETS])
+    with pytest.raises(ValueError, match="target"):
+        fresh.load_state_dict(ExplorationEnv(MAPS, num_envs=4, num_threads=1).state_dict())
+
+
+def test_robots_that_hear_nobody_know_of_no_plans():
+    td = play(make_env(comm=CommConfig(range=0.1)), 2)[-1]
+    mask = td[MASK]
+    assert (column(td, "claimed")[mask] == 0).all() and (column(td, "mates")[mask] == 0).all()
+    assert (column(td, "plan_gap")[mask] == 4.0).all() and (column(td, "nearest")[mask] == 1).all()
+
+
+def test_bad_actions_and_settings_are_named():
+    env = make_env(2, targets=8)
+    td = env.reset()
+    td[ACTION] = torch.full((2, 3), 8)
+    with pytest.raises(ValueError, match="give 0 to 7"):
+        env.step(td)
+    plain = ExplorationEnv(MAPS, num_envs=2, num_threads=1)
+    td = plain.reset()
+    td[ACTION] = torch.zeros(2, 3, dtype=torch.long)
+    with pytest.raises(ValueError, match=r"observation\.targets"):
+        plain.step(td)
+    with pytest.raises(ValueError, match=r"observation\.targets=-1"):
+        make_env(targets=-1)
+    with pytest.raises(ValueError, match=r"observation\.targets=8 needs"):
+        make_env(targets=8, planner=PlannerConfig(name="direct"))
+
+
+@pytest.mark.parametrize("reach", [math.inf, 12.0])
+def test_features_agree_with_their_definitions(reach):
+    env = make_env(comm=CommConfig(range=reach))
+    td = play(env, 3)[-1]
+    view, robots = env.target_view, env.num_robots
+    nav, state, sim = view.tracker.nav, view.state, env.simulation
+    block = state["block"]
+    theirs = [nav.travel()[:, j : j + 1].expand(-1, robots, -1).gather(2, block) for j in range(robots)]
+    ways = torch.stack(theirs, -1)
+    speed = sim.tensors["pose"][..., 2].abs()
+    area, _ = nav.look_around(nav.radar_range)
+    gain = area.expand(-1, robots, -1).gather(2, block) / (math.pi * 100.0)
+    first = nav.points_on_way(torch.where(state["mask"], state["cell"], -1), 3.0)
+    limit = sim.robot_tensors["max_speed"]
+    arrays = {
+        "point": state["point"], "some": state["mask"], "ways": ways, "gain": gain, "toward": state["toward"],
+        "travel": ways.diagonal(dim1=1, dim2=3).permute(0, 2, 1), "first": first, "center": nav.centers(),
+        "heading": sim.tensors["pose"][..., 3], "speed": speed, "limit": limit,
+        "drive": torch.minimum(2.0 * speed + 0.5 * 2.0 * 4.0, 2.0 * limit), "alive": nav.alive(), "last": state["last"],
+        "has_last": state["has_last"], "comm": sim.tensors["comm"],
+    }  # fmt: skip
+    scene = {name: value.double().numpy() for name, value in arrays.items()} | {"reach": 10.0, "least_gain": 0.3}
+    checked = 0
+    for e, i, k in state["mask"].nonzero().tolist():
+        for name, wanted in oracle_columns(e, i, k, scene).items():
+            got = column(td, name)[e, i, k].item()
+            assert got == pytest.approx(wanted, abs=2e-4), (name, e, i, k)
+            checked += 1
+    assert checked > 200
