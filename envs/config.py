@@ -58,12 +58,14 @@ class RewardConfig:
     ``points`` / |free| scales explore and overlap, ``events`` the other terms; ``events`` 0 takes
     ``points`` / |free| there too, as the paper does. ``time_on`` "uncovered" pays -(1 - coverage),
     "covered" pays -coverage as the paper prints. ``charge_rest``: when the last robot of a team has collided,
-    the steps left in the episode are charged at once, as if it went on; else the team is spared them.
+    the steps left in the episode are charged at once, as if it went on; else the team is spared them. ``unfinished``
+    adds to what is charged for time in every local step until the team is done: the last corners count then, too.
     """
 
     explore: float = 0.3
     overlap: float = 0.0
     time: float = 1.0
+    unfinished: float = 0.0
     success: float = 100.0
     collision: float = 200.0
     points: float = 60.0

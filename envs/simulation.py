@@ -69,7 +69,7 @@ def reward_weights(env) -> RewardWeights:
     """The reward's coefficients as the kernels read them."""
     cfg = env.reward_config
     weights = RewardWeights()
-    for name in ("explore", "overlap", "time", "success", "collision", "points", "events"):
+    for name in ("explore", "overlap", "time", "unfinished", "success", "collision", "points", "events"):
         setattr(weights, name, float(getattr(cfg, name)))
     weights.time_sign = 1.0 if cfg.time_on == "covered" else 0.0
     weights.goal_coverage = env.success_coverage

@@ -22,6 +22,7 @@ class RewardWeights:
     explore: float
     overlap: float
     time: float
+    unfinished: float  # joins the time term's share of what is not covered, as long as the team is not done
     success: float
     collision: float
     points: float  # w = points / total weight scales explore and overlap
@@ -96,6 +97,7 @@ def _reward_robots(
     lapse = -(1.0 - before) - left * (1.0 - after)
     if weights.time_sign != 0.0:
         lapse = -before - left * after
+    lapse = lapse - weights.unfinished * (1.0 + left)
     add_term(terms, raw, e, i, EXPLORE, weights.explore * float(fresh[e, i]), w)
     add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
     add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
