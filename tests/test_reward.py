@@ -20,11 +20,11 @@ def drive(env, td, control):
     return env.step(td)["next"]
 
 
-@pytest.mark.parametrize("charge", [True, False])
-def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge):
+@pytest.mark.parametrize("charge, unfinished", [(True, 0.0), (False, 0.0), (True, 0.4)])
+def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge, unfinished):
     """Every local step of teams at full throttle, until all have hit something, against the oracle."""
     maps = [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)]
-    reward = RewardConfig(overlap=0.01, charge_rest=charge)
+    reward = RewardConfig(overlap=0.01, charge_rest=charge, unfinished=unfinished)
     env = ExplorationEnv(
         maps, 4, 2, seed=2, planner=DIRECT, reward=reward, radar=RadarConfig(range=4.0), num_threads=1,
         robot=RobotConfig(collision_threshold=0.6), local_steps=1, macro_steps=90, success_coverage=1.0,
@@ -44,7 +44,7 @@ def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge):
             new, overlap = team.counts(old.seen_free, now.visible, weights)
             want = team.reward_terms(
                 new, overlap, old.coverage, False, now.crashed != 0, weights.sum(),
-                coverage_now=now.coverage, charged=left,
+                coverage_now=now.coverage, charged=left, unfinished=unfinished,
             )  # fmt: skip
             for k, name in enumerate(REWARD_TERMS):
                 np.testing.assert_allclose(now.terms[:, k], want[name], rtol=2e-5, atol=1e-6, err_msg=name)

@@ -28,6 +28,7 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     f"scenario={OLD_SCENARIO}",
     "algorithm=mappo",
     "planner=dwa",
+    "action=regions",
     "reward.overlap=0.01",
     _wheelbase,
     "reward.charge_rest=false",

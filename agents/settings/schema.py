@@ -145,6 +145,7 @@ class TrainSettings(LearnerSettings):
     """`maexp train`."""
 
     preset: str = MISSING
+    action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
@@ -164,6 +165,7 @@ class EvaluateSettings(LearnerSettings):
     """`maexp evaluate`."""
 
     preset: str = MISSING
+    action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
     policy: Any = setting(None, f"{', '.join(POLICIES)}; several as policy=random,voronoi")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
@@ -177,6 +179,7 @@ class EvaluateSettings(LearnerSettings):
 class ViewSettings(LearnerSettings):
     """`maexp view`."""
 
+    action: str = MISSING  # which file of conf/action
     place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
     index: int = setting(0, "which map of the scenario")
     policy: str | None = setting(None, "a classical policy to watch, on the map given or a held-out one")
@@ -253,6 +256,7 @@ class BenchmarkSettings(LearnerSettings):
 
     seed: int = 0  # each cell has its own, from `seeds`
     preset: str = MISSING
+    action: str = MISSING  # which file of conf/action
     scenarios: Any = setting(None, "where: scenarios=maze,indoor_small; default: what the preset says")
     algorithms: Any = setting(None, "trained and then evaluated; default: all six")
     policies: Any = setting(None, "classical ones, only evaluated; default: all")

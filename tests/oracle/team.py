@@ -83,18 +83,21 @@ def reward_terms(
     paper: bool = False,
     coverage_now: float = 1.0,
     charged: int = 0,
+    unfinished: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """The terms of one local step, each (N,), signed and weighted as they enter the reward (design 4.5).
 
     succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step;
-    charged: steps left that are charged too, at `coverage_now` (`steps_charged`).
+    charged: steps left that are charged too, at `coverage_now` (`steps_charged`); unfinished: weight of the time
+    itself.
     """
     w = 60.0 / num_free
     v = w if paper else 60.0 / 7000.0
     robots = len(new)
-    time, shared = -v * (1.0 - coverage_before), [-w * overlap_weight * overlap[i] for i in range(robots)]
+    time = -v * (1.0 - coverage_before + unfinished)
+    shared = [-w * overlap_weight * overlap[i] for i in range(robots)]
     for _ in range(charged):  # nobody moves any more: each step costs the same
-        time -= v * (1.0 - coverage_now)
+        time -= v * (1.0 - coverage_now + unfinished)
     return {
         "explore": np.asarray([w * explore * new[i] for i in range(robots)]),
         "overlap": np.asarray([(1 + charged) * value for value in shared]),
