@@ -174,7 +174,7 @@ def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None
     if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_TARGETS:
         raise ValueError(f"observation.targets={count!r} must be a whole number from 0 to {MOST_TARGETS}")
     if count and planner.name == "direct":
-        raise ValueError(f"planner=direct takes controls, and observation.targets={count} shows goals: add action=regions")
+        raise ValueError(f"planner=direct takes controls, observation.targets={count} shows goals: add action=regions")
 
 
 def check_comm(config: CommConfig) -> CommConfig:
