@@ -1,5 +1,6 @@
 """From settings to maps, environments and learners."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
 from maexp.agents.errors import UserError
+from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import algorithm_settings, model_settings
@@ -27,7 +29,7 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
-from maexp.envs.scenarios import find_scenario
+from maexp.envs.scenarios import SCENARIOS, find_scenario
 from maexp.envs.starts import STARTS, read_starts
 
 
@@ -149,6 +151,28 @@ def choose_starts(cfg: Any, num_robots: int) -> Any:
     """
     starts = cfg.scenario.starts
     return starts if starts in STARTS else read_starts(starts, num_robots)
+
+
+def other_scenarios(cfg: Any) -> list[Any]:
+    """The settings once more for each scenario of `scenario.also`, with what a scenario supplies left to it.
+
+    Raises:
+        UserError: a name that is unknown or given twice, or a scenario without maps of its own.
+    """
+    names = [] if cfg.scenario.also is None else list(cfg.scenario.also)
+    check_distinct("scenario.also", [cfg.scenario.name, *names])
+    return [_with_scenario(cfg, name) for name in names]
+
+
+def _with_scenario(cfg: Any, name: str) -> Any:
+    if name not in SCENARIOS or SCENARIOS[name].build is None:
+        known = ", ".join(one for one, row in SCENARIOS.items() if row.build is not None)
+        raise UserError(f"scenario.also={name} is no scenario with maps of its own: choose among {known}.")
+    other = copy.deepcopy(cfg)
+    other.scenario.name = name
+    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", "local_steps", "macro_steps"):
+        other.scenario[setting] = None
+    return other
 
 
 def set_steps(cfg: Any, env: ExplorationEnv) -> int:

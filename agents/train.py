@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner, set_steps
+from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner, other_scenarios, set_steps
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
@@ -123,6 +123,8 @@ class TrainingRun:
     @property
     def batch_frames(self) -> int:
         """Macro steps of teams in one iteration."""
+        if self.cfg.scenario.also:  # whose episodes differ in length
+            return sum(one.requested_frames_per_batch for one in self.experience.collectors)
         return self.cfg.num_envs * self.cfg.collector.steps
 
     @property
@@ -234,19 +236,27 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
     check_collector(cfg.collector)
     alone, workers = cfg.collector.backend == "single", cfg.collector.workers
     here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
-    teams = divide_teams(cfg.num_envs, team_sizes(cfg.num_robots), workers)
+    others = other_scenarios(cfg)
+    if others and not alone:
+        raise UserError(f"scenario.also={list(cfg.scenario.also)} needs collector=single.")
+    places = [(cfg, maps), *((one, load_maps(one.scenario).train) for one in others)]
+    sizes = team_sizes(cfg.num_robots)
+    teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
+    whole = cfg.collector.steps is None  # episodes, which differ in length from scenario to scenario
     envs = [
-        make_env(cfg, maps, one.num_robots, one.num_envs if alone else 1, device=here if alone else there,
-                 first_env=one.first_env)
-        for one in teams
+        make_env(*places[k // len(sizes)], one.num_robots, one.num_envs if alone else 1,
+                 device=here if alone else there, first_env=one.first_env)
+        for k, one in enumerate(teams)
     ]  # fmt: skip
-    steps = set_steps(cfg, envs[0])
-    for env, one in zip(envs, teams, strict=True):
-        check_batch_memory(env, steps, one.num_envs)
+    set_steps(cfg, envs[0])
+    steps = [env.macro_steps if whole else cfg.collector.steps for env in envs]
+    for env, one, length in zip(envs, teams, steps, strict=True):
+        check_batch_memory(env, length, one.num_envs)
     like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
     learner = make_learner(cfg, like)
     if alone:
-        return learner, Experience([make_collector(env, learner.policy, steps, there) for env in envs])
+        pairs = zip(envs, steps, strict=True)
+        return learner, Experience([make_collector(env, learner.policy, length, there) for env, length in pairs])
     from maexp.agents.workers import make_workers  # here: most runs have none
 
     return learner, make_workers(cfg, maps, teams, learner.policy)

@@ -80,6 +80,7 @@ class ScenarioSettings:
     """Where the team explores. Null: what the table of scenarios says."""
 
     name: str = MISSING
+    also: Any = None  # further scenarios to train on, as [maze,outdoor], each with its own robots and episode
     path: str | None = None  # the map of scenario=pointcloud, or several: a.yaml,b.pcd
     maps: Any = None  # indices trained on; null: what held_out and validation leave of the table's count
     validation: Any = None  # indices that choose between checkpoints and planners; null: the last fifth of the rest
