@@ -12,7 +12,16 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from maexp.agents.build import Learner, MapSuite, choose_device, load_maps, make_env, make_learner, other_scenarios, set_steps
+from maexp.agents.build import (
+    Learner,
+    MapSuite,
+    choose_device,
+    load_maps,
+    make_env,
+    make_learner,
+    other_scenarios,
+    set_steps,
+)
 from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector

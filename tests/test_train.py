@@ -19,8 +19,8 @@ from maexp.agents.logs import MetricsLog, read_metrics
 from maexp.agents.settings.compose import compose_config
 
 TINY = [
-    "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3", "scenario.local_steps=5",
-    "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
+    "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
+    "scenario.local_steps=5", "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
 ]  # fmt: skip
 BATCH = 6
 CLOCKS = (
@@ -154,6 +154,29 @@ def test_teams_of_several_sizes_in_one_batch(capsys):
     assert "num_robots=1,3, not num_envs=5 num_robots=1,2" in capsys.readouterr().err
     assert main(["train", *TINY, "num_envs=2", "num_robots=1,2,3", "hydra.run.dir=few"]) == 2
     assert "num_envs=2 is too few for 3 team sizes" in capsys.readouterr().err
+
+
+def test_several_scenarios_in_one_batch(tmp_path, capsys):
+    """Each with its own robots and episodes; resumed it goes on with all of them."""
+    words = [
+        "scenario=maze_small", "scenario.also=[indoor_small]", "scenario.maps=[0]", "scenario.held_out=[70]",
+        "scenario.macro_steps=2", "num_envs=4", "episodes=0", "action=targets",
+    ]  # fmt: skip
+    batch = 2 * 2 + 2 * 15
+    assert main(["train", *words, "hydra.run.dir=whole", f"total_frames={2 * batch}"]) == 0
+    assert main(["train", *words, "hydra.run.dir=halves", f"total_frames={batch}"]) == 0
+    assert main(["train", "resume=halves", f"total_frames={2 * batch}"]) == 0
+    rows = [read_metrics(Path(one) / "metrics.csv") for one in ("whole", "halves")]
+    assert rows[0]["frames"].tolist() == rows[1]["frames"].tolist() == [batch, 2 * batch]
+    assert rows[0]["loss_critic"].tolist() == rows[1]["loss_critic"].tolist()
+    assert (rows[0]["episodes"] >= 4).all()
+    for word, told in (
+        ("scenario.also=[nowhere]", "scenario.also=nowhere is no scenario"),
+        ("scenario.also=[maze_small]", "names maze_small twice"),
+    ):
+        capsys.readouterr()
+        assert main(["train", "scenario=maze_small", word, "hydra.run.dir=bad"]) == 2
+        assert told in capsys.readouterr().err
 
 
 def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
