@@ -75,18 +75,18 @@ class TargetView:
         Without any (the robot has collided, or knows no way to a frontier) the first candidate stands for driving
         anywhere; its features are 0.
         """
-        s, scene = self.state, self.tracker.look()
+        s, scene = self.state, self.tracker.look(compact=True)
         nav = scene.nav
         s["has_last"] = s["has_last"] & (nav.state["macro_step"] != 0).unsqueeze(-1)
         value = value_targets(scene)
-        block = _best(value, self.count)
-        some = (scene.travel.isfinite() & scene.alive.unsqueeze(-1)).gather(2, block)
+        best = _best(value, self.count)
+        some = (scene.travel.isfinite() & scene.alive.unsqueeze(-1)).gather(2, best)
         some[..., value.shape[-1] :] = False
-        s["block"], s["mask"] = block, some
-        s["cell"] = scene.spread(nav.target).gather(2, block)
-        s["point"], s["toward"] = _pick(scene.points, block), _pick(scene.middle, block)
-        columns = self._columns(scene, block, some)
-        features = torch.stack([columns[name].expand(block.shape) for name in FEATURES], -1)
+        s["block"], s["mask"] = scene.block.gather(2, best), some
+        s["cell"] = scene.cells().gather(2, best)
+        s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
+        columns = self._columns(scene, best, some)
+        features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
         return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": some.clone()}
 
     def take(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -120,33 +120,33 @@ class TargetView:
             for name in part:
                 part[name] = state[f"{prefix}_{name}"].to(part[name].device).clone()
 
-    def _columns(self, scene: Scene, block: torch.Tensor, some: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _columns(self, scene: Scene, best: torch.Tensor, some: torch.Tensor) -> dict[str, torch.Tensor]:
         """Every feature by name, shapes that expand to [E, N, M]."""
-        travel = torch.where(some, scene.travel.gather(2, block), 0.0) / scene.nav.radar_range
-        near = _Near(self, scene, block, some, travel)
+        travel = torch.where(some, scene.travel.gather(2, best), 0.0) / scene.nav.radar_range
+        near = _Near(self, scene, best, some, travel)
         return near.plan() | near.way() | near.worth() | near.bearings() | near.others() | near.team()
 
 
 class _Near:
     """The features of the candidates of one moment, group by group."""
 
-    def __init__(self, view: TargetView, scene: Scene, block: torch.Tensor, some: torch.Tensor, travel: torch.Tensor):
-        self.view, self.scene, self.block, self.some, self.travel = view, scene, block, some, travel
+    def __init__(self, view: TargetView, scene: Scene, best: torch.Tensor, some: torch.Tensor, travel: torch.Tensor):
+        self.view, self.scene, self.best, self.some, self.travel = view, scene, best, some, travel
         nav = scene.nav
         self.nav, self.reach = nav, nav.radar_range
         self.point = view.state["point"]
         self.to = self.point - nav.centers().unsqueeze(2)
         self.distance = self.to.norm(dim=-1) / self.reach
-        self.gain = scene.gain.gather(2, block)
-        robots = block.shape[1]
-        own = torch.eye(robots, dtype=torch.bool, device=block.device)
+        self.gain = scene.gain.gather(2, best)
+        robots = best.shape[1]
+        own = torch.eye(robots, dtype=torch.bool, device=best.device)
         self.own = own.view(1, robots, 1, robots)
         self.mate = (nav.state["comm"] & ~own).unsqueeze(2)  # [E, N, 1, N]: robots that this one hears
 
     def plan(self) -> dict[str, torch.Tensor]:
         """What the classical planner would do, each robot hearing only those it hears."""
         some = self.some
-        value = value_targets(self.scene).gather(2, self.block)
+        value = value_targets(self.scene).gather(2, self.best)
         open_value = torch.where(some, value, -torch.inf)
         score, taken, claimed = plan_in_turn(self.gain, open_value, self.point / self.reach, self.nav.state["comm"])
         where = _pick(self.point, taken.unsqueeze(-1)).squeeze(2)
@@ -172,7 +172,7 @@ class _Near:
         gap = (self.point.unsqueeze(3) - self.point.unsqueeze(2)).norm(dim=-1) / self.reach
         return {
             "gain": self.gain,
-            "size": self.scene.size.gather(2, self.block) / 10.0,
+            "size": self.scene.size.gather(2, self.best) / 10.0,
             "worth": (self.gain >= LEAST_GAIN).float(),
             "gain_near": ((gap < 1.0) * gain).sum(-1),
             "gain_around": ((gap < 2.5) * gain).sum(-1) / 4.0,
@@ -193,10 +193,10 @@ class _Near:
 
     def others(self) -> dict[str, torch.Tensor]:
         scene, s = self.scene, self.view.state
-        envs, robots, count = self.block.shape
-        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.travel() / self.reach, torch.inf)
+        envs, robots, count = self.best.shape
+        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.travel(scene.nav.cell) / self.reach, torch.inf)
         theirs = ways.unsqueeze(1).expand(-1, robots, -1, -1)
-        theirs = theirs.gather(3, self.block.unsqueeze(2).expand(-1, -1, robots, -1)).transpose(2, 3)
+        theirs = theirs.gather(3, self.best.unsqueeze(2).expand(-1, -1, robots, -1)).transpose(2, 3)
         rival = theirs.masked_fill(~self.mate, torch.inf).amin(-1)
         last = s["has_last"].view(envs, 1, 1, robots)
         return {
@@ -228,9 +228,12 @@ class _Near:
 
 
 def _best(value: torch.Tensor, count: int) -> torch.Tensor:
-    """Numbers of the `count` highest values of each robot, int64 [E, N, count]; 0 where there are no more."""
-    block = value.topk(min(count, value.shape[-1]), dim=-1).indices
-    return torch.nn.functional.pad(block, (0, count - block.shape[-1]))
+    """Places of the `count` highest of the values [E, N, K], int64 [E, N, count]; 0 where there are no more.
+
+    The first of equals comes first, whatever K is: it depends on the other envs of the batch.
+    """
+    place = value.sort(dim=-1, descending=True, stable=True).indices[..., :count]
+    return torch.nn.functional.pad(place, (0, count - place.shape[-1]))
 
 
 def _pick(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
