@@ -67,7 +67,9 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
         )
     actions = env.full_action_spec.keys(True, True)
     return ObservationShape(
-        channels=spec[MAP].shape[-3], side=spec[GRID].shape[-1], regions=(*ACTION, "region") in actions
+        channels=spec[MAP].shape[-3] if MAP in spec.keys(True, True) else 0,
+        side=spec[GRID].shape[-1],
+        regions=(*ACTION, "region") in actions,
     )
 
 

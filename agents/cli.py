@@ -50,7 +50,7 @@ VERBS = {
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
          "maexp maps import FOLDER", "maexp maps check floor.yaml", "maexp maps show map.npz"),
-        ("action", "file"),
+        ("task", "file"),
         ("list", "make", "import", "check", "show"),
     ),
     "irsim": Verb(
@@ -63,7 +63,7 @@ VERBS = {
         "measures throughput, as a table and JSON",
         ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",
          "maexp bench train model=small,paper", "maexp bench scale axes=envs,robots"),
-        ("action",),
+        ("task",),
         ("env", "kernels", "train", "scale"),
     ),
 }  # fmt: skip

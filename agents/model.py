@@ -67,7 +67,6 @@ class ModelConfig:
 
 PRESETS = {
     "small": ModelConfig(),
-    "targets": ModelConfig(action="targets"),
     "paper": ModelConfig(
         stem="conv",
         channels=32,

@@ -79,8 +79,8 @@ class ObservationConfig:
     """What a robot sees.
 
     ``map`` is what its picture shows: what it has ``seen`` itself, or ``known`` through communication. Without
-    ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost. ``targets`` is
-    how many frontier targets it is shown to choose from, 0 for none (`maexp.envs.target_view`).
+    ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost. ``targets``
+    is how many frontier targets it is shown to choose from, 0 for none (`maexp.envs.target_view`).
     """
 
     map: Literal["seen", "known"] = "seen"

@@ -32,7 +32,7 @@ def report(folder: str, name: str) -> dict:
 
 
 def test_settings_with_several_values_become_every_combination():
-    words = make_overrides("bench", ["env", "num_envs=2,4", "scenario=maze,maze_small", "num_robots=3,5"], ("action",))
+    words = make_overrides("bench", ["env", "num_envs=2,4", "scenario=maze,maze_small", "num_robots=3,5"], ("task",))
     prepared = move_sweeps(words)
     cfg = compose_config("bench", prepared)
     points = sweep_points(cfg, prepared, [2])
@@ -161,7 +161,7 @@ def test_bad_input_gives_a_sentence(case, capsys):
 
 @pytest.mark.parametrize("settings", ["planner=dwa", "planner=direct"])
 def test_every_kernel_of_the_plain_step_has_a_formula(settings):
-    cfg = compose_config("bench", ["action=kernels", *TINY, "num_robots=2", settings])
+    cfg = compose_config("bench", ["task=kernels", *TINY, "num_robots=2", settings])
     env = kernels.make_env(cfg, [make_map("maze_small", 0)], 2)
     steps = kernels.record_steps(env, env.simulation.shards[0])
     assert {step.kernel for step in steps} <= set(FORMULAS)

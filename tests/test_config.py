@@ -36,7 +36,7 @@ def test_choices_match_the_tables_of_the_code():
 
 def test_every_verb_composes():
     for verb in SCHEMAS:
-        words = ["action=list"] if verb in ("maps", "bench") else []
+        words = ["task=list"] if verb in ("maps", "bench") else []
         assert compose_config(verb, words).hydra.run.dir.endswith(f"-{verb}")
 
 
@@ -66,8 +66,8 @@ def test_any_file_name_survives(name, tmp_path):
     word = f"scenario.path={tmp_path / name}"
     cfg = compose_config("train", make_overrides("train", ["scenario=pointcloud", word]))
     assert cfg.scenario.path == str(tmp_path / name)
-    cfg = compose_config("maps", make_overrides("maps", ["import", name], ("action", "file")))
-    assert (cfg.action, cfg.file) == ("import", name)
+    cfg = compose_config("maps", make_overrides("maps", ["import", name], ("task", "file")))
+    assert (cfg.task, cfg.file) == ("import", name)
 
 
 def test_quote_round_trip_of_trailing_backslashes():

@@ -5,8 +5,12 @@ import math
 import pytest
 import torch
 from oracle.targets import columns as oracle_columns
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type, step_mdp
 
+from maexp.agents.actor import make_policy
+from maexp.agents.algorithms import find_algorithm
+from maexp.agents.collect import make_collector
+from maexp.agents.model import ModelConfig
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.target_view import FEATURES
@@ -167,3 +171,33 @@ def test_features_agree_with_their_definitions(reach):
             assert got == pytest.approx(wanted, abs=2e-4), (name, e, i, k)
             checked += 1
     assert checked > 200
+
+
+@pytest.mark.parametrize("name", ["ippo", "mappo", "itrpo", "matrpo", "vdppo", "vda2c"])
+def test_all_algorithms_learn_to_choose(name):
+    """One update changes the policy; teams of any size use the same weights; nobody takes what is not there."""
+    env = make_env(4, macro_steps=3)
+    model = ModelConfig(action="targets")
+    policy, row = make_policy(env, model), find_algorithm(name)
+    settings = row.configure(minibatch_size=6)
+    loss = row.make_loss(policy, row.make_critic(env, model, settings), settings)
+    batch = make_collector(env, policy, 3).next()
+    taken = batch[MASK].gather(-1, batch[ACTION].unsqueeze(-1)).squeeze(-1)
+    assert taken[batch[MASK].any(-1)].all() and (batch[ACTION][~batch[MASK].any(-1)] == 0).all()
+    before = policy.state_dict()["module.0.module.network.head.weight"].clone()
+    logs = row.make_updater(loss, settings).update(batch)
+    assert math.isfinite(logs["loss_critic"]) and not torch.equal(
+        before, policy.state_dict()["module.0.module.network.head.weight"]
+    )
+    for size in (1, 5):
+        other = make_env(2, num_robots=size)
+        assert policy(other.reset())[ACTION].shape == (2, size)
+
+
+def test_an_untrained_policy_is_the_classical_planner():
+    env = make_env()
+    policy = make_policy(env, ModelConfig(action="targets"))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for td in play(env, 3):
+            some = td[MASK].any(-1)
+            assert torch.equal(policy(td.clone())[ACTION][some], choose(td)[some])

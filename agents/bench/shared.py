@@ -22,7 +22,7 @@ from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import split_sweeps, without
 
-OWN = ("action", "seconds", "baseline", "sweep", "axes")
+OWN = ("task", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""
 LEAST_LAPS = 5
 WIDTH = 116  # columns of the widest table; a narrower terminal wraps lines, which is still readable

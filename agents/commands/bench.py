@@ -11,7 +11,7 @@ from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.overrides import move_sweeps
 from maexp.agents.settings.runs import Recipe
 
-ONE_VALUE = ("action", "seconds", "baseline", "largest", "device", "hydra")
+ONE_VALUE = ("task", "seconds", "baseline", "largest", "device", "hydra")
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -35,13 +35,13 @@ def check(cfg: Any) -> None:
     if cfg.largest is not None:
         check_counts(cfg, "largest")
     for name, action in (("baseline", "kernels"), ("axes", "scale"), ("largest", "scale")):
-        if cfg[name] is not None and cfg.action != action:
-            raise UserError(f"{name}={cfg[name]} belongs to maexp bench {action}, not to maexp bench {cfg.action}.")
+        if cfg[name] is not None and cfg.task != action:
+            raise UserError(f"{name}={cfg[name]} belongs to maexp bench {action}, not to maexp bench {cfg.task}.")
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Measure what `action` names; each has a module of its own."""
-    home = importlib.import_module(f"maexp.agents.bench.{cfg.action}")
+    home = importlib.import_module(f"maexp.agents.bench.{cfg.task}")
     with blame_input():
         home.run(cfg, where, overrides)
     return 0

@@ -70,7 +70,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
-        if policy_names(cfg) and cfg.observation.pictures is None:  # classical planners look at no pictures
+        if cfg.checkpoint is None and cfg.observation.pictures is None:  # classical planners look at no pictures
             cfg.observation.pictures = False
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0], maps)}

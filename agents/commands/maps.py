@@ -30,26 +30,26 @@ def prepare(overrides: list[str]) -> Recipe:
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
     """A new folder, except for the list."""
-    return None if find_override(overrides, "action") == "list" else claim()
+    return None if find_override(overrides, "task") == "list" else claim()
 
 
 def check(cfg: Any) -> None:
     """Raise UserError for what is missing or out of range, before a folder is made."""
     check_counts(cfg, "num_robots")
     check_counts(cfg, "index", least=0)
-    if cfg.action == "list" and cfg.file:
+    if cfg.task == "list" and cfg.file:
         raise UserError(f"maexp maps list lists all scenarios and takes no file: leave {cfg.file} out.")
-    if cfg.action != "list" and not cfg.file:
-        raise UserError(f"maexp maps {cfg.action} needs a {'scenario' if cfg.action == 'make' else 'file'} after it.")
-    if cfg.action == "make" and cfg.file not in SCENARIOS:
+    if cfg.task != "list" and not cfg.file:
+        raise UserError(f"maexp maps {cfg.task} needs a {'scenario' if cfg.task == 'make' else 'file'} after it.")
+    if cfg.task == "make" and cfg.file not in SCENARIOS:
         raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(_generated())}.")
     if cfg.out and Path(cfg.out).exists():
         raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
-    if cfg.out and cfg.action == "check" and Path(cfg.out).suffix != ".npz":
+    if cfg.out and cfg.task == "check" and Path(cfg.out).suffix != ".npz":
         raise UserError(f"out={cfg.out} must end in .npz.")
-    if cfg.out and cfg.action in ("make", "import") and Path(cfg.out).suffix not in (".npz", ".yaml"):
+    if cfg.out and cfg.task in ("make", "import") and Path(cfg.out).suffix not in (".npz", ".yaml"):
         raise UserError(f"out={cfg.out} must end in .npz, or in .yaml for a map of map_server and nav2.")
-    if cfg.out and cfg.action == "show" and Path(cfg.out).suffix != ".png":
+    if cfg.out and cfg.task == "show" and Path(cfg.out).suffix != ".png":
         raise UserError(f"out={cfg.out} must end in .png.")
     if cfg.out and not Path(cfg.out).parent.is_dir():
         raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
@@ -59,7 +59,7 @@ def check(cfg: Any) -> None:
 
 def _is_folder(cfg: Any) -> bool:
     """Whether a folder of several files is to be imported; the folder of a bag is one map."""
-    return cfg.action == "import" and Path(cfg.file).is_dir() and not is_bag(Path(cfg.file))
+    return cfg.task == "import" and Path(cfg.file).is_dir() and not is_bag(Path(cfg.file))
 
 
 def check_folder(cfg: Any) -> None:
@@ -73,7 +73,7 @@ def check_folder(cfg: Any) -> None:
 
 def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
     """Do what `action` says; 1 where the map turned out unusable."""
-    if cfg.action == "list":
+    if cfg.task == "list":
         print_scenarios()
         return 0
     if _is_folder(cfg):
@@ -82,7 +82,7 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
         world, imported = read_map(cfg)
         story = "" if imported is None else imported.table()
         report = check_map(world, num_robots=cfg.num_robots)
-        if cfg.repair and cfg.action == "check":
+        if cfg.repair and cfg.task == "check":
             world, steps = repair_map(world)
             story = "\n".join(f"repair: {step}" for step in steps or ["nothing to mend"])
             report = check_map(world, num_robots=cfg.num_robots)
@@ -91,7 +91,7 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
         written = write_files(cfg, where, world, imported)
     write_text(where / "report.txt", told + "\n")
     print(f"Written: {', '.join(str(one) for one in written)}")
-    if report.ok and cfg.action in ("make", "import"):
+    if report.ok and cfg.task in ("make", "import"):
         print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}")
     return 0 if report.ok else UNUSABLE
 
@@ -99,15 +99,15 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
 def write_files(cfg: Any, where: Path, world: PointCloudMap, imported: ImportReport | None) -> list[Path]:
     """The map (unless it was only looked at) and its picture, in the run's folder or where `out` says."""
     name = file_name(world)
-    out = Path(cfg.out) if cfg.out else where / (f"{name}.png" if cfg.action == "show" else f"{name}.npz")
+    out = Path(cfg.out) if cfg.out else where / (f"{name}.png" if cfg.task == "show" else f"{name}.npz")
     written = []
     if out.suffix == ".yaml":
         written += [export_ros_map(world, out), out.with_suffix(".pgm")]
-    elif cfg.action in ("make", "import") or cfg.repair:
+    elif cfg.task in ("make", "import") or cfg.repair:
         world.save(out)
         written.append(out)
-    picture = out if cfg.action == "show" else where / f"{name}.png"
-    if cfg.action == "import":
+    picture = out if cfg.task == "show" else where / f"{name}.png"
+    if cfg.task == "import":
         written.append(draw_import(world, imported, picture))
     else:
         written.append(draw_map(world, picture))
@@ -123,7 +123,7 @@ def read_map(cfg: Any) -> tuple[PointCloudMap, ImportReport | None]:
     """The map of a scenario's name or of a file, and what the import did."""
     if cfg.file in SCENARIOS and not Path(cfg.file).exists():
         return make_map(cfg.file, cfg.index), None
-    if cfg.action in ("check", "show") and cfg.file.endswith(".npz"):
+    if cfg.task in ("check", "show") and cfg.file.endswith(".npz"):
         return PointCloudMap.load(cfg.file), None
     return import_map_with_report(cfg.file, **import_options(cfg))
 

@@ -204,7 +204,7 @@ class ViewSettings(LearnerSettings):
 class MapsSettings:
     """`maexp maps`."""
 
-    action: str = MISSING
+    task: str = MISSING
     file: str | None = setting(None, "a map's file, for import also a folder of them, for make and show a scenario")
     index: int = setting(0, "which map of the scenario")
     out: str | None = setting(None, "file to write, .npz or for nav2 .yaml; default: in the run's folder")
@@ -240,7 +240,7 @@ class IrsimSettings:
 class BenchSettings(LearnerSettings):
     """`maexp bench`."""
 
-    action: str = MISSING
+    task: str = MISSING
     num_envs: int = setting(256, "teams simulated at once (train: 32); several as num_envs=64,256, as any setting")
     num_robots: Any = setting(None, "team sizes; default 2,4,6,8 for env, 4 for kernels, 3 for train and scale")
     seconds: float = setting(5.0, "time measured per row [s]")
