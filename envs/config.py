@@ -13,13 +13,13 @@ class RobotConfig:
     """One robot. Lengths in metres, speeds in m/s, angles in radians; None takes the scenario's value.
 
     ``max_yaw_rate`` [rad/s] is the turn limit of a differential drive, ``max_steer`` that of a car.
-    ``wheelbase`` None is the body's length.
+    ``wheelbase`` of a car is metres, or "width" (None, the default) or "length" of the body.
     """
 
     kind: Literal["ackermann", "differential", "omnidirectional"] = "ackermann"
     length: float | None = None
     width: float | None = None
-    wheelbase: float | None = None
+    wheelbase: float | Literal["width", "length"] | None = None
     max_speed: float | None = None
     max_accel: float | None = None
     max_steer: float | None = None
@@ -121,7 +121,10 @@ def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
         max_steer=scenario.max_steer,
         collision_threshold=scenario.collision_threshold,
     )
-    config = _complete(config, wheelbase=config.length)
+    if config.wheelbase in (None, "width", "length"):
+        config = replace(config, wheelbase=getattr(config, config.wheelbase or "width"))
+    elif not isinstance(config.wheelbase, int | float):
+        raise ValueError(f"robot.wheelbase={config.wheelbase!r} must be metres, width or length")
     _check_choice("robot.kind", config.kind, ROBOT_KINDS)
     _check_positive("robot", config, skip=("kind",))
     if config.max_steer >= math.pi / 2:

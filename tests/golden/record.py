@@ -29,7 +29,7 @@ def settings(case: str) -> dict:
     scenario, planner = CASES[case]
     clearance = 2.0 if planner == "wavefront" else CLEARANCE[scenario.split("_")[0]]
     planning = PlannerConfig(name=planner, horizon=3, clearance_factor=clearance, clearance_weight=100.0)
-    robot = RobotConfig(kind="ackermann", wheelbase=SCENARIOS[scenario].body_length)
+    robot = RobotConfig(kind="ackermann", wheelbase="length")
     return {"planner": planning, "robot": robot, "reward": REWARD}
 
 
