@@ -42,7 +42,7 @@ class RadarConfig:
 class PlannerConfig:
     """How a robot drives to its goal (design 4.4)."""
 
-    name: Literal["dwa", "wavefront", "direct"] = "dwa"
+    name: Literal["dwa", "wavefront", "direct"] = "wavefront"
     num_accel: int = 3
     num_steering: int | None = None
     horizon: int = 3

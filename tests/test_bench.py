@@ -48,10 +48,18 @@ def test_spread_is_median_and_tenths():
 def test_env_measures_every_point(capsys):
     assert main(["bench", "env", *TINY, "num_robots=1,2", "radar.range=4,8", "hydra.run.dir=out"]) == 0
     rows = report("out", "bench_env.json")["rows"]
-    assert [(row["radar_range"], row["num_robots"]) for row in rows] == [(4, 1), (4, 2), (8, 1), (8, 2)]
+    points = [(row["radar_range"], row["planner"], row["num_robots"]) for row in rows]
+    assert points == [(r, p, n) for r in (4, 8) for p in ("wavefront", "dwa") for n in (1, 2)]
     assert all(row["robot_local_steps_per_second"] > 0 and row["memory_per_env"] > 0 for row in rows)
     text = capsys.readouterr().out
     assert "robot-local-steps/s" in text and "bench_env.json" in text
+
+
+def test_env_measures_the_planner_that_is_asked_for(capsys):
+    assert main(["bench", "env", *TINY, "num_robots=2,3", "planner=dwa", "hydra.run.dir=out"]) == 0
+    assert [row["planner"] for row in report("out", "bench_env.json")["rows"]] == ["dwa", "dwa"]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:3] for line in lines if "this machine" in line] == [["this", "machine,", "dwa"]]
 
 
 def test_kernels_are_timed_counted_and_compared(capsys):

@@ -84,18 +84,20 @@ def test_the_papers_preset_has_its_288_runs():
     assert (run.scenario.name, run.algorithm.name, run.seed, list(run.scenario.maps)) == ("maze", "itrpo", 2, [3])
     assert (run.num_envs, run.collector.steps, run.total_frames) == (2, 30, 10_000 * 2 * 30)
     assert (run.algorithm.preset, run.model.preset, run.reward.events) == ("reference", "paper", 0.0)
+    assert (run.planner.name, settings("preset=cpu").planner.name) == ("dwa", "wavefront")
+    assert settings("preset=paper", "planner=wavefront").planner.name == "wavefront"
     assert cell_config(cfg, Cell("outdoor", "itrpo", 2, map=0))[0].collector.steps == 20
     assert compose_settings("train", words) == run
 
 
 def test_every_setting_reaches_every_cell():
     cfg = settings(
-        "scenario=maze,indoor_small", "algorithm=mappo", "policies=[]", "seed=3", "planner=wavefront", "radar.range=7",
+        "scenario=maze,indoor_small", "algorithm=mappo", "policies=[]", "seed=3", "planner=dwa", "radar.range=7",
         "train_maps=2", "test_maps=1", "robot.team=[{kind: differential, radar: {range: 3}}]", "algorithm.lr=0.5",
     )  # fmt: skip
     assert [one.name for one in list_cells(cfg)] == ["maze/mappo/seed_3", "indoor_small/mappo/seed_3"]
     run, _ = cell_config(cfg, list_cells(cfg)[1])
-    assert (run.planner.name, run.radar.range, run.algorithm.lr, run.seed) == ("wavefront", 7.0, 0.5, 3)
+    assert (run.planner.name, run.radar.range, run.algorithm.lr, run.seed) == ("dwa", 7.0, 0.5, 3)
     assert list(run.scenario.maps) == [0, 1] and run.scenario.held_out_count == 1
     assert run.robot.team[0].radar.range == 3
 

@@ -87,7 +87,7 @@ def test_without_drops_groups_and_their_values():
 
 
 def test_settings_reach_the_env_and_the_networks():
-    words = ["num_envs=2", "radar.range=7", "robot.max_speed=3", "planner=wavefront", "reward.collision=5"]
+    words = ["num_envs=2", "radar.range=7", "robot.max_speed=3", "planner=dwa", "reward.collision=5"]
     words += ["scenario.macro_steps=4", "scenario.maps=[3]", "model.channels=8", "algorithm.lr=0.5", "comm.range=9"]
     cfg = compose_config("train", words)
     maps = load_maps(cfg.scenario)
@@ -96,7 +96,7 @@ def test_settings_reach_the_env_and_the_networks():
     assert (env.num_envs, env.num_robots, env.macro_steps) == (2, 2, 4)
     assert {one.range for one in env.radar_configs} == {7.0}
     assert {one.max_speed for one in env.robot_configs} == {3.0}
-    assert (env.planner_config.name, env.reward_config.collision, env.comm_config.range) == ("wavefront", 5.0, 9.0)
+    assert (env.planner_config.name, env.reward_config.collision, env.comm_config.range) == ("dwa", 5.0, 9.0)
     assert model_settings(cfg).channels == 8
     assert make_learner(cfg, env).updater.settings.lr == 0.5
 

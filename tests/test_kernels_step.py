@@ -50,7 +50,7 @@ CASES = {
 def episode(request):
     """`(env, moments)`: for each of two envs on maps of different size, the states along some local steps."""
     maps = [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2), room(11, 15, "jittered", 3)]
-    settings = {"planner": PlannerConfig(num_steering=7, clearance_factor=4.0), "radar": radars()}
+    settings = {"planner": PlannerConfig(name="dwa", num_steering=7, clearance_factor=4.0), "radar": radars()}
     settings["reward"] = RewardConfig(overlap=0.01)
     env = ExplorationEnv(
         maps, 3, 4, seed=5, robot=robots(), local_steps=1, macro_steps=1000, success_coverage=1.0,

@@ -23,7 +23,7 @@ def team_env(maps, envs: int, robots: int, order=None, **settings) -> Exploratio
     order = list(range(robots)) if order is None else order
     bodies = [RobotConfig(kind=kinds[i % 3], **BODY | {"length": 0.6 + 0.01 * i}) for i in order]
     sensors = [RadarConfig(range=3.0 + 0.05 * i, fov=2.0 if i % 5 == 4 else 2.0 * math.pi) for i in order]
-    defaults = {"planner": PlannerConfig(num_steering=5, clearance_factor=3.0), "local_steps": 3, "macro_steps": 50,
+    defaults = {"planner": PlannerConfig(name="dwa", num_steering=5, clearance_factor=3.0), "local_steps": 3, "macro_steps": 50,
                 "num_threads": 1}  # fmt: skip
     return ExplorationEnv(
         maps, envs, robots, seed=3, robot=bodies, radar=sensors, success_coverage=1.0,
@@ -228,7 +228,7 @@ def test_dwa_takes_the_first_of_equal_candidates():
     """At rest on its goal a car scores the same for every steering angle without throttle: the first wins."""
     env = ExplorationEnv(
         room(21, 21, "lattice"), 1, 1, robot=RobotConfig(**BODY), radar=RadarConfig(range=2.0), local_steps=1,
-        planner=PlannerConfig(num_steering=5, clearance_factor=1.0),
+        planner=PlannerConfig(name="dwa", num_steering=5, clearance_factor=1.0),
     )  # fmt: skip
     pose = torch.tensor([[[16.0, 11.0, 0.0, 0.0]]])
     place(env, pose, pose[..., :2] + torch.tensor([0.3, 0.0]))

@@ -19,7 +19,7 @@ PAPER_SECONDS_PER_STEP = {
     "Explore-Bench (paper)": {2: 3.8586, 4: 6.6381, 6: 8.6575, 8: 10.9880},
     "MAexp 2024, GPU (paper)": {2: 0.0144, 4: 0.0254, 6: 0.0373, 8: 0.0477},
 }
-COLUMNS = ["scenario", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"]
+COLUMNS = ["scenario", "planner", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"]
 WARM_LAPS = 4
 """Macro steps before the clock starts: the first few fill memory that the later ones use again (300 robots: twice the
 time a step)."""
@@ -50,6 +50,7 @@ def print_rows(title: str, rows: list[dict]) -> None:
     cells = [
         [
             row["scenario"],
+            row["planner"],
             f"{row['radar_range']:g}",
             str(row["num_envs"]),
             str(row["num_robots"]),
@@ -66,14 +67,16 @@ def print_rows(title: str, rows: list[dict]) -> None:
 
 def print_latency(rows: list[dict]) -> None:
     """The paper's table III beside ours: seconds per local step of one env, by team size."""
-    ours = {row["num_robots"]: row["seconds_per_step_one_env"] for row in rows}
+    sizes = list(dict.fromkeys(row["num_robots"] for row in rows))
     cells = [
-        [name, *("-" if size not in published else f"{published[size]:.4f}" for size in ours)]
+        [name, *("-" if size not in published else f"{published[size]:.4f}" for size in sizes)]
         for name, published in PAPER_SECONDS_PER_STEP.items()
     ]
-    cells.append(["this machine", *(f"{seconds:.6f}" for seconds in ours.values())])
+    for planner in dict.fromkeys(row["planner"] for row in rows):
+        ours = {row["num_robots"]: row["seconds_per_step_one_env"] for row in rows if row["planner"] == planner}
+        cells.append([f"this machine, {planner}", *(f"{ours[size]:.6f}" for size in sizes)])
     title = "seconds per local step of one env, beside the paper's table"
-    print_table(title, ["platform", *(f"N = {size}" for size in ours)], cells)
+    print_table(title, ["platform", *(f"N = {size}" for size in sizes)], cells)
 
 
 class Batch:

@@ -8,14 +8,20 @@ from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
-from maexp.agents.settings.overrides import move_sweeps
+from maexp.agents.settings.overrides import find_override, move_sweeps
 from maexp.agents.settings.runs import Recipe
 
 ONE_VALUE = ("task", "seconds", "baseline", "largest", "device", "hydra")
 
 
 def prepare(overrides: list[str]) -> Recipe:
-    """Settings given several values go to `sweep`; their first value stands in their place."""
+    """Settings given several values go to `sweep`; their first value stands in their place.
+
+    `bench env` measures both planners unless one is chosen.
+    """
+    names = [word.partition("=")[0] for word in overrides]
+    if find_override(overrides, "action") == "env" and not {"planner", "planner.name"} & set(names):
+        overrides = [*overrides, "planner=wavefront,dwa"]
     return Recipe(move_sweeps(overrides, ONE_VALUE))
 
 
