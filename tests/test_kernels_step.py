@@ -18,7 +18,7 @@ SMALL = {"length": 0.8, "width": 0.5, "max_speed": 3.0, "max_accel": 6.0, "colli
 def robots() -> list[RobotConfig]:
     """Four robots no two of which are alike."""
     return [
-        RobotConfig(max_steer=1.0, **SMALL),
+        RobotConfig(wheelbase=0.8, max_steer=1.0, **SMALL),
         RobotConfig(kind="differential", max_yaw_rate=2.0, **SMALL | {"length": 0.6, "max_speed": 2.2}),
         RobotConfig(kind="omnidirectional", **SMALL | {"width": 0.7, "collision_threshold": 0.45}),
         RobotConfig(wheelbase=0.4, max_steer=0.6, **SMALL | {"length": 1.1, "max_accel": 4.0}),

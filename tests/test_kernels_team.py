@@ -23,8 +23,8 @@ def team_env(maps, envs: int, robots: int, order=None, **settings) -> Exploratio
     order = list(range(robots)) if order is None else order
     bodies = [RobotConfig(kind=kinds[i % 3], **BODY | {"length": 0.6 + 0.01 * i}) for i in order]
     sensors = [RadarConfig(range=3.0 + 0.05 * i, fov=2.0 if i % 5 == 4 else 2.0 * math.pi) for i in order]
-    defaults = {"planner": PlannerConfig(name="dwa", num_steering=5, clearance_factor=3.0), "local_steps": 3, "macro_steps": 50,
-                "num_threads": 1}  # fmt: skip
+    defaults = {"planner": PlannerConfig(name="dwa", num_steering=5, clearance_factor=3.0), "local_steps": 3,
+                "macro_steps": 50, "num_threads": 1}  # fmt: skip
     return ExplorationEnv(
         maps, envs, robots, seed=3, robot=bodies, radar=sensors, success_coverage=1.0,
         **defaults | settings,

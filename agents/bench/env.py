@@ -19,7 +19,10 @@ PAPER_SECONDS_PER_STEP = {
     "Explore-Bench (paper)": {2: 3.8586, 4: 6.6381, 6: 8.6575, 8: 10.9880},
     "MAexp 2024, GPU (paper)": {2: 0.0144, 4: 0.0254, 6: 0.0373, 8: 0.0477},
 }
-COLUMNS = ["scenario", "planner", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env", "start [s]"]
+COLUMNS = [
+    "scenario", "planner", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env",
+    "start [s]",
+]  # fmt: skip
 WARM_LAPS = 4
 """Macro steps before the clock starts: the first few fill memory that the later ones use again (300 robots: twice the
 time a step)."""
