@@ -123,7 +123,7 @@ def test_another_scenario_brings_its_own_values_but_not_what_the_run_had_set():
 
 
 def test_a_group_chosen_anew_is_todays():
-    saved = save("planner.horizon=5", planner__clearance_weight=7.0, planner__clearance_factor=9.0)
+    saved = save("planner=dwa", "planner.horizon=5", planner__clearance_weight=7.0, planner__clearance_factor=9.0)
     today = flatten(resolve(compose_config("train", ["planner=wavefront"])))
     after = play(saved, "planner=wavefront")
     assert {k: v for k, v in after.items() if k.startswith("planner.")} == {
@@ -171,11 +171,11 @@ def test_a_checkpoint_of_words_alone_keeps_the_defaults_of_its_time(monkeypatch)
 def test_a_setting_that_came_later_keeps_what_was_before(monkeypatch):
     saved = save(radar__range=99.0)
     del saved["settings"]["reward"]["time_on"]
-    monkeypatch.setattr(legacy, "OLD_DEFAULTS", ["reward.time_on=covered", "radar.range=5", "planner=wavefront"])
+    monkeypatch.setattr(legacy, "OLD_DEFAULTS", ["reward.time_on=covered", "radar.range=5", "planner=dwa"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         after = play(saved)
-    assert (after["reward.time_on"], after["radar.range"], after["planner.name"]) == ("covered", 99.0, "dwa")
+    assert (after["reward.time_on"], after["radar.range"], after["planner.name"]) == ("covered", 99.0, "wavefront")
 
 
 def test_old_defaults_compose_for_every_scenario():
@@ -183,6 +183,8 @@ def test_old_defaults_compose_for_every_scenario():
         words = [f"scenario={scenario}"]
         settings = resolve(compose_config("train", [*legacy.old_defaults(words), *words]))
         assert settings["robot"]["wheelbase"] == SCENARIOS[scenario].body_length
+        assert settings["planner"]["name"] == "dwa"
+        assert settings["planner"]["clearance_factor"] == SCENARIOS[scenario].clearance_factor
 
 
 # Through the command line
