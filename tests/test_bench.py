@@ -63,7 +63,7 @@ def test_env_measures_the_planner_that_is_asked_for(capsys):
 
 
 def test_kernels_are_timed_counted_and_compared(capsys):
-    words = ["bench", "kernels", *TINY, "num_robots=2"]
+    words = ["bench", "kernels", *TINY, "num_robots=2", "planner=dwa"]
     assert main([*words, "hydra.run.dir=first"]) == 0
     first = report("first", "bench_kernels.json")
     names = {row["kernel"] for row in first["rows"] if row["stage"] == "local step"}
