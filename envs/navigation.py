@@ -104,7 +104,7 @@ class Navigation:
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
         self._target = torch.zeros((e * r, k), dtype=torch.int32, device=self.device)
         self._size = torch.zeros_like(self._target)
-        self._sums = torch.zeros((e * r, k, 2), dtype=torch.int32, device=self.device)
+        self._sums = torch.zeros((e * r, k, 2), dtype=torch.int64, device=self.device)
 
     def update(self) -> None:
         """Bring everything up to date with the env."""

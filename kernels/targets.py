@@ -71,7 +71,7 @@ def _sum_frontier(
     frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
     # Out, zero before:
     size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
-    sums: wp.array3d(dtype=wp.int32),  # [row, block, 2], sums of their x and y, from the block's corner
+    sums: wp.array3d(dtype=wp.int64),  # [row, block, 2], sums of their x and y, from the block's corner
 ):
     """Gathers the frontier cells of a line of cells in their blocks."""
     row, y = wp.tid()
@@ -86,8 +86,8 @@ def _sum_frontier(
         if line[y * w + x] != wp.uint8(0):
             k = first + x / b
             wp.atomic_add(size, row, k, 1)
-            wp.atomic_add(sums, row, k, 0, x % b)
-            wp.atomic_add(sums, row, k, 1, y % b)
+            wp.atomic_add(sums, row, k, 0, wp.int64(x % b))
+            wp.atomic_add(sums, row, k, 1, wp.int64(y % b))
 
 
 @wp.kernel(enable_backward=False)
@@ -99,7 +99,7 @@ def _place_targets(
     search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
     # State in:
     size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
-    sums: wp.array3d(dtype=wp.int32),  # [row, block, 2]
+    sums: wp.array3d(dtype=wp.int64),  # [row, block, 2]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     rows_per_env: int,
     robots: int,
@@ -123,12 +123,12 @@ def _place_targets(
     first = wp.where(rows_per_env > 1, row % rows_per_env, 0)
     last = wp.where(rows_per_env > 1, first + 1, robots)
     s = search[m]
-    best_gap = wp.int64(1) << wp.int64(60)
+    best_gap = wp.int64(1) << wp.int64(62)
     for y in range(wp.max(y0 - s, 0), wp.min(wp.min(y0 + b, h) + s, h)):
         for x in range(wp.max(x0 - s, 0), wp.min(wp.min(x0 + b, w) + s, w)):
             # Compared after scaling by `count`, which keeps the mean in integers; 64 bits, for blocks may be large.
-            gap_x = wp.int64((x - x0) * count - sums[row, k, 0])
-            gap_y = wp.int64((y - y0) * count - sums[row, k, 1])
+            gap_x = wp.int64(x - x0) * wp.int64(count) - sums[row, k, 0]
+            gap_y = wp.int64(y - y0) * wp.int64(count) - sums[row, k, 1]
             gap = gap_x * gap_x + gap_y * gap_y
             if gap < best_gap:
                 if is_reached(distance, e, first, last, robots, y * w + x):
@@ -249,7 +249,7 @@ def _first_cells(
 ):
     """The cell that lies `reach` ahead of the robot on its way to each target."""
     e, i, k = wp.tid()
-    item = e * distance.shape[0] / map_id.shape[0] + i
+    item = e * (distance.shape[0] / map_id.shape[0]) + i
     m = map_id[e]
     here = target[e, i, k]
     if here >= 0:
