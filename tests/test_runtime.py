@@ -9,10 +9,11 @@ import torch
 from runtime_cases import Moment, moments
 
 from maexp.agents import policies
-from maexp.agents.runtime import CHOICES, TeamPlanner, choices, frontiers, ways
+from maexp.agents.runtime import CHOICES, TeamPlanner, choices, features, frontiers, values, ways
 from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.team import read_team
-from maexp.envs import RobotConfig
+from maexp.envs import RobotConfig, target_view
+from maexp.envs import targets as env_targets
 from maexp.kernels import geodesic, targets, wavefront
 from maexp.kernels import ways as kernel_ways
 
@@ -54,7 +55,9 @@ def test_numbers_are_those_of_the_kernels_and_policies():
         (ways, wavefront, ("MARGIN_CELLS", "COMFORT")),
         (ways, kernel_ways, ("SNAP_CELLS",)),
         (frontiers, targets, ("RAYS",)),
-        (choices, policies, ("BETA", "LEAST_GAIN", "RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
+        (values, env_targets, ("BETA", "LEAST_GAIN")),
+        (features, target_view, ("FAR", "WAY_AHEAD", "FEATURES")),
+        (choices, policies, ("RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
     ):
         assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
     assert set(CHOICES) == set(policies.POLICIES) - {"oracle"}  # no robot knows the true map

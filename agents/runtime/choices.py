@@ -11,10 +11,9 @@ from scipy.optimize import linear_sum_assignment
 from .frontiers import STRIDE
 from .grid import FREE, UNKNOWN, KnownGrid
 from .scene import Scene
+from .values import LEAST_GAIN, plan_in_turn, value_targets
 from .ways import cells_ahead
 
-BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, wait until no others are left
 RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
@@ -33,27 +32,15 @@ def choose_nearest(scene: Scene) -> np.ndarray:
     return prefer(scene).travel.argmin(-1)
 
 
-def choose_in_turn(scene: Scene, gain: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Pairs in order of gain - cost, both [N, K]; a target taken lowers the gain of others that can be seen from
-    there (Burgard et al. 2005)."""
-    chosen = np.zeros(len(scene.at), np.int64)
-    waiting = np.ones(len(scene.at), bool)
-    for _ in range(len(scene.at)):
-        value = np.where(waiting[:, None], gain - cost, -np.inf)
-        robot, target = np.unravel_index(value.argmax(), value.shape)
-        if value[robot, target] == -np.inf:  # only robots without a way to any target are left
-            break
-        chosen[robot], waiting[robot] = target, False
-        far = np.linalg.norm(scene.points - scene.points[target], axis=-1) / scene.radar_range
-        gain = gain * np.minimum(far, 1.0)
-    return chosen
-
-
 def choose_by_utility(scene: Scene) -> np.ndarray:
-    """Unknown area around the target against the way there."""
-    scene = prefer(scene)
+    """Unknown area around the target against the way there; a target taken lowers what others near it offer."""
     gain = np.broadcast_to(scene.gain, scene.travel.shape)
-    return choose_in_turn(scene, gain, BETA * scene.travel / scene.radar_range)
+    return _choose_in_turn(scene, gain, value_targets(gain, scene.travel, scene.radar_range))
+
+
+def _choose_in_turn(scene: Scene, gain: np.ndarray, value: np.ndarray) -> np.ndarray:
+    points = np.broadcast_to(scene.points / scene.radar_range, (*gain.shape, 2))
+    return plan_in_turn(gain, value, points)[1]
 
 
 def choose_by_area(scene: Scene) -> np.ndarray:
@@ -97,14 +84,14 @@ def choose_by_force(scene: Scene) -> np.ndarray:
 
 def choose_by_tree(scene: Scene) -> np.ndarray:
     """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
-    scene = prefer(scene)
     ends = np.concatenate([_grow_tree(scene, robot) for robot in range(len(scene.at))])
     shift = scene.targets.block_of(ends % scene.grid.width, ends // scene.grid.width)
     found = (scene.targets.block[:, None] == shift).all(-1).any(1) & np.isfinite(scene.travel)
     found |= ~found.any(-1, keepdims=True)  # no tree of the team found any: all frontiers count
     near = np.linalg.norm(scene.points - scene.at[:, None], axis=-1) <= scene.radar_range
-    gain = scene.gain * np.where(near, RRT_HYSTERESIS, 1.0)
-    return choose_in_turn(scene, gain, np.where(found, BETA * scene.travel / scene.radar_range, np.inf))
+    gain = (scene.gain * np.where(near, RRT_HYSTERESIS, 1.0)).astype(np.float32)
+    value = value_targets(gain, scene.travel, scene.radar_range)
+    return _choose_in_turn(scene, gain, np.where(found, value, -np.inf))
 
 
 def _grow_tree(scene: Scene, robot: int) -> np.ndarray:

@@ -7,10 +7,13 @@ import math
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from .choices import CHOICES
+from .features import Motion
+from .folder import Contract, LearnedChoice
 from .grid import FREE, KnownGrid, read_grid
 from .scene import Scene, look_at
 from .team import Team, read_team
@@ -18,6 +21,7 @@ from .watch import Watch
 from .ways import trace
 
 LOG = logging.getLogger("maexp.runtime")
+DEFAULTS = Contract("", 1, radar_range=5.0, robot_radius=0.3, motion=Motion(1.0, 1.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,10 @@ class TeamPlanner:
     """Chooses where each robot of a team should go next, call by call.
 
     Args:
-        policy: one of the classical planners, `maexp.agents.runtime.CHOICES`.
-        radar_range: how far robots see [m].
-        robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list.
+        policy: one of the classical planners, `maexp.agents.runtime.CHOICES`, or the folder of a trained policy.
+        radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
+        robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list;
+            None: as the policy was trained, 0.3 m for planners.
         clearance_factor: radii that ways keep from obstacles twice over where there is room.
         occupied: cells of the grid with this value and above are obstacles, 1 to 100.
         bounded: the grid shows the whole place; else the unknown lies beyond its edge.
@@ -61,10 +66,10 @@ class TeamPlanner:
 
     def __init__(
         self,
-        policy: str = "cost_utility",
+        policy: str | Path = "cost_utility",
         *,
-        radar_range: float = 5.0,
-        robot_radius=0.3,
+        radar_range: float | None = None,
+        robot_radius=None,
         clearance_factor: float = 2.0,
         occupied: float = 50.0,
         bounded: bool = False,
@@ -73,11 +78,11 @@ class TeamPlanner:
         pause: float = 60.0,
         seed: int = 0,
     ):
-        if policy not in CHOICES:
-            raise ValueError(f"policy={policy!r} is unknown: choose one of {', '.join(CHOICES)}")
-        self.choose = CHOICES[policy]
-        self.radar_range = _positive("radar_range", radar_range)
-        self.robot_radius, self.bounded, self.seed = robot_radius, bounded, seed
+        self.learned = None if policy in CHOICES else _open(policy)
+        self.policy, self.bounded, self.seed = policy, bounded, seed
+        defaults = DEFAULTS if self.learned is None else self.learned.contract
+        self.radar_range = _positive("radar_range", defaults.radar_range if radar_range is None else radar_range)
+        self.robot_radius = defaults.robot_radius if robot_radius is None else robot_radius
         self.clearance_factor = _positive("clearance_factor", clearance_factor)
         self.occupied = _positive("occupied", occupied)
         self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
@@ -89,6 +94,7 @@ class TeamPlanner:
         self.watch.forget()
         self.rng = np.random.default_rng(self.seed)
         self.anchor: KnownGrid | None = None  # blocks of targets are counted from its corner
+        self.last: dict[Hashable, np.ndarray] = {}  # where each robot's latest target was in the map's frame
         self.said: frozenset[str] = frozenset()
 
     def plan(
@@ -125,14 +131,16 @@ class TeamPlanner:
         known = read_grid(grid, resolution, origin, self.occupied, notes)
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
-        _finite("time_left", time_left)
+        time_left = min(max(_finite("time_left", time_left), 0.0), 1.0)
         scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
             notes.append("the grid holds no free cell yet: robots stay where they are")
             return self._finish(_stay(team, notes))
         notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
-        chosen, events = self._choose(team, scene)
-        return self._finish(_describe(team, scene, chosen, notes + events))
+        chosen, events = self._choose(team, scene, time_left)
+        plan = _describe(team, scene, chosen, notes + events)
+        self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
+        return self._finish(plan)
 
     def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> Scene:
         shift = self._shift(grid, notes)
@@ -150,7 +158,7 @@ class TeamPlanner:
         x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
         return int(x), int(y)
 
-    def _choose(self, team: Team, scene: Scene) -> tuple[np.ndarray, list[str]]:
+    def _choose(self, team: Team, scene: Scene, time_left: float) -> tuple[np.ndarray, list[str]]:
         """The target of each robot of the scene, int64 [n], -1 = none; and what happened."""
         notes = []
         allowed = self.watch.allowed(team, scene.robots, scene.targets)
@@ -163,7 +171,7 @@ class TeamPlanner:
             return chosen, notes
         parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots])
         if not parked.all():
-            chosen[~parked] = self.choose(replace(scene, travel=travel).of(~parked))
+            chosen[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left)
         chosen[parked] = scene.travel[parked].argmin(-1)
         travel[parked] = scene.travel[parked]
         chosen[~np.isfinite(travel[np.arange(len(chosen)), chosen])] = -1
@@ -172,6 +180,15 @@ class TeamPlanner:
         )
         return chosen, notes + events
 
+    def _ask(self, team: Team, scene: Scene, time_left: float) -> np.ndarray:
+        """What the policy chooses for each robot of the scene, int64 [n]."""
+        if self.learned is None:
+            return CHOICES[self.policy](scene)
+        robots = scene.robots
+        last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
+        heading = team.yaw[robots] - scene.grid.yaw
+        return self.learned.choose(scene, heading, team.speed[robots], scene.grid.from_map(last), time_left)
+
     def _finish(self, plan: Plan) -> Plan:
         """Log what has not been said in the call before."""
         for note in plan.notes:
@@ -179,6 +196,15 @@ class TeamPlanner:
                 LOG.warning(note)
         self.said = frozenset(plan.notes)
         return plan
+
+
+def _open(policy) -> LearnedChoice:
+    """The trained policy of a folder."""
+    if not isinstance(policy, str | Path) or not Path(policy).is_dir():
+        raise ValueError(
+            f"policy={policy!r} is unknown: choose one of {', '.join(CHOICES)}, or the folder of a trained policy"
+        )
+    return LearnedChoice(policy)
 
 
 def _describe(team: Team, scene: Scene, chosen: np.ndarray, notes: list[str]) -> Plan:

@@ -25,6 +25,7 @@ class Scene:
         passable, distance: per robot uint8 and int32 [H, W], as `mark_passable` and `flood` make them.
         targets: blocks, cells and sizes of the targets.
         travel: float32 [n, K], way from robot to target; infinite where there is none or it is not to be taken.
+        way: the same without anything that is not to be taken.
         points: float64 [K, 2], where the targets are.
         gain: float32 [K], unknown cells in radar range and sight of each, as a share of the radar's disc.
         middle: float32 [K, 2], the middle of those, from the target.
@@ -40,6 +41,7 @@ class Scene:
     distance: np.ndarray
     targets: Targets
     travel: np.ndarray
+    way: np.ndarray
     points: np.ndarray
     gain: np.ndarray
     middle: np.ndarray
@@ -49,7 +51,7 @@ class Scene:
     def of(self, rows: np.ndarray) -> Scene:
         """The scene for some of its robots, bool [n]."""
         passable = [mask for mask, kept in zip(self.passable, rows, strict=True) if kept]
-        parts = {name: getattr(self, name)[rows] for name in ("robots", "at", "distance", "travel", "near")}
+        parts = {name: getattr(self, name)[rows] for name in ("robots", "at", "distance", "travel", "way", "near")}
         return replace(self, passable=passable, **parts)
 
 
@@ -88,6 +90,7 @@ def look_at(
     targets, area, middle = targets.select(kept), area[kept], middle[kept]
     points = grid.centers(targets.cell)
     way = distance.reshape(len(robots), grid.known.size)[:, targets.cell]
+    way = np.where(way < UNREACHED, way * np.float32(grid.cell / STRAIGHT), np.float32(np.inf))
     at = grid.from_map(team.at[robots])
     beside = np.maximum(1.5 * grid.cell, clearance_factor * radius)[:, None]
     return Scene(
@@ -98,7 +101,8 @@ def look_at(
         passable=passable,
         distance=distance,
         targets=targets,
-        travel=np.where(way < UNREACHED, way * np.float32(grid.cell / STRAIGHT), np.float32(np.inf)),
+        travel=way,
+        way=way,
         points=points,
         gain=area / np.float32(math.pi * (radar_range / grid.cell) ** 2),
         middle=middle,

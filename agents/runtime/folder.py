@@ -1,0 +1,113 @@
+"""A trained policy as a folder: `policy.onnx`, and `contract.json`: what goes in and what it was trained for.
+
+Written by `maexp.agents.export`. Nothing in it is unpickled; a file that was changed is refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .features import FEATURES, Candidates, Motion, list_candidates
+from .scene import Scene
+
+FORMAT = "maexp-policy-1"
+CONTRACT, NETWORK = "contract.json", "policy.onnx"
+NUMBERS = ("radar_range", "robot_radius", "max_speed", "max_accel", "seconds")
+
+
+@dataclass(frozen=True)
+class Contract:
+    """What a policy was trained for.
+
+    Attributes:
+        name: of the policy.
+        candidates: targets that each robot is shown.
+        radar_range, robot_radius: [m].
+        motion: how its robots moved.
+    """
+
+    name: str
+    candidates: int
+    radar_range: float
+    robot_radius: float
+    motion: Motion
+
+
+class LearnedChoice:
+    """Chooses among targets as a trained policy does, the likeliest each.
+
+    Args:
+        folder: where it lies.
+
+    Raises:
+        ValueError: it is not such a folder, damaged, or of another version; or onnxruntime is not installed.
+    """
+
+    def __init__(self, folder: str | Path):
+        folder = Path(folder)
+        self.contract = read_contract(folder)
+        try:
+            import onnxruntime
+        except ImportError:
+            raise ValueError(f"{folder} is a trained policy and needs onnxruntime: pip install onnxruntime") from None
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        try:
+            self.session = onnxruntime.InferenceSession(
+                (folder / NETWORK).read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime raises classes of its own
+            reason = " ".join(str(error).split())[:200]
+            raise ValueError(f"{folder / NETWORK} is not a network that onnxruntime runs ({reason})") from None
+
+    def logits(self, candidates: Candidates) -> np.ndarray:
+        """What speaks for every candidate, float32 [n, M]."""
+        count = len(candidates.mask)
+        inputs = {
+            "features": candidates.features[None],
+            "mask": candidates.mask[None],
+            "comm": np.ones((1, count, count), bool),
+        }
+        return self.session.run(["logits"], inputs)[0][0]
+
+    def choose(self, scene: Scene, heading, speed, last, time_left: float) -> np.ndarray:
+        """The target of every robot, int64 [n]; the arguments of `list_candidates`."""
+        count, motion = self.contract.candidates, self.contract.motion
+        candidates = list_candidates(scene, count, heading, speed, last, time_left, motion)
+        best = np.where(candidates.mask, self.logits(candidates), -np.inf).argmax(-1)
+        return candidates.target[np.arange(len(best)), best]
+
+
+def read_contract(folder: Path) -> Contract:
+    """The contract of a folder, its network checked against it.
+
+    Raises:
+        ValueError: what is wrong with it.
+    """
+    again = "export the policy again"
+    try:
+        content = json.loads((folder / CONTRACT).read_text(encoding="utf-8"))
+        network = (folder / NETWORK).read_bytes()
+    except OSError as error:
+        raise ValueError(f"{folder} is not the folder of a policy: {error.strerror} ({error.filename})") from None
+    except ValueError:
+        raise ValueError(f"{folder / CONTRACT} is not JSON: {again}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{folder / CONTRACT} is not a contract of the kind {FORMAT}: {again}")
+    if content.get("features") != list(FEATURES):
+        raise ValueError(f"{folder} was made for other features than this version of maexp has: {again}")
+    sums = content.get("sha256")
+    if not isinstance(sums, dict) or sums.get(NETWORK) != hashlib.sha256(network).hexdigest():
+        raise ValueError(f"{folder / NETWORK} is not the file that its contract names: {again}")
+    numbers = [content.get(name) for name in NUMBERS]
+    count = content.get("candidates")
+    right = all(type(one) in (int, float) and 0 < one < 1e6 for one in numbers)
+    if not right or type(count) is not int or not 0 < count <= 1024:
+        raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {again}")
+    radar_range, robot_radius, *motion = map(float, numbers)
+    return Contract(str(content.get("name", folder.name)), count, radar_range, robot_radius, Motion(*motion))
