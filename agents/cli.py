@@ -46,6 +46,11 @@ VERBS = {
          "maexp view maze index=7"),
         ("place",),
     ),
+    "export": Verb(
+        "writes the policy of a run as a folder for robots (maexp.agents.runtime)",
+        ("maexp export RUN out=FOLDER",),
+        ("checkpoint",),
+    ),
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",

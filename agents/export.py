@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import warnings
 from importlib import metadata
 from pathlib import Path
@@ -107,6 +108,7 @@ def to_onnx(chooser: TargetChooser, robots: int) -> bytes:
         torch.ones(2, max(robots, 2), max(robots, 2), dtype=torch.bool),
     )
     shapes = {"features": {0: batch, 1: team, 2: count}, "mask": {0: batch, 1: team, 2: count}}
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about names of axes that are the same axis
         program = torch.onnx.export(

@@ -18,6 +18,7 @@ from maexp.envs.importing.options import ImportOptions
 from maexp.envs.importing.report import ImportReport
 
 ROOT = Path(__file__).resolve().parents[1]
+HAS_ONNX = all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript", "safetensors"))
 HAS_BAGS = importlib.util.find_spec("rosbags") is not None
 PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
 PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
@@ -181,6 +182,8 @@ def test_command(line, folder, monkeypatch, capsys):
     if "browser=true" in line:  # the page opens, and ends at once
         page = pytest.importorskip("maexp.envs.viewing.page", reason="viser is absent")
         monkeypatch.setattr(page.Page, "run", lambda page: None)
+    if line.startswith("maexp export") and not HAS_ONNX:
+        pytest.skip("THE EXTRA maexp[export] IS NOT INSTALLED: its command is not run")
     if ".mcap" in line and not HAS_BAGS:
         pytest.skip("THE EXTRA maexp[rosbag] IS NOT INSTALLED: bags are not imported")
     if line.startswith("maexp irsim"):

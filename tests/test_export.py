@@ -10,7 +10,8 @@ import torch
 from runtime_cases import moment
 from test_runtime import survey
 
-from maexp.agents import make_policy
+from maexp.agents import ModelConfig, make_policy
+from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.export import export_policy, find_chooser
 from maexp.agents.runtime import TeamPlanner
@@ -79,7 +80,7 @@ def test_features_are_those_of_the_env(num_robots):
 def policy():
     """An untrained policy whose head says something."""
     torch.manual_seed(3)
-    made = make_policy(make_env(), "targets")
+    made = make_policy(make_env(), ModelConfig(action="targets"))
     torch.nn.init.normal_(find_chooser(made).head.weight, std=0.1)
     return made
 
@@ -183,3 +184,10 @@ def test_weights_are_kept_without_pickle(policy, folder):
 
     weights, there = load_file(folder / "weights.safetensors"), find_chooser(policy).state_dict()
     assert weights.keys() == there.keys() and all(torch.equal(weights[name], there[name]) for name in there)
+
+
+def test_the_command_needs_a_run_and_a_place(capsys):
+    assert main(["export"]) == 2
+    assert "maexp: Nothing to export: give a run" in capsys.readouterr().err
+    assert main(["export", "nowhere", "out=small"]) == 2
+    assert "nowhere does not exist" in capsys.readouterr().err

@@ -201,6 +201,17 @@ class ViewSettings(LearnerSettings):
 
 
 @dataclass
+class ExportSettings(LearnerSettings):
+    """`maexp export`."""
+
+    action: str = MISSING  # which file of conf/action
+    checkpoint: str | None = setting(None, "a run's folder or one checkpoint file, whose policy chooses targets")
+    out: str | None = setting(None, "folder to write, new or empty")
+    name: str | None = setting(None, "of the policy; default: the folder's")
+    num_robots: int = setting(3, "robots in a team")
+
+
+@dataclass
 class MapsSettings:
     """`maexp maps`."""
 
@@ -284,6 +295,7 @@ SCHEMAS = {
     "train": TrainSettings,
     "evaluate": EvaluateSettings,
     "view": ViewSettings,
+    "export": ExportSettings,
     "maps": MapsSettings,
     "irsim": IrsimSettings,
     "bench": BenchSettings,
