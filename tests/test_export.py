@@ -186,6 +186,28 @@ def test_weights_are_kept_without_pickle(policy, folder):
     assert weights.keys() == there.keys() and all(torch.equal(weights[name], there[name]) for name in there)
 
 
+def test_from_a_run_to_a_plan(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ("scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]", "scenario.held_out=[1]")
+    train = ("total_frames=8", "num_envs=2", "episodes=2", "classical=[]", "device=cpu", "hydra.run.dir=run")
+    assert main(["train", "action=targets", *small, *train]) == 0
+    assert main(["export", "run", "out=made"]) == 0
+    told = capsys.readouterr().out
+    assert "Written to made: card.md" in told and "policy.onnx (" in told
+    card = (tmp_path / "made" / "card.md").read_text()
+    assert card.startswith("# made\n") and "| trained | " in card and "| random | " in card and "maze_small" in card
+    grid = np.full((60, 80), -1)
+    grid[:, :40], grid[:, 0] = 0, 100
+    poses = {"a": (1.0, 1.0, 0.0), "b": (1.0, 3.0, 1.5)}
+    settings = {"radar_range": 3.0, "robot_radius": 0.3}
+    plan = TeamPlanner("made", **settings).plan(grid, 0.1, (0, 0), poses, velocities=[0.2, 0.0], time_left=0.8)
+    assert plan.active.all() and not plan.notes
+    assert main(["export", "run", "out=made"]) == 2
+    assert "made holds something already" in capsys.readouterr().err
+    assert main(["export", "run"]) == 2
+    assert "out is missing" in capsys.readouterr().err
+
+
 def test_the_command_needs_a_run_and_a_place(capsys):
     assert main(["export"]) == 2
     assert "maexp: Nothing to export: give a run" in capsys.readouterr().err

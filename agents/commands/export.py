@@ -44,7 +44,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     out = Path(cfg.out)
     with blame_input():
         env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out[:1], cfg.num_robots, 1)
-        policy = load_policy(cfg, env)
+        policy = load_policy(cfg, env, [])  # it is not played: no map of its training need still be there
         find_chooser(policy)
         name = cfg.name or out.absolute().name
         export_policy(policy, env, out, name, write_card(cfg, name))
@@ -75,7 +75,7 @@ def read_results(file: Path) -> list[str]:
         summary = json.loads(file.read_text())
     except (OSError, ValueError):
         return ["It has not been evaluated.", ""]
-    rows = [(policy, values) for policy, values in summary.items() if policy not in ("run", "difference")]
+    rows = [(policy, values) for policy, values in summary.items() if SHOWN[0] in values]
     lines = ["On held-out maps, mean and 95 % interval:", "", f"| policy | {' | '.join(SHOWN)} |"]
     lines.append("| --- " * (len(SHOWN) + 1) + "|")
     for policy, values in rows:
