@@ -15,7 +15,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
-from maexp.agents.settings.resolved import algorithm_settings, model_settings
+from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
 from maexp.agents.settings.schema import given
 from maexp.agents.updaters import Updater
 from maexp.envs import (
@@ -153,18 +153,20 @@ def choose_starts(cfg: Any, num_robots: int) -> Any:
     return starts if starts in STARTS else read_starts(starts, num_robots)
 
 
-def other_scenarios(cfg: Any) -> list[Any]:
+def other_scenarios(cfg: Any, words: Any) -> list[Any]:
     """The settings once more for each scenario of `scenario.also`, with what a scenario supplies left to it.
+
+    `words` tell what that is: settings that hold no values of a checkpoint.
 
     Raises:
         UserError: a name that is unknown or given twice, or a scenario without maps of its own.
     """
     names = [] if cfg.scenario.also is None else list(cfg.scenario.also)
     check_distinct("scenario.also", [cfg.scenario.name, *names])
-    return [_with_scenario(cfg, name) for name in names]
+    return [_with_scenario(cfg, words, name) for name in names]
 
 
-def _with_scenario(cfg: Any, name: str) -> Any:
+def _with_scenario(cfg: Any, words: Any, name: str) -> Any:
     if name not in SCENARIOS or SCENARIOS[name].build is None:
         known = ", ".join(one for one, row in SCENARIOS.items() if row.build is not None)
         raise UserError(f"scenario.also={name} is no scenario with maps of its own: choose among {known}.")
@@ -172,6 +174,10 @@ def _with_scenario(cfg: Any, name: str) -> Any:
     other.scenario.name = name
     for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", "local_steps", "macro_steps"):
         other.scenario[setting] = None
+    raw = OmegaConf.to_container(words, resolve=False)
+    for group, setting in (one.split(".") for one in find_followers(words)):
+        if group != "scenario":
+            other[group][setting] = raw[group][setting]
     return other
 
 

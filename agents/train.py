@@ -102,7 +102,8 @@ class TrainingRun:
         seed_everything(cfg.seed)
         with blame_input():
             suite = load_maps(cfg.scenario)
-            learner, experience = make_both(cfg, suite.train)
+            words = compose_config("train", overrides) if cfg.scenario.also else None
+            learner, experience = make_both(cfg, suite.train, words)
             run = cls(cfg, folder, overrides, suite, learner, experience)
             if saved is not None:
                 run.restore(saved)
@@ -236,8 +237,13 @@ class TrainingRun:
         )
 
 
-def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
+def make_both(cfg: Any, maps: list, words: Any = None) -> tuple[Learner, Experience]:
     """The networks that learn and what gathers their experience, each on its device.
+
+    Args:
+        cfg: the settings
+        maps: those of the first scenario
+        words: the settings that the run's own words come to, where `cfg` holds values of a checkpoint too
 
     Raises:
         UserError, ValueError: settings that cannot be used.
@@ -245,13 +251,14 @@ def make_both(cfg: Any, maps: list) -> tuple[Learner, Experience]:
     check_collector(cfg.collector)
     alone, workers = cfg.collector.backend == "single", cfg.collector.workers
     here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
-    others = other_scenarios(cfg)
+    words = cfg if words is None else words
+    others = other_scenarios(cfg, words)
     if others and not alone:
         raise UserError(f"scenario.also={list(cfg.scenario.also)} needs collector=single.")
     places = [(cfg, maps), *((one, load_maps(one.scenario).train) for one in others)]
     sizes = team_sizes(cfg.num_robots)
     teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
-    whole = cfg.collector.steps is None  # episodes, which differ in length from scenario to scenario
+    whole = words.collector.steps is None  # episodes, which differ in length from scenario to scenario
     envs = [
         make_env(*places[k // len(sizes)], one.num_robots, one.num_envs if alone else 1,
                  device=here if alone else there, first_env=one.first_env)
