@@ -140,15 +140,16 @@ def test_resumed_is_uninterrupted(algorithm):
 
 def test_teams_of_several_sizes_in_one_batch(capsys):
     """Resumed is uninterrupted; the teams are those that runs of one size would have; each size is evaluated."""
-    words = ["num_robots=1,3", "num_envs=5"]
+    words = ["num_robots=1,3", "num_envs=5", "classical=[]"]
     frames = [f"total_frames={count * 5 * 2}" for count in (6, 3)]
     for folder, count in (("whole", frames[0]), ("parts", frames[1])):
         assert main(["train", *TINY, *words, f"hydra.run.dir={folder}", count, "episodes=3"]) == 0
     summary = json.loads(Path("parts/summary.json").read_text())
-    assert {name for name in summary if name != "run"} == {f"{p} N={n}" for p in ("trained", "random") for n in (1, 3)}
+    teams = {f"{policy} N={n}" for policy in ("trained", "random") for n in (1, 3)}
+    assert summary.keys() - {"run", "difference"} == teams
     assert summary["run"]["num_robots"] == [1, 3]
     assert "5 teams of 1 and 3 robots" in capsys.readouterr().out
-    assert main(["train", "resume=parts", frames[0], "episodes=0"]) == 0
+    assert main(["train", "resume=parts", frames[0], "episodes=3"]) == 0
     assert_same_runs(Path("whole"), Path("parts"))
     assert main(["train", "resume=parts", "num_robots=1,2"]) == 2
     assert "num_robots=1,3, not num_envs=5 num_robots=1,2" in capsys.readouterr().err
