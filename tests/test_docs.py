@@ -58,7 +58,7 @@ def test_own_training_loop():
     (code,) = blocks("docs/torchrl.md", "python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 30
     names = run_block(code, "docs/torchrl.md")
-    assert names["batch"].shape == (4, 6) and names["log_prob"].numel() == 4 * 6
+    assert names["batch"].shape == (4, 6) and names["log_prob"].shape == (4, 6, 3)
     for value in names["log_prob"].values(True, True):
         assert value.shape == (4, 6, 3)  # one per robot: not the joint action's
     assert torch.isfinite(names["loss"])
