@@ -102,8 +102,9 @@ def grid(*sizes: int) -> list[tuple]:
 # Worker processes
 
 TINY = [
-    "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3", "scenario.local_steps=5",
-    "num_envs=4", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0", "device=cpu",
+    "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
+    "scenario.local_steps=5", "num_envs=4", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
+    "device=cpu",
 ]  # fmt: skip
 BATCH = 8
 

@@ -45,7 +45,7 @@ def somewhere(tmp_path, monkeypatch):
 class Results:
     """Stands in for an evaluation with a long summary."""
 
-    policy, num_robots, place = "one", 3, None
+    policy, num_robots, place, learned = "one", 3, None, False
 
     def __init__(self, count: int = 1):
         self.count = count

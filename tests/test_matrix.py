@@ -22,7 +22,7 @@ def experience(scenario: str, path: str | None):
     """The policy and the batch [2 envs, 3 macro steps] it collected, once per scenario."""
     torch.manual_seed(0)
     place = [f"scenario.path='{path}'"] if path else ["scenario.maps=[0]", "scenario.held_out=[0]"]
-    small = ["model.channels=4", "scenario.local_steps=4", "num_envs=2", "device=cpu"]
+    small = ["action=regions", "model.channels=4", "scenario.local_steps=4", "num_envs=2", "device=cpu"]
     cfg = compose_config("train", [f"scenario={scenario}", *place, *small])
     env = make_env(cfg, load_maps(cfg.scenario).held_out, TEAM.get(scenario, 3))
     policy = make_policy(env, model_settings(cfg))

@@ -93,6 +93,7 @@ def test_yaml_holds_the_same_values():
 
 def test_a_run_is_played_as_it_was_trained():
     words = ["scenario=maze", "planner=wavefront", "reward=paper", "radar.range=8", "model.channels=8", "num_robots=2"]
+    words += ["collector.steps=30"]  # a run sets it to the episode's length
     saved = save(*words, scenario__macro_steps=7, reward__overlap=0.3, robot__wheelbase=0.7, algorithm__lr=0.25)
     before = flatten(saved["settings"])
     assert play(saved, "resume=x", verb="train") == before | {"resume": "x"}
