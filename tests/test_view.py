@@ -123,9 +123,8 @@ def test_film_shows_the_teams_at_the_same_time():
     frames = draw_film(episodes)
     assert len(frames) == 10
     for record in (2, 9):
-        left, right = (draw_frame(episodes[k].snapshot((record, min(record, 3))[k]), 360) for k in (0, 1))
-        shown = frames[record]  # pictures differ in height as the maps do
-        assert np.array_equal(shown[: len(left), :360], left) and np.array_equal(shown[: len(right), -360:], right)
+        left, right = (draw_frame(episodes[k].snapshot((record, min(record, 3))[k]), 440) for k in (0, 1))
+        assert np.array_equal(frames[record][:, :440], left) and np.array_equal(frames[record][:, -440:], right)
 
 
 @pytest.mark.parametrize("count", [1, 3])

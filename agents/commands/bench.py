@@ -20,7 +20,7 @@ def prepare(overrides: list[str]) -> Recipe:
     `bench env` measures both planners unless one is chosen.
     """
     names = [word.partition("=")[0] for word in overrides]
-    if find_override(overrides, "action") == "env" and not {"planner", "planner.name"} & set(names):
+    if find_override(overrides, "task") == "env" and not {"planner", "planner.name"} & set(names):
         overrides = [*overrides, "planner=wavefront,dwa"]
     return Recipe(move_sweeps(overrides, ONE_VALUE))
 
