@@ -164,11 +164,12 @@ class Report:
     def describe(self, scenarios: list[str]) -> dict:
         """What was run, of the cells that are done."""
         known = {cell: one.run for (cell, _), one in self._results.items() if cell.scenario in scenarios}
-        runs = [one.run for (cell, _), one in self._results.items() if cell.scenario in scenarios]
+        chosen = [(suite, one.run) for (cell, suite), one in self._results.items() if cell.scenario in scenarios]
+        runs = [run for _, run in chosen]
         return {
             "preset": self.cfg.preset,
             "scenario": scenarios[0] if len(scenarios) == 1 else scenarios,
-            "maps": sorted({name for one in runs for name in one["maps"]}),
+            "maps": sorted({name for suite, run in chosen if suite in self.suites for name in run["maps"]}),
             "maps_are": self.suites,
             "seeds": sorted({cell.seed for cell in known}),
             "episodes": self.cfg.episodes,
