@@ -97,7 +97,8 @@ def small(line: str) -> list[str]:
     if any(word.endswith("_device=cuda:1") or word.endswith("_device=cuda") for word in words):
         return [*words, "--cfg", "job"]  # its settings are good; a machine with such devices runs it in test_cuda.py
     more = SMALLER.get(words[0], ())
-    if words[0] in SMALLER and not any(w.startswith(("scenario=pointcloud", "checkpoint=", "resume=")) for w in words):
+    own = ("scenario=pointcloud", "checkpoint=", "resume=")
+    if words[0] in SMALLER and words[0] != "irsim" and not any(word.startswith(own) for word in words):
         more = (*more, *OWN_MAPS)
     if any(word.startswith("resume=") for word in words):
         more = ("algorithms=mappo",) if words[0] == "benchmark" else ()
