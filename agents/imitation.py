@@ -26,6 +26,7 @@ from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
+from maexp.agents.settings.resolved import model_settings
 from maexp.agents.train import check_action, load_matching
 from maexp.agents.updaters import Meter
 
@@ -39,10 +40,21 @@ def check_warm_start(cfg: Any) -> None:
     check_counts(cfg, "warm_start_frames")
     if cfg.warm_start in POLICIES:
         check_goals([cfg.warm_start], cfg.planner.name)
+        _check_kind(cfg, "regions")
     elif cfg.warm_start is not None and not Path(cfg.warm_start).exists():
         raise UserError(
             f"warm_start={cfg.warm_start} is neither a run's folder, a checkpoint, nor a policy: choose one of "
             f"{', '.join(POLICIES)}."
+        )
+
+
+def _check_kind(cfg: Any, taught: str) -> None:
+    """Raise UserError where the teacher chooses something else than the policy that is to imitate it."""
+    chosen = model_settings(cfg).action
+    if chosen != taught:
+        raise UserError(
+            f"warm_start={cfg.warm_start} chooses {taught}, which a policy with action={chosen} cannot imitate: "
+            f"add action={taught}."
         )
 
 
@@ -52,6 +64,7 @@ def load_teacher(cfg: Any, env: Any) -> Any:
         return POLICIES[cfg.warm_start](env)
     _, saved = find_checkpoint(cfg.warm_start)
     check_action(saved, cfg)
+    _check_kind(cfg, model_of(saved).action)
     policy = make_policy(env, model_of(saved))
     load_matching(policy, saved["policy"])
     return policy

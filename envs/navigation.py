@@ -245,10 +245,6 @@ class Navigation:
         index = torch.stack([cells % width, cells // width], dim=-1) + 0.5
         return self.origin[m].view(*shape, 2) + index * self.cell_size[m].view(*shape, 1)
 
-    def first_points(self, ahead: float) -> torch.Tensor:
-        """Points ``ahead`` [cells] in front of every robot on its way to every target: float32 [E, N, K, 2] [m]."""
-        return self.points_on_way(self.target.expand(-1, self.num_robots, -1), ahead)
-
     def points_on_way(self, cells: torch.Tensor, ahead: float) -> torch.Tensor:
         """Points ``ahead`` [cells] in front of robots on their ways to ``cells``, int64 [E, N, M], -1 = none.
 

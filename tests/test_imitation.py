@@ -155,6 +155,7 @@ def test_a_trained_team_of_another_size_of_network_is_a_teacher_too():
     [
         (["warm_start=nobody"], "warm_start=nobody is neither a run's folder, a checkpoint, nor a policy"),
         (["warm_start=voronoi", "planner=direct"], "planner=direct takes controls, and voronoi picks goals"),
+        (["warm_start=voronoi", "action=targets"], "voronoi chooses regions, which a policy with action=targets"),
         (["warm_start=voronoi", "warm_start_frames=0"], "warm_start_frames=0 must be a whole number, 1 or more"),
     ],
 )
