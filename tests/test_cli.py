@@ -1,6 +1,7 @@
 """The command line: what it prints, how it refuses, where it writes."""
 
 import json
+import logging
 import subprocess
 import sys
 from pathlib import Path
@@ -192,3 +193,10 @@ def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "results.json, coverage.png, metrics.png, shares.png, picture.png, config.yaml" in printed
     assert "nearest_frontier N=2" in printed and "maze_small: 3 held-out episodes, for each team size" in printed
+
+
+def test_a_sweep_leaves_the_loggers_of_the_program_around_it_alone(tmp_path, monkeypatch):
+    log = logging.getLogger("maexp.runtime")
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "-m", "seed=0,1", "num_envs=-1"]) == 2
+    assert not log.disabled

@@ -14,6 +14,7 @@ GOOD = {
     "gamma": [0, 1.0], "lmbda": [0, 1], "final_lr_share": [0, 1], "accept_ratio": [0, 1],
     "lr": [1e-9, 2], "critic_lr": [1e-9], "max_grad_norm": [1e-3], "kl_target": [1e-6], "max_kl": [1e-6],
     "entropy_coeff": [0], "critic_coeff": [0], "clip_value": [0, 10], "kl_coeff": [0], "damping": [0],
+    "anchor_coeff": [0, 3],
     "clip_epsilon": [0.01, 0.99], "backtrack_factor": [0.01, 0.99],
     **{name: [True, False] for name in ("value_norm", "normalize_advantage", "finite_horizon", "mask_collided")},
     "mixer": ["vdn", "qmix"],
@@ -25,7 +26,9 @@ BAD = {
     "gamma": [-0.1, 1.1, 2], "lmbda": [-1, 2], "final_lr_share": [-0.5, 1.5], "accept_ratio": [-0.1, 1.1],
     "clip_epsilon": [-1, 0, 1], "backtrack_factor": [0, 1], "mixer": ["sum", ""],
     **{name: [0, -1] for name in ("lr", "critic_lr", "max_grad_norm", "kl_target", "max_kl")},
-    **{name: [-1e-9] for name in ("entropy_coeff", "critic_coeff", "clip_value", "kl_coeff", "damping")},
+    **{name: [-1e-9] for name in (
+        "entropy_coeff", "critic_coeff", "clip_value", "kl_coeff", "damping", "anchor_coeff",
+    )},
     **{name: [0, -3, 1.5, True] for name in (
         "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
     )},
@@ -51,7 +54,7 @@ def test_every_setting_of_an_algorithm_has_its_range(name):
 @pytest.mark.parametrize("name", [one.name for one in fields(ModelConfig)])
 def test_every_size_of_a_network_has_its_range(name):
     kind = type(getattr(PRESETS["small"], name))
-    bad = {str: ["fft"], bool: [1], int: [0, -1, 2.0, 10**6, True]}[kind]
+    bad = {str: ["fft"], bool: [1], int: [0, -1, 2.0, 10**6, True], float: [-1e-9]}[kind]
     for value in bad + EVERYWHERE:
         with pytest.raises(ValueError, match=rf"model\.{name}=.*must be"):
             ModelConfig(**{name: value})
