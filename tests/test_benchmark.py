@@ -83,7 +83,8 @@ def test_the_papers_preset_has_its_288_runs():
     run, words = cell_config(cfg, Cell("maze", "itrpo", 2, map=3))
     assert (run.scenario.name, run.algorithm.name, run.seed, list(run.scenario.maps)) == ("maze", "itrpo", 2, [3])
     assert (run.num_envs, run.collector.steps, run.total_frames) == (2, 30, 10_000 * 2 * 30)
-    assert (run.algorithm.preset, run.model.preset, run.reward.events) == ("reference", "paper", 0.0)
+    assert (run.tuning, run.model.stem, run.reward.events) == ("reference", "conv", 0.0)
+    assert run.algorithm.max_kl == 0.06, "the original platform's"
     assert (run.planner.name, settings("preset=cpu").planner.name) == ("dwa", "wavefront")
     assert settings("preset=paper", "planner=wavefront").planner.name == "wavefront"
     assert cell_config(cfg, Cell("outdoor", "itrpo", 2, map=0))[0].collector.steps == 20

@@ -1,5 +1,7 @@
 """Settings: every choice composes, and what does not fit is refused in one sentence."""
 
+from dataclasses import asdict, fields
+
 import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
@@ -8,7 +10,18 @@ from maexp.agents.errors import UserError
 from maexp.agents.model import PRESETS
 from maexp.agents.settings.compose import compose_config, group_choices, groups
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
-from maexp.agents.settings.schema import SCHEMAS, schema
+from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
+from maexp.envs.config import (
+    CommConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    complete_planner,
+    complete_radar,
+    complete_robot,
+)
 from maexp.envs.scenarios import SCENARIOS
 
 
@@ -32,6 +45,46 @@ def test_choices_match_the_tables_of_the_code():
     assert set(group_choices("scenario")) == set(SCENARIOS)
     assert set(group_choices("algorithm")) == set(ALGORITHMS)
     assert set(group_choices("model")) == set(PRESETS)
+
+
+# conf/ holds the values, the dataclasses those of Python users: a default that changes, changes in both
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_conf_algorithm_holds_the_defaults(algorithm):
+    row, cfg = ALGORITHMS[algorithm], compose_config("train", [f"algorithm={algorithm}"])
+    assert given(cfg.algorithm, "name") == asdict(row.settings), f"conf/algorithm/{algorithm}.yaml"
+    tuned = compose_config("train", [f"algorithm={algorithm}", "tuning=reference"])
+    assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
+
+
+def test_conf_model_holds_the_presets():
+    for name, sizes in PRESETS.items():
+        assert given(compose_config("train", [f"model={name}"]).model) == asdict(sizes), f"conf/model/{name}.yaml"
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_conf_scenario_holds_the_table(scenario):
+    row, words = SCENARIOS[scenario], [f"scenario={scenario}", "scenario.path=x"]
+    held = given(compose_config("train", words[: 1 + (row.build is None)]).scenario)
+    supplied = [one.name for one in fields(row) if one.name in ScenarioSettings.__dataclass_fields__]
+    assert len(supplied) == 12, "all but count, resolution, size and build"
+    wanted = supplied if row.build else ["name"]  # whose map it is, is known when it is read
+    held = {name: value for name, value in held.items() if name in supplied}
+    assert held == {one: getattr(row, one) for one in wanted}, f"conf/scenario/{scenario}.yaml"
+
+
+@pytest.mark.parametrize("planner", ["dwa", "wavefront", "direct"])
+@pytest.mark.parametrize("scenario", ["maze", "indoor_small", "outdoor"])
+def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
+    cfg, row = compose_config("train", [f"scenario={scenario}", f"planner={planner}"]), SCENARIOS[scenario]
+    robot, radar = team_configs(cfg, 1)
+    assert complete_robot(robot, row) == complete_robot(RobotConfig(), row), "conf/robot/ackermann.yaml"
+    assert complete_radar(radar, row) == complete_radar(RadarConfig(), row), "conf/radar/lidar.yaml"
+    whole = complete_planner(PlannerConfig(name=planner), row)
+    assert complete_planner(PlannerConfig(**given(cfg.planner)), row) == whole, f"conf/planner/{planner}.yaml"
+    for group, kind in (("reward", RewardConfig), ("observation", ObservationConfig), ("comm", CommConfig)):
+        assert given(cfg[group]) == asdict(kind()), f"conf/{group}"
 
 
 def test_every_verb_composes():
@@ -105,7 +158,7 @@ def test_a_team_of_different_robots():
     cfg = compose_config("train", ["robot.team=[{kind: differential, radar: {range: 3}},{max_speed: 1}]"])
     robots, radars = team_configs(cfg, 3)
     assert [one.kind for one in robots] == ["differential", "ackermann", "differential"]
-    assert [one.range for one in radars] == [3, None, 3]
+    assert [one.range for one in radars] == [3, 10.0, 3]
     with pytest.raises(UserError, match="robot.team has no setting wings"):
         team_configs(compose_config("train", ["robot.team=[{wings: 2}]"]), 3)
 

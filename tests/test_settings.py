@@ -134,6 +134,20 @@ def test_a_group_chosen_anew_is_todays():
     assert play(saved, "planner.name=wavefront")["planner.clearance_factor"] == today["planner.clearance_factor"]
 
 
+def test_what_a_scenario_supplies_can_be_set_there():
+    saved = save(radar__range=99.0)
+    assert play(saved, "scenario.max_speed=3", "scenario.radar_range=5").items() >= {
+        "robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 1.5}.items()  # fmt: skip
+
+
+def test_older_names_of_groups():
+    saved = save("algorithm.preset=reference", "model.preset=paper")
+    assert saved["settings"]["algorithm"]["lr"] == 0.0001 and saved["settings"]["model"]["channels"] == 32
+    del saved["settings"], saved["followers"]
+    with pytest.warns(UserWarning, match="an earlier version"):
+        assert play(saved)["model.channels"] == 32
+
+
 def test_the_wheelbase_follows_the_body():
     saved = save(robot__wheelbase=0.7)
     assert play(saved)["robot.wheelbase"] == 0.7
@@ -222,9 +236,11 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
 
 def test_the_papers_set_up_is_the_same_for_every_verb():
     for verb in ("train", "evaluate", "benchmark"):
-        cfg = compose_config(verb, ["preset=paper", "algorithm=vda2c"] + ["policy=random"] * (verb == "evaluate"))
+        cfg = compose_config(verb, ["preset=paper"])
         assert (cfg.planner.name, cfg.reward.overlap, cfg.reward.events) == ("dwa", 0.01, 0.0)
-        assert algorithm_settings(cfg) == ALGORITHMS["vda2c"].reference
+        assert (cfg.tuning, cfg.model.stem) == ("reference", "conv")
+    cfg = compose_config("train", ["preset=paper", "algorithm=vda2c"])
+    assert algorithm_settings(cfg) == ALGORITHMS["vda2c"].reference
     cfg = compose_config("train", ["preset=paper", "planner=wavefront", "algorithm.lr=0.5"])
     assert (cfg.planner.name, model_settings(cfg).channels, algorithm_settings(cfg).lr) == ("wavefront", 32, 0.5)
     assert model_settings(compose_config("train", ["preset=paper", "model=small"])).channels == 16

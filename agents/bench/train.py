@@ -12,7 +12,9 @@ from maexp.agents.build import Learner, load_maps, make_env, make_learner, set_s
 from maexp.agents.checkpoint import seed_everything
 from maexp.agents.collect import Stopwatch, make_collector
 from maexp.agents.memory import check_batch_memory
+from maexp.agents.model import PRESETS
 from maexp.agents.progress import Progress
+from maexp.agents.settings.resolved import model_settings
 from maexp.envs import ExplorationEnv
 
 TEAM_SIZES = [3]
@@ -63,7 +65,7 @@ class Trainee:
         steps = self.env.num_envs * cfg.collector.steps
         return describe_point(self.env, cfg) | {
             "algorithm": cfg.algorithm.name,
-            "model": cfg.model.preset or "small",
+            "model": next((name for name, one in PRESETS.items() if one == model_settings(cfg)), "own"),
             "parameters": sum(one.numel() for network in networks for one in network.parameters()),
             "macro_steps": steps,
             "iterations": len(laps),

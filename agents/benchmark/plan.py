@@ -26,7 +26,7 @@ PLAN = "benchmark.json"
 SUITES = {"held_out": "held-out maps", "trained": "training maps"}
 SECTIONS = (
     "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
-    "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
+    "tuning", "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
 )  # fmt: skip
 """Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
 OWN = ("scenario.name", "algorithm.name")  # each cell has its own
@@ -136,7 +136,7 @@ def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
     """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
     words = [f"scenario={cell.scenario}", f"seed={cell.seed}"]
     words += [f"algorithm={cell.policy}"] if cell.trains else []
-    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_train_defaults(), plain(cfg)))
+    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), raw(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
     changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
     if not cell.trains:
@@ -145,9 +145,16 @@ def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
 
 
 @cache
-def _train_defaults() -> dict:
-    """The settings of maexp train without overrides."""
-    return plain(compose_settings("train", []))
+def _usual() -> dict:
+    """The settings of maexp train without overrides; of scenario and algorithm, which are each cell's own, what is set
+    for all cells without overrides."""
+    own = raw(compose_settings("benchmark", []))
+    return raw(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
+
+
+def raw(cfg: Any) -> dict:
+    """Settings as plain containers, references to the scenario as they are."""
+    return OmegaConf.to_container(cfg, resolve=False)
 
 
 def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
@@ -198,7 +205,7 @@ def render(value: Any) -> str:
         return "{" + ",".join(f"{name}:{render(one)}" for name, one in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ",".join(render(one) for one in value) + "]"
-    return quote(str(value))
+    return str(value) if str(value).startswith("${scenario.") else quote(str(value))
 
 
 # The folder

@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.legacy import old_defaults
-from maexp.agents.settings.overrides import without
+from maexp.agents.settings.overrides import rename, without
 from maexp.agents.settings.resolved import flatten, plain
 from maexp.agents.settings.runs import Recipe
 
@@ -74,6 +74,7 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
     """
     from maexp.agents.settings.schema import register_schema
 
+    overrides = rename(overrides)
     register_schema(verb)
     GlobalHydra.instance().clear()
     try:

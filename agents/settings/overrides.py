@@ -14,6 +14,8 @@ PATHS = (
     "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir",
     "hydra.sweep.dir",
 )  # fmt: skip
+RENAMED = {"algorithm.preset": "tuning", "model.preset": "model", "planner.name": "planner"}
+"""Settings that are groups now: a choice brings all its values."""
 LISTS = {
     "train": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
@@ -94,6 +96,12 @@ def split_paths(text: str) -> list[str]:
     parts = [one.strip() for one in text.split(",") if one.strip()]
     single = Path(text).expanduser().exists() or not all(Path(one).suffix for one in parts)
     return [text] if single else parts
+
+
+def rename(overrides: list[str]) -> list[str]:
+    """`overrides` with the groups that took the place of single settings."""
+    parts = [word.partition("=") for word in overrides]
+    return [f"{RENAMED.get(name, name)}{sign}{value}" for name, sign, value in parts]
 
 
 def quote(text: str) -> str:

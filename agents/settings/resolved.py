@@ -1,14 +1,13 @@
 """The values that settings come to: what is null in the composed settings is filled in from where it comes."""
 
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
 
 from maexp.agents.algorithms import Settings, find_algorithm
-from maexp.agents.errors import UserError
-from maexp.agents.model import PRESETS, ModelConfig
+from maexp.agents.model import ModelConfig
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.schema import given
 from maexp.envs.config import (
@@ -101,26 +100,26 @@ def _resolve_planner(cfg: Any, row: Scenario) -> dict[str, Any]:
 
 
 def algorithm_settings(cfg: Any) -> Settings:
-    """The settings of the algorithm: those of its preset with some values replaced."""
-    row = find_algorithm(cfg.algorithm.name)
-    return row.configure(cfg.algorithm.preset or "default", **given(cfg.algorithm, "name", "preset"))
+    """The settings of the algorithm."""
+    return find_algorithm(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
 
 
 def model_settings(cfg: Any) -> ModelConfig:
-    """The sizes of the networks: those of a preset with some values replaced."""
-    preset = cfg.model.preset or "small"
-    if preset not in PRESETS:
-        raise UserError(f"model.preset={preset} is unknown: choose one of {', '.join(PRESETS)}.")
-    return replace(PRESETS[preset], **given(cfg.model, "preset"))
+    """The sizes of the networks."""
+    return ModelConfig(**given(cfg.model))
 
 
 def find_followers(cfg: Any) -> list[str]:
-    """Names of the settings that are null and follow the scenario, as radar.range."""
+    """Names of the settings that follow the scenario, as radar.range: null, or a reference to what it says."""
     names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
     for group, kind in FOLLOWERS.items():
         names += [f"{group}.{one.name}" for one in fields(kind) if one.default is None]
-    found = [name for name in names if OmegaConf.select(cfg, name) is None]
+    found = [name for name in names if _follows(cfg, *name.split("."))]
     return found + ["robot.team"] * bool(cfg.robot.team)
+
+
+def _follows(cfg: Any, group: str, name: str) -> bool:
+    return OmegaConf.is_interpolation(cfg[group], name) or cfg[group][name] is None
 
 
 def _without_null(node: dict) -> dict:

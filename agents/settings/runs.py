@@ -14,12 +14,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.legacy import old_defaults
-from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.overrides import find_override, rename, without
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import schema
 
 GROUPS = ("scenario", "robot", "radar", "planner", "reward", "observation", "comm", "algorithm", "model")
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
+CALLED = {"radar.range": "radar_range", "robot.length": "body_length", "robot.width": "body_width"}
+"""What the scenario calls them, where that is another name."""
 BODY = ("robot.length", "robot.width")
 HELD_OUT = ("scenario.held_out", "scenario.held_out_count")  # one of the two
 
@@ -49,19 +51,21 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         new: overrides of the command line
         leave_out: settings of the run that do not matter here
     """
+    new, own = rename(new), rename(saved["overrides"])
     known = schema(verb).__dataclass_fields__
     values = flatten(saved.get("settings", {}))
-    if preset := find_override(new, "preset"):
-        raise UserError(
-            f"preset={preset} stands for many settings, and those of {path} are kept: name the ones to change."
-        )
+    for name in ("preset", "tuning"):
+        if choice := find_override(new, name):
+            raise UserError(
+                f"{name}={choice} stands for many settings, and those of {path} are kept: name the ones to change."
+            )
     foreign = [name for name in schema("train").__dataclass_fields__ if name not in known]
     chosen = _chosen_anew(values, new)
-    leave_out += ("preset",) * (verb != "train")
+    leave_out += ("preset", "tuning") * (verb != "train")
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
     left_out += HELD_OUT if {*HELD_OUT} & {*_names(new)} else ()
-    kept = without(saved["overrides"], *left_out)
-    old = without(old_defaults([*saved["overrides"], *new]), *left_out)
+    kept = without(own, *left_out)
+    old = without(old_defaults([*own, *new]), *left_out)
     if not values:
         _warn_of_old_defaults(path, old)
         return Recipe([*kept, *new], old)
@@ -106,7 +110,7 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers
-    gone = [one for one in followers if one.startswith("planner.") and "planner.name" in names]
+    gone = [one for one in followers if f"scenario.{CALLED.get(one, one.partition('.')[2])}" in names]
     gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*BODY, "robot.team"} & {*names}))
     if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode
         gone += ["scenario.macro_steps"] * ("scenario.macro_steps" in followers)

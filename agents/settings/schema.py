@@ -1,8 +1,8 @@
 """Types of the settings, registered with Hydra: a misspelt name or a word in a number's place is refused.
 
 Values live in `conf/`, types here. Where settings belong to a class of the layers below (`RobotConfig`,
-`ModelConfig`, ...), their names and types are read from that class, each optional: null keeps the value of the
-scenario or preset.
+`ModelConfig`, ...), their names and types are read from that class, each optional: null where a group does not have
+the setting, or where its value follows from the map.
 """
 
 import types
@@ -63,21 +63,21 @@ def describe(cls: type) -> list[tuple[str, Any, str]]:
 
 
 RobotSettings = optional_settings(RobotConfig, team=Any)  # team: a list of settings, one per robot
-ModelSettings = optional_settings(ModelConfig, preset=str | None)
+ModelSettings = optional_settings(ModelConfig)
 RadarSettings = optional_settings(RadarConfig)
 PlannerSettings = optional_settings(PlannerConfig)
 RewardSettings = optional_settings(RewardConfig)
 ObservationSettings = optional_settings(ObservationConfig)
 CommSettings = optional_settings(CommConfig)
 AlgorithmSettings = optional_settings(
-    *{type(row.settings): None for row in ALGORITHMS.values()}, name=str | None, preset=str | None
+    *{type(row.settings): None for row in ALGORITHMS.values()}, name=str | None
 )
 ImportSettings = optional_settings(ImportOptions)
 
 
 @dataclass
 class ScenarioSettings:
-    """Where the team explores. Null: what the table of scenarios says."""
+    """Where the team explores, and what robot, radar and planner take from there. Null: what the map says."""
 
     name: str = MISSING
     also: Any = None  # further scenarios to train on, as [maze,outdoor], each with its own robots and episode
@@ -89,6 +89,15 @@ class ScenarioSettings:
     local_steps: int | None = None  # control steps in one decision
     macro_steps: int | None = None  # decisions in one episode
     starts: str = "drawn"  # anew at every reset; fixed: once for each map; or a .csv or .npy file of x, y, heading
+    radar_range: float | None = None
+    max_speed: float | None = None
+    max_accel: float | None = None
+    body_length: float | None = None
+    body_width: float | None = None
+    collision_threshold: float | None = None
+    clearance_factor: float | None = None
+    num_steering: int | None = None
+    max_steer: float | None = None
     success_coverage: float = 0.95
     collision: str = "centre"  # or footprint
     importing: ImportSettings = field(default_factory=ImportSettings)
@@ -138,6 +147,7 @@ class LearnerSettings(EnvSettings):
     """Settings of everything that has a network."""
 
     algorithm: AlgorithmSettings = field(default_factory=AlgorithmSettings)
+    tuning: str = "default"  # or reference
     model: ModelSettings = field(default_factory=ModelSettings)
 
 
