@@ -31,8 +31,6 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     "action=regions",
     "reward.overlap=0.01",
     _wheelbase,
-    "reward.charge_rest=false",
-    "algorithm.finite_horizon=false",
     "collector.steps=15",
     "scenario.validation=[]",
     "reward.charge_rest=false",

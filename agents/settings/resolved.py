@@ -64,6 +64,8 @@ def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
         settings["comm"] = asdict(CommConfig(**given(cfg.comm)))
         settings["algorithm"] = {"name": cfg.algorithm.name} | asdict(algorithm_settings(cfg))
         settings["model"] = asdict(model_settings(cfg))
+        if "collector" in settings and settings["collector"]["steps"] is None:  # one whole episode
+            settings["collector"]["steps"] = settings["scenario"]["macro_steps"]
     return _without_null(settings)
 
 
