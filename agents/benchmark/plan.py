@@ -139,6 +139,7 @@ def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
     usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), raw(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
     changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
+    changed = {name: value for name, value in changed.items() if not (name.startswith("algorithm.") and value is None)}
     if not cell.trains:
         changed = {name: value for name, value in changed.items() if not name.startswith("algorithm.")}
     return words + [f"{name}={render(value)}" for name, value in changed.items()]

@@ -103,6 +103,13 @@ class ScenarioSettings:
     importing: ImportSettings = field(default_factory=ImportSettings)
 
 
+SUPPLIED = (
+    "local_steps", "macro_steps", "radar_range", "max_speed", "max_accel", "body_length", "body_width",
+    "collision_threshold", "clearance_factor", "num_steering", "max_steer",
+)  # fmt: skip
+"""What a scenario's file supplies; null: what the map's own scenario says."""
+
+
 @dataclass
 class CollectorSettings:
     """How experience is gathered."""
