@@ -16,7 +16,7 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
-from maexp.agents.settings.schema import given
+from maexp.agents.settings.schema import SUPPLIED, given
 from maexp.agents.updaters import Updater
 from maexp.envs import (
     CommConfig,
@@ -172,7 +172,7 @@ def _with_scenario(cfg: Any, words: Any, name: str) -> Any:
         raise UserError(f"scenario.also={name} is no scenario with maps of its own: choose among {known}.")
     other = copy.deepcopy(cfg)
     other.scenario.name = name
-    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", "local_steps", "macro_steps"):
+    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED):
         other.scenario[setting] = None
     raw = OmegaConf.to_container(words, resolve=False)
     for group, setting in (one.split(".") for one in find_followers(words)):

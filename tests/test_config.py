@@ -47,20 +47,22 @@ def test_choices_match_the_tables_of_the_code():
     assert set(group_choices("model")) == set(PRESETS)
 
 
+REGIONS = ["action=regions"]  # action=targets brings settings of its own
+
 # conf/ holds the values, the dataclasses those of Python users: a default that changes, changes in both
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_conf_algorithm_holds_the_defaults(algorithm):
-    row, cfg = ALGORITHMS[algorithm], compose_config("train", [f"algorithm={algorithm}"])
+    row, cfg = ALGORITHMS[algorithm], compose_config("train", [*REGIONS, f"algorithm={algorithm}"])
     assert given(cfg.algorithm, "name") == asdict(row.settings), f"conf/algorithm/{algorithm}.yaml"
-    tuned = compose_config("train", [f"algorithm={algorithm}", "tuning=reference"])
+    tuned = compose_config("train", [f"algorithm={algorithm}", "action=targets", "tuning=reference"])
     assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
 
 
 def test_conf_model_holds_the_presets():
     for name, sizes in PRESETS.items():
-        assert given(compose_config("train", [f"model={name}"]).model) == asdict(sizes), f"conf/model/{name}.yaml"
+        assert given(compose_config("train", [*REGIONS, f"model={name}"]).model) == asdict(sizes), f"conf/model/{name}.yaml"
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -77,7 +79,7 @@ def test_conf_scenario_holds_the_table(scenario):
 @pytest.mark.parametrize("planner", ["dwa", "wavefront", "direct"])
 @pytest.mark.parametrize("scenario", ["maze", "indoor_small", "outdoor"])
 def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
-    cfg, row = compose_config("train", [f"scenario={scenario}", f"planner={planner}"]), SCENARIOS[scenario]
+    cfg, row = compose_config("train", [*REGIONS, f"scenario={scenario}", f"planner={planner}"]), SCENARIOS[scenario]
     robot, radar = team_configs(cfg, 1)
     assert complete_robot(robot, row) == complete_robot(RobotConfig(), row), "conf/robot/ackermann.yaml"
     assert complete_radar(radar, row) == complete_radar(RadarConfig(), row), "conf/radar/lidar.yaml"

@@ -26,7 +26,8 @@ PLAN = "benchmark.json"
 SUITES = {"held_out": "held-out maps", "trained": "training maps"}
 SECTIONS = (
     "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
-    "tuning", "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
+    "action", "tuning", "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep",
+    "num_threads",
 )  # fmt: skip
 """Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
 OWN = ("scenario.name", "algorithm.name")  # each cell has its own
