@@ -62,7 +62,8 @@ def test_conf_algorithm_holds_the_defaults(algorithm):
 
 def test_conf_model_holds_the_presets():
     for name, sizes in PRESETS.items():
-        assert given(compose_config("train", [*REGIONS, f"model={name}"]).model) == asdict(sizes), f"conf/model/{name}.yaml"
+        held = given(compose_config("train", [*REGIONS, f"model={name}"]).model)
+        assert held == asdict(sizes), f"conf/model/{name}.yaml"
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
