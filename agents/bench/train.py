@@ -1,7 +1,7 @@
 """`maexp bench train`: where the time of a training iteration goes, over algorithms, networks and team sizes."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +65,19 @@ class Trainee:
         steps = self.env.num_envs * cfg.collector.steps
         return describe_point(self.env, cfg) | {
             "algorithm": cfg.algorithm.name,
-            "model": next((name for name, one in PRESETS.items() if one == model_settings(cfg)), "own"),
+            "model": _model_name(cfg),
             "parameters": sum(one.numel() for network in networks for one in network.parameters()),
             "macro_steps": steps,
             "iterations": len(laps),
             "seconds": seconds,
             "robot_macro_steps_per_second": steps * self.env.num_robots / seconds["iteration"]["median"],
         }
+
+
+def _model_name(cfg: Any) -> str:
+    """The preset whose sizes these are."""
+    sizes = replace(model_settings(cfg), action="regions")
+    return next((name for name, one in PRESETS.items() if one == sizes), "own")
 
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> None:
