@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -242,7 +243,8 @@ def read_plan(place: str | Path) -> dict:
 def shared_settings(cfg: Any) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
-    return {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
+    shared = {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
+    return {name: "inf" if value == math.inf else value for name, value in shared.items()}  # JSON has no infinity
 
 
 def _is_free(name: str) -> bool:
