@@ -1,4 +1,4 @@
-"""The six algorithms: for each its loss, critic, updater and settings. An algorithm is only its difference."""
+"""The six algorithms: for each its loss, critic, updater and settings."""
 
 from dataclasses import dataclass, fields, replace
 

@@ -5,7 +5,7 @@ All but `random` look into the env: what the team knows as a grid, its frontiers
 from every robot to every target. They differ in which target each robot takes. How it is approached they share
 (`envs/targets.py`).
 
-Sources and tuning: docs/planners.md.
+Sources: docs/planners.md. Tuning: docs/notes.md.
 """
 
 from __future__ import annotations

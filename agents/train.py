@@ -293,7 +293,7 @@ def check_collector(settings: Any) -> None:
 
 
 def describe_teams(cfg: Any) -> str:
-    """Which teams a run has, as one types it."""
+    """The settings that choose a run's teams, as they are written on the command line."""
     return f"num_envs={cfg.num_envs} num_robots={','.join(map(str, team_sizes(cfg.num_robots)))}"
 
 

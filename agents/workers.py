@@ -168,12 +168,12 @@ class WorkerExperience(Experience):
                 raise WorkerLost(f"{lost}.") from error
 
     def update_policy_weights_(self) -> None:
-        """Act with what was learned: now, or in the batches after those in the making."""
+        """Act with the new weights: now, or, where workers are busy, from their next batch on."""
         if not self.pending:
             self._push(self.policy)
 
     def state_dict(self) -> dict[str, Any]:
-        """As for one process; and, where batches are in the making, the policy that makes them."""
+        """As for one process; while workers gather a batch, also the weights that they act with."""
         if self.pending:
             return self.before
         states = self._wait([Call(group.state_dict) for group in self.groups])

@@ -101,7 +101,7 @@ class CommConfig:
 
 
 MOST_TARGETS = 256  # that a robot is shown
-WAVEFRONT_CLEARANCE = 2.0  # clearance factor of the wavefront planner (measured in docs/planners.md)
+WAVEFRONT_CLEARANCE = 2.0  # clearance factor of the wavefront planner (measured in docs/notes.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
 
 

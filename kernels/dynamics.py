@@ -112,7 +112,7 @@ def _face_robots(
     facing: wp.array2d(dtype=wp.vec2),
     place: wp.array2d(dtype=wp.vec3),
 ):
-    """Note where robot (e, i) faces, for every robot near it asks, and in ``place`` a disc that it stays in this step.
+    """Write the heading of robot (e, i), which the robots near it read, and in ``place`` a disc it stays in this step.
 
     ``place`` is its centre's x and y and how far from there its body may reach before or after it moves [m].
     """

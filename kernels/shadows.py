@@ -2,8 +2,9 @@
 
 For every bin we keep the distance of the nearest occluder that may touch it (``near``) and of the nearest one
 that surely covers all of it (``full``). A free point nearer than ``near`` is visible, one behind ``full`` is
-masked, and only the rest meets the occluders one by one: the verdict is the same, bit for bit. Where only
-another robot's body may be near enough (``near`` of the static occluders is kept beside), it meets bodies only.
+masked. Only points between the two are tested against every occluder, so the verdict is the same, bit for bit.
+``near`` of the static occluders is kept apart: where only another robot's body may hide a point, it is tested
+against bodies only.
 
 Likewise an occluder all of whose bins are full nearer than itself decides nothing: every free point
 that it could mask is masked.
