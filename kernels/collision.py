@@ -38,22 +38,22 @@ def hits_boundary(
 def _detect_collisions(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     footprint: int,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch in:
-    near: wp.array3d(dtype=wp.int32),
-    near_count: wp.array2d(dtype=wp.int32),
+    near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State in and out:
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    collided: wp.array2d(dtype=wp.int32),
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Out:
-    crashed: wp.array2d(dtype=wp.int32),
+    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Mark the robots that collide in this local step in ``crashed``, and for good in ``collided``."""
     e, i = wp.tid()

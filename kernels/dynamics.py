@@ -104,13 +104,13 @@ def _face_robots(
     robots: Robots,
     dt: float,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch out:
-    facing: wp.array2d(dtype=wp.vec2),
-    place: wp.array2d(dtype=wp.vec3),
+    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    place: wp.array2d(dtype=wp.vec3),  # [env, robot]
 ):
     """Write the heading of robot (e, i), which the robots near it read, and in ``place`` a disc it stays in this step.
 
@@ -134,12 +134,12 @@ def _list_near(
     # Robots:
     robots: Robots,
     # State in:
-    active: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
     # Scratch in:
-    place: wp.array2d(dtype=wp.vec3),
+    place: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch out:
-    near: wp.array3d(dtype=wp.int32),
-    near_count: wp.array2d(dtype=wp.int32),
+    near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """List the robots whose bodies may be in radar range of robot (e, i), or touch it, before or after it moves.
 
@@ -166,16 +166,16 @@ def _move_robots(
     robots: Robots,
     dt: float,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    control: wp.array2d(dtype=wp.vec2),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # State out:
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    center: wp.array2d(dtype=wp.vec3),
-    path_length: wp.array2d(dtype=wp.float32),
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
     # Scratch out:
-    facing: wp.array2d(dtype=wp.vec2),
+    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Clamp the controls to the robot's limits and move it by one local step."""
     e, i = wp.tid()

@@ -17,15 +17,15 @@ wp.set_module_options({"enable_backward": False})  # nobody differentiates: half
 def _count_points(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    viewers_free: wp.array3d(dtype=wp.int32),
-    visible: wp.array3d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Out:
-    fresh: wp.array2d(dtype=wp.int32),
-    overlap: wp.array2d(dtype=wp.int32),
+    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Weigh the points robot (e, i) sees now: new to the team, seen by another now."""
     e, i = wp.tid()
@@ -50,16 +50,16 @@ def _count_points(
 def _merge_scan(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    visible: wp.array3d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State out:
-    seen_free: wp.array3d(dtype=wp.int32),
-    viewers_free: wp.array3d(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
-    shared: wp.array(dtype=wp.int32),
+    seen_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    covered: wp.array(dtype=wp.int32),  # [env]
+    shared: wp.array(dtype=wp.int32),  # [env]
 ):
     """Add the scan of robot (e, i) to what it has seen, and clear the scan's counts.
 
@@ -91,15 +91,15 @@ def _merge_scan(
 def _hear_robots(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     comm_range: float,
     line_of_sight: int,
     # State out:
-    comm: wp.array3d(dtype=wp.bool),
-    hears: wp.array3d(dtype=wp.int32),
+    comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
+    hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
 ):
     """Decide whom robot (e, i) hears: itself, and robots in range (and in sight, if asked)."""
     e, i = wp.tid()
@@ -137,12 +137,12 @@ def segment_distance(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
 @wp.kernel
 def _share_points(
     # State in:
-    active: wp.array(dtype=wp.int32),
-    hears: wp.array3d(dtype=wp.int32),
-    seen: wp.array3d(dtype=wp.int32),
-    told: wp.array3d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
+    seen: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    told: wp.array3d(dtype=wp.int32),  # [env, word, point]
     # State out:
-    known: wp.array3d(dtype=wp.int32),
+    known: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
     """Robot i knows a point if it has seen it or a robot it hears had seen or been ``told`` of it."""
     e, j = wp.tid()
@@ -168,10 +168,10 @@ def _share_points(
 @wp.kernel
 def _copy_flags(
     # State in:
-    active: wp.array(dtype=wp.int32),
-    flags: wp.array3d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
     # Scratch out:
-    copy: wp.array3d(dtype=wp.int32),
+    copy: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
     """Freeze flags, so that news travels one hop a step whatever the order of threads."""
     e, w, j = wp.tid()

@@ -57,20 +57,20 @@ def count_viewers(
 def _draw_points(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
-    mask: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    mask: wp.array(dtype=wp.int32),  # [env]
     robot_count: int,
     team_bits: int,
     lanes: int,
     # State in:
-    draw_free: wp.array3d(dtype=wp.int32),
-    draw_boundary: wp.array3d(dtype=wp.int32),
-    seen_free: wp.array3d(dtype=wp.int32),
-    viewers_free: wp.array3d(dtype=wp.int32),
-    viewers_boundary: wp.array3d(dtype=wp.int32),
+    draw_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
+    draw_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
+    seen_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
     # Out:
-    picture: wp.array4d(dtype=wp.uint8),
-    team: wp.array3d(dtype=wp.uint8),
+    picture: wp.array4d(dtype=wp.uint8),  # [env, robot, channel, pixel]
+    team: wp.array3d(dtype=wp.uint8),  # [env, channel, pixel]
 ):
     """Enter every known point of env e into the pictures of the robots (explored, obstacle) and of the team.
 
@@ -123,17 +123,17 @@ def _draw_points(
 def _list_bodies(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
-    mask: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    mask: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     # State in:
-    pose: wp.array2d(dtype=wp.vec4),
-    center: wp.array2d(dtype=wp.vec3),
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch out:
-    body_pixel: wp.array3d(dtype=wp.int32),
-    body_count: wp.array2d(dtype=wp.int32),
-    error: wp.array(dtype=wp.int32),
+    body_pixel: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    body_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """List the pixels whose centres lie in the body of robot (e, i), and the one nearest to its centre."""
     e, i = wp.tid()
@@ -178,14 +178,14 @@ def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.ar
 @wp.kernel
 def _draw_robots(
     # State in:
-    mask: wp.array(dtype=wp.int32),
-    comm: wp.array3d(dtype=wp.bool),
-    body_pixel: wp.array3d(dtype=wp.int32),
-    body_count: wp.array2d(dtype=wp.int32),
-    local_step: wp.array(dtype=wp.int32),
-    track: wp.array3d(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),  # [env]
+    comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
+    body_pixel: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    body_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    local_step: wp.array(dtype=wp.int32),  # [env]
+    track: wp.array3d(dtype=wp.int32),  # [env, robot, step]
     # Out:
-    picture: wp.array4d(dtype=wp.uint8),
+    picture: wp.array4d(dtype=wp.uint8),  # [env, robot, channel, pixel]
 ):
     """Draw bodies (own 255, others it hears 128) and the fading trajectory, 255 * 0.99^age, over cleared channels."""
     e, i = wp.tid()
@@ -213,14 +213,14 @@ def _draw_robots(
 def _record_track(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-    local_step: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    local_step: wp.array(dtype=wp.int32),  # [env]
     ahead: int,
     # State out:
-    track: wp.array3d(dtype=wp.int32),
+    track: wp.array3d(dtype=wp.int32),  # [env, robot, step]
 ):
     """Note the pixel of robot (e, i) under the step that is being finished (``ahead`` = 1) or starts (0)."""
     e, i = wp.tid()
@@ -234,17 +234,17 @@ def _record_track(
 def _observe_pose(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     # State in:
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    center: wp.array2d(dtype=wp.vec3),
-    goal: wp.array2d(dtype=wp.vec2),
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # Out:
-    scaled_pose: wp.array2d(dtype=wp.vec4),
-    grid: wp.array4d(dtype=wp.float32),
+    scaled_pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    grid: wp.array4d(dtype=wp.float32),  # [env, robot, channel, region]
 ):
     """Pose scaled to about [-1, 1]; offsets of the region centres to the robot and to its last goal, in frame sides."""
     e, i = wp.tid()

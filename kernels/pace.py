@@ -115,15 +115,15 @@ def room_ahead(
 def _fit_clearance(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     rows_per_env: int,
     # Robots:
     robots: Robots,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
     path_total: wp.array(dtype=wp.int32),  # [item]
     path_used: wp.array(dtype=wp.int32),  # [item]
@@ -153,21 +153,21 @@ def _fit_clearance(
 def _hold_back(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     rows_per_env: int,
     # Robots:
     robots: Robots,
     lead_time: float,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    center: wp.array2d(dtype=wp.vec3),
-    goal: wp.array2d(dtype=wp.vec2),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # State out:
-    target: wp.array2d(dtype=wp.vec2),
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Draws waypoints nearer, so that robots drive no faster than they can brake: before other robots, before what
     stands where they are moving, and before the goal.

@@ -164,7 +164,7 @@ def obstacle_distance(
 def _plan_dwa(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     num_accels: int,
@@ -175,23 +175,23 @@ def _plan_dwa(
     limited: int,
     dt: float,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    slip: wp.array2d(dtype=wp.float32),
-    center: wp.array2d(dtype=wp.vec3),
-    facing: wp.array2d(dtype=wp.vec2),
-    target: wp.array2d(dtype=wp.vec2),
-    known_boundary: wp.array3d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    known_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
     # Scratch in:
-    near: wp.array3d(dtype=wp.int32),
-    near_count: wp.array2d(dtype=wp.int32),
+    near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Scratch:
-    nearby: wp.array3d(dtype=wp.vec2),
-    mates: wp.array3d(dtype=wp.int32),
+    nearby: wp.array3d(dtype=wp.vec2),  # [env, robot, slot]
+    mates: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     # Out:
-    control: wp.array2d(dtype=wp.vec2),
-    error: wp.array(dtype=wp.int32),
+    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Dynamic window: the candidate with the best score after ``horizon`` steps.
 
@@ -281,10 +281,10 @@ def _plan_direct(
     # Robots:
     robots: Robots,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    command: wp.array2d(dtype=wp.vec2),
+    active: wp.array(dtype=wp.int32),  # [env]
+    command: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # Out:
-    control: wp.array2d(dtype=wp.vec2),
+    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Take the controls from the policy: shares of the robot's limits in [-1, 1]."""
     e, i = wp.tid()
@@ -303,16 +303,16 @@ def _plan_direct(
 def _set_goal(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Action:
-    region: wp.array2d(dtype=wp.int64),
-    offset: wp.array2d(dtype=wp.vec2),
+    region: wp.array2d(dtype=wp.int64),  # [env, robot]
+    offset: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # State in:
-    active: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
     # State out:
-    goal: wp.array2d(dtype=wp.vec2),
-    target: wp.array2d(dtype=wp.vec2),
-    error: wp.array(dtype=wp.int32),
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Goal = region centre + offset * half a region (region = ix * 8 + iy); out of bounds is clamped."""
     e, i = wp.tid()

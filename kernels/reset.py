@@ -55,17 +55,17 @@ def _place_team(
     # Robots:
     robots: Robots,
     # State in:
-    seed: wp.array(dtype=wp.int32),
-    mask: wp.array(dtype=wp.int32),
-    env_id: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
+    seed: wp.array(dtype=wp.int32),  # [1]
+    mask: wp.array(dtype=wp.int32),  # [env]
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
     starts: wp.array2d(dtype=wp.vec3),  # [env, robot] x, y [m], heading [rad]; inf: those of the map
     map_starts: wp.array2d(dtype=wp.vec3),  # [map, robot] the same; inf: drawn
     # State out:
-    map_id: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    center: wp.array2d(dtype=wp.vec3),
-    error: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Draw the map of a new episode and, where none is given, a start for every robot: clear of walls and of the
     others, any heading."""
@@ -113,9 +113,9 @@ def _place_team(
 @wp.kernel
 def _clear_flags(
     # State in:
-    mask: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
-    flags: wp.array3d(dtype=wp.int32),
+    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
     e, w, j = wp.tid()
     if mask[e] != 0:
@@ -125,17 +125,17 @@ def _clear_flags(
 @wp.kernel
 def _clear_env(
     # State in:
-    mask: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
-    covered: wp.array(dtype=wp.int32),
-    covered_before: wp.array(dtype=wp.int32),
-    covered_sum: wp.array(dtype=wp.int64),
-    shared: wp.array(dtype=wp.int32),
-    local_step: wp.array(dtype=wp.int32),
-    macro_step: wp.array(dtype=wp.int32),
-    terminated: wp.array(dtype=wp.int32),
-    milestone_step: wp.array2d(dtype=wp.int32),
-    milestone_overlap: wp.array2d(dtype=wp.float32),
+    covered: wp.array(dtype=wp.int32),  # [env]
+    covered_before: wp.array(dtype=wp.int32),  # [env]
+    covered_sum: wp.array(dtype=wp.int64),  # [env]
+    shared: wp.array(dtype=wp.int32),  # [env]
+    local_step: wp.array(dtype=wp.int32),  # [env]
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    terminated: wp.array(dtype=wp.int32),  # [env]
+    milestone_step: wp.array2d(dtype=wp.int32),  # [env, mark]
+    milestone_overlap: wp.array2d(dtype=wp.float32),  # [env, mark]
 ):
     e = wp.tid()
     if mask[e] == 0:
@@ -155,20 +155,20 @@ def _clear_env(
 @wp.kernel
 def _clear_robots(
     # State in:
-    mask: wp.array(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
+    mask: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # State out:
-    slip: wp.array2d(dtype=wp.float32),
-    control: wp.array2d(dtype=wp.vec2),
-    goal: wp.array2d(dtype=wp.vec2),
-    target: wp.array2d(dtype=wp.vec2),
-    collided: wp.array2d(dtype=wp.int32),
-    crashed: wp.array2d(dtype=wp.int32),
-    path_length: wp.array2d(dtype=wp.float32),
-    milestone_path: wp.array3d(dtype=wp.float32),
-    terms: wp.array3d(dtype=wp.float32),
-    raw: wp.array3d(dtype=wp.float32),
-    episode_reward: wp.array2d(dtype=wp.float32),
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
+    path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
+    milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
+    terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
+    raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
+    episode_reward: wp.array2d(dtype=wp.float32),  # [env, robot]
 ):
     e, i = wp.tid()
     if mask[e] == 0:
@@ -191,13 +191,13 @@ def _clear_robots(
 @wp.kernel
 def _start_env(
     # State in:
-    mask: wp.array(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
+    mask: wp.array(dtype=wp.int32),  # [env]
+    covered: wp.array(dtype=wp.int32),  # [env]
     # State out:
-    covered_before: wp.array(dtype=wp.int32),
-    active: wp.array(dtype=wp.int32),
-    fresh: wp.array2d(dtype=wp.int32),
-    overlap: wp.array2d(dtype=wp.int32),
+    covered_before: wp.array(dtype=wp.int32),  # [env]
+    active: wp.array(dtype=wp.int32),  # [env]
+    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """The scan at reset counts in coverage and earns nothing."""
     e = wp.tid()

@@ -60,20 +60,20 @@ def steps_charged(horizon: int, local_step: int, e: int, collided: wp.array2d(dt
 def _reward_robots(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     weights: RewardWeights,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    fresh: wp.array2d(dtype=wp.int32),
-    overlap: wp.array2d(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    crashed: wp.array2d(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
-    covered_before: wp.array(dtype=wp.int32),
-    local_step: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
+    covered: wp.array(dtype=wp.int32),  # [env]
+    covered_before: wp.array(dtype=wp.int32),  # [env]
+    local_step: wp.array(dtype=wp.int32),  # [env]
     # Out:
-    terms: wp.array3d(dtype=wp.float32),
-    raw: wp.array3d(dtype=wp.float32),
+    terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
+    raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
 ):
     """Add this local step's reward terms of robot (e, i): weighted in ``terms``, plain in ``raw``.
 
@@ -111,22 +111,22 @@ def _reward_robots(
 def _close_step(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     goal_coverage: float,
     # State in:
-    collided: wp.array2d(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
-    shared: wp.array(dtype=wp.int32),
-    path_length: wp.array2d(dtype=wp.float32),
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    covered: wp.array(dtype=wp.int32),  # [env]
+    shared: wp.array(dtype=wp.int32),  # [env]
+    path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
     # State in and out:
-    active: wp.array(dtype=wp.int32),
-    covered_before: wp.array(dtype=wp.int32),
-    covered_sum: wp.array(dtype=wp.int64),
-    local_step: wp.array(dtype=wp.int32),
-    milestone_step: wp.array2d(dtype=wp.int32),
-    milestone_overlap: wp.array2d(dtype=wp.float32),
-    milestone_path: wp.array3d(dtype=wp.float32),
-    terminated: wp.array(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    covered_before: wp.array(dtype=wp.int32),  # [env]
+    covered_sum: wp.array(dtype=wp.int64),  # [env]
+    local_step: wp.array(dtype=wp.int32),  # [env]
+    milestone_step: wp.array2d(dtype=wp.int32),  # [env, mark]
+    milestone_overlap: wp.array2d(dtype=wp.float32),  # [env, mark]
+    milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
+    terminated: wp.array(dtype=wp.int32),  # [env]
 ):
     """Count the local step, sum up the coverage, note when 85 % and 95 % are reached, end the episode on success or
     when all collided."""

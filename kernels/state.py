@@ -1,10 +1,11 @@
-"""State and scratch of a simulation: torch tensors that own the memory, Warp views that kernels read.
+"""State and scratch of a simulation: one table of every array, torch tensors that own the memory, Warp views.
 
 Rows of different envs never share memory, so a simulation is split into shards, runs of envs with
 Warp views of their own, and every shard may run in its own thread.
 """
 
 import math
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import torch
@@ -14,74 +15,181 @@ from maexp.kernels.reward import TERMS
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Robots
 
-# name: (axes, torch dtype, Warp dtype). Axes: E envs, N robots, W words of 32 robots, F free and B boundary points
-# of the largest map; H, P, Q are W, F, B where communication is limited and 1 elsewhere; T track length,
-# V visible points, K occluders, O boundary points in range, G pixels of a body; digits are literal.
+AXES = {
+    "E": ("env", "teams of the batch"),
+    "N": ("robot", "robots of a team"),
+    "W": ("word", "words of 32 robots; robot i owns bit i % 32 of word i // 32"),
+    "F": ("free", "free points of the largest map"),
+    "B": ("boundary", "boundary points of the largest map"),
+    "H": ("word", "as W where communication is limited, else 1"),
+    "P": ("free", "as F where communication is limited, else 1"),
+    "Q": ("boundary", "as B where communication is limited, else 1"),
+    "R": ("term", "terms of the reward"),
+    "M": ("mark", "coverage of 85 % and of 95 %"),
+    "T": ("step", "local steps that a trajectory remembers; step t stands at t % T"),
+    "S": ("slot", "entries of a list of robots, N"),
+    "V": ("slot", "entries of a list of visible points"),
+    "O": ("slot", "entries of a list of boundary points in range"),
+    "G": ("slot", "entries of a list of pixels of a body"),
+    "K": ("occluder", "entries of a list of occluders"),
+    "D": ("bin", "three times `shadows.BINS`: nearest occluder, nearest full cover, nearest of the walls"),
+    "1": ("1", "one"),
+}
+"""Letter: (name in the kernels' signatures, what is counted)."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """An array of the simulation.
+
+    Attributes:
+        kind: Warp type of an entry.
+        axes: letters of `AXES`; a vector's own length is none of them.
+        unit: of an entry, "" for numbers, flags and counts.
+        meaning: what an entry is.
+        written: who writes it: kernels, and ``host`` for torch code of `Simulation` and of the env.
+    """
+
+    kind: type
+    axes: str
+    unit: str
+    meaning: str
+    written: str
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of the torch tensor that owns the memory."""
+        return wp.dtype_to_torch(getattr(self.kind, "_wp_scalar_type_", self.kind))
+
+    def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
+        """Shape of that tensor; a vector's entries are its last axis."""
+        vector = getattr(self.kind, "_shape_", ())
+        return (*(sizes[axis] for axis in self.axes.split()), *vector)
+
+
+# fmt: off
 STATE = {
-    "seed": ("1", torch.int32, wp.int32),
-    "map_id": ("E", torch.int32, wp.int32),
-    "env_id": ("E", torch.int32, wp.int32),
-    "episode": ("E", torch.int32, wp.int32),
-    "starts": ("E N 3", torch.float32, wp.vec3),  # x, y, heading of following resets; inf: those of the map
-    "active": ("E", torch.int32, wp.int32),
-    "local_step": ("E", torch.int32, wp.int32),
-    "macro_step": ("E", torch.int32, wp.int32),
-    "terminated": ("E", torch.int32, wp.int32),
-    "covered": ("E", torch.int32, wp.int32),
-    "covered_before": ("E", torch.int32, wp.int32),
-    "covered_sum": ("E", torch.int64, wp.int64),
-    "shared": ("E", torch.int32, wp.int32),
-    "error": ("E", torch.int32, wp.int32),
-    "pose": ("E N 4", torch.float32, wp.vec4),
-    "slip": ("E N", torch.float32, wp.float32),
-    "center": ("E N 3", torch.float32, wp.vec3),
-    "goal": ("E N 2", torch.float32, wp.vec2),
-    "target": ("E N 2", torch.float32, wp.vec2),
-    "control": ("E N 2", torch.float32, wp.vec2),
-    "collided": ("E N", torch.int32, wp.int32),
-    "path_length": ("E N", torch.float32, wp.float32),
-    "milestone_step": ("E 2", torch.int32, wp.int32),
-    "milestone_overlap": ("E 2", torch.float32, wp.float32),
-    "milestone_path": ("E N 2", torch.float32, wp.float32),
-    "terms": ("E N R", torch.float32, wp.float32),
-    "raw": ("E N R", torch.float32, wp.float32),
-    "episode_reward": ("E N", torch.float32, wp.float32),
-    "seen_free": ("E W F", torch.int32, wp.int32),
-    "seen_boundary": ("E W B", torch.int32, wp.int32),
-    "viewers_free": ("E 1 F", torch.int32, wp.int32),
-    "viewers_boundary": ("E 1 B", torch.int32, wp.int32),
-    "known_free": ("E H P", torch.int32, wp.int32),
-    "known_boundary": ("E H Q", torch.int32, wp.int32),
-    "comm": ("E N N", torch.bool, wp.bool),
-    "hears": ("E N W", torch.int32, wp.int32),
-    "track": ("E N T", torch.int32, wp.int32),
+    # Which episode an env plays.
+    "seed": Field(wp.int32, "1", "", "key of all random numbers, with env_id and episode", "host"),
+    "env_id": Field(wp.int32, "E", "", "number of the env in keys of random numbers; of an evaluation episode", "host"),
+    "episode": Field(wp.int32, "E", "", "number of the episode; evaluation's begin at 2^30, -1: none yet", "host"),
+    "map_id": Field(wp.int32, "E", "", "map of the episode", "_place_team"),
+    "starts": Field(wp.vec3, "E N", "m, m, rad",
+        "x, y, heading of following resets; inf: those of the map, or drawn", "host"),
+
+    # Its clock and its end.
+    "active": Field(wp.int32, "E", "", "1 while the episode runs: local steps leave other envs alone",
+        "_start_env _close_step host"),
+    "local_step": Field(wp.int32, "E", "steps", "local steps made in this episode", "_clear_env _close_step"),
+    "macro_step": Field(wp.int32, "E", "steps", "decisions made in this episode", "_clear_env host"),
+    "terminated": Field(wp.int32, "E", "", "1 once the coverage is reached or all robots have collided",
+        "_clear_env _close_step"),
+    "error": Field(wp.int32, "E", "", "bits `ERROR_*` of `types`, raised and cleared after every macro step",
+        "_set_goal _plan_dwa _collect_occluders _scan_free _list_bodies _place_team host"),
+
+    # Where the robots are and where they go.
+    "pose": Field(wp.vec4, "E N", "m, m, m/s, rad", "x, y, speed forward, heading of the reference point (`dynamics`)",
+        "_place_team _move_robots _detect_collisions"),
+    "slip": Field(wp.float32, "E N", "m/s", "speed to the left, of omnidirectional robots; 0 for the others",
+        "_clear_robots _move_robots _detect_collisions"),
+    "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it",
+        "_place_team _move_robots"),
+    "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
+    "target": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
+        "_clear_robots _set_goal _pick_waypoint _hold_back"),
+    "control": Field(wp.vec2, "E N", "m/s^2, rad", "acceleration, then steering [rad], yaw rate [rad/s] or sideways"
+        " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct"),
+    "collided": Field(wp.int32, "E N", "", "1 once the robot has collided: it stands for good",
+        "_clear_robots _detect_collisions"),
+    "path_length": Field(wp.float32, "E N", "m", "way driven in this episode", "_clear_robots _move_robots"),
+    "track": Field(wp.int32, "E N T", "", "pixel of the body's centre after each local step (ix * 125 + iy)",
+        "_record_track"),
+
+    # What they have seen and know. Points are numbered within their map, sorted by cell (`types.Maps`).
+    "seen_free": Field(wp.int32, "E W F", "", "bit of every robot that has scanned the free point",
+        "_clear_flags _merge_scan"),
+    "seen_boundary": Field(wp.int32, "E W B", "", "the same of boundary points", "_clear_flags _scan_boundary"),
+    "viewers_free": Field(wp.int32, "E 1 F", "", "robots that have ever scanned the point; during a scan also"
+        " `VIEWER_NOW` for each that sees it now", "_clear_flags _scan_free _merge_scan"),
+    "viewers_boundary": Field(wp.int32, "E 1 B", "", "robots that have ever scanned the point",
+        "_clear_flags _scan_boundary"),
+    "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it",
+        "_clear_flags _share_points"),
+    "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_clear_flags _share_points"),
+    "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited",
+        "_hear_robots"),
+    "hears": Field(wp.int32, "E N W", "", "the same in bits: of the robots that robot i hears", "_hear_robots"),
+
+    # How much that is. Weights: `Maps.free_weight`, 1 a point on maps of even density.
+    "covered": Field(wp.int32, "E", "weight", "of the free points that the team has seen", "_clear_env _merge_scan"),
+    "covered_before": Field(wp.int32, "E", "weight", "the same before this local step",
+        "_clear_env _start_env _close_step"),
+    "covered_sum": Field(wp.int64, "E", "weight", "sum of `covered` over the episode's local steps",
+        "_clear_env _close_step"),
+    "shared": Field(wp.int32, "E", "weight", "of the free points that two robots or more have seen",
+        "_clear_env _merge_scan"),
+    "milestone_step": Field(wp.int32, "E M", "steps", "local step that reached the mark; -1 before",
+        "_clear_env _close_step"),
+    "milestone_overlap": Field(wp.float32, "E M", "", "shared / covered at that moment", "_clear_env _close_step"),
+    "milestone_path": Field(wp.float32, "E N M", "m", "`path_length` at that moment", "_clear_robots _close_step"),
+
+    # What it earns.
+    "terms": Field(wp.float32, "E N R", "", "terms of the reward, scaled and summed over the macro step",
+        "_clear_robots _reward_robots host"),
+    "raw": Field(wp.float32, "E N R", "", "the same without the scales w and v, summed over the episode",
+        "_clear_robots _reward_robots"),
+    "episode_reward": Field(wp.float32, "E N", "", "reward of the episode up to the last macro step",
+        "_clear_robots host"),
 }
+"""What a simulation is at a moment: saved, loaded, and all that the future depends on."""
+
 SCRATCH = {
-    "mask": ("E", torch.int32, wp.int32),
-    "facing": ("E N 2", torch.float32, wp.vec2),
-    "place": ("E N 3", torch.float32, wp.vec3),
-    "near": ("E N N", torch.int32, wp.int32),
-    "near_count": ("E N", torch.int32, wp.int32),
-    "fresh": ("E N", torch.int32, wp.int32),
-    "overlap": ("E N", torch.int32, wp.int32),
-    "crashed": ("E N", torch.int32, wp.int32),
-    "told_free": ("E H P", torch.int32, wp.int32),
-    "told_boundary": ("E H Q", torch.int32, wp.int32),
-    "visible": ("E N V", torch.int32, wp.int32),
-    "visible_count": ("E N", torch.int32, wp.int32),
-    "bins": ("E N D", torch.float32, wp.float32),
-    "direction": ("E N K 3", torch.float32, wp.vec3),
-    "limit": ("E N K 2", torch.float32, wp.vec2),
-    "occluder_count": ("E N", torch.int32, wp.int32),
-    "wall_count": ("E N", torch.int32, wp.int32),
-    "nearby": ("E N O 2", torch.float32, wp.vec2),
-    "mates": ("E N N", torch.int32, wp.int32),
-    "body_pixel": ("E N G", torch.int32, wp.int32),
-    "body_count": ("E N", torch.int32, wp.int32),
-    "command": ("E N 2", torch.float32, wp.vec2),
-    "region": ("E N", torch.int64, wp.int64),
-    "offset": ("E N 2", torch.float32, wp.vec2),
+    # What the host asks for.
+    "mask": Field(wp.int32, "E", "", "1 for the envs that a reset starts anew, or whose pictures are drawn", "host"),
+    "region": Field(wp.int64, "E N", "", "the policy's region, ix * 8 + iy", "host"),
+    "offset": Field(wp.vec2, "E N", "", "its offset in that region, in [-1, 1] half regions", "host"),
+    "command": Field(wp.vec2, "E N", "", "its controls, if it drives itself, shares of the limits in [-1, 1]", "host"),
+
+    # Who is near whom in this local step.
+    "facing": Field(wp.vec2, "E N", "", "unit vector ahead of the robot", "_face_robots _move_robots"),
+    "place": Field(wp.vec3, "E N", "m", "x, y and radius of a disc that the body stays in", "_face_robots"),
+    "near": Field(wp.int32, "E N S", "", "robots that may be in radar range, or touch", "_list_near"),
+    "near_count": Field(wp.int32, "E N", "", "how many those are", "_list_near"),
+
+    # Planning.
+    "nearby": Field(wp.vec2, "E N O", "m", "known boundary points that may be in the way", "_plan_dwa"),
+    "mates": Field(wp.int32, "E N S", "", "robots that may be in the way", "_plan_dwa"),
+
+    # Colliding.
+    "crashed": Field(wp.int32, "E N", "", "1 where the robot collides in this local step",
+        "_clear_robots _detect_collisions"),
+
+    # Scanning.
+    "bins": Field(wp.float32, "E N D", "m", "distances of what is nearest in each bin of directions (`shadows`)",
+        "_collect_occluders"),
+    "direction": Field(wp.vec3, "E N K", "", "unit vector from the sensor to each occluder", "_collect_occluders"),
+    "limit": Field(wp.vec2, "E N K", "1, m", "cosine of its angular half-width, its distance", "_collect_occluders"),
+    "occluder_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders"),
+    "wall_count": Field(wp.int32, "E N", "", "how many of them, the first, belong to the map; 0: no matter",
+        "_collect_occluders"),
+    "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now", "_scan_free"),
+    "visible_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders _scan_free"),
+
+    # Merging.
+    "fresh": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team",
+        "_count_points _start_env"),
+    "overlap": Field(wp.int32, "E N", "weight", "of the visible points that another robot sees now",
+        "_count_points _start_env"),
+    "told_free": Field(wp.int32, "E H P", "", "`known_free` before this step's sharing", "_copy_flags"),
+    "told_boundary": Field(wp.int32, "E H Q", "", "`known_boundary` before this step's sharing", "_copy_flags"),
+
+    # Drawing.
+    "body_pixel": Field(wp.int32, "E N G", "", "pixels of the robot's body, that of its centre first",
+        "_list_bodies"),
+    "body_count": Field(wp.int32, "E N", "", "how many those are", "_list_bodies"),
 }
+"""What the kernels of a step, a reset or an observation hand to each other: no later one reads it."""
+# fmt: on
 
 
 def axis_sizes(
@@ -103,29 +211,19 @@ def axis_sizes(
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
         "O": max(nearby, 1), "G": body_pixels, "T": track, "R": int(TERMS), "D": 3 * int(BINS),
+        "S": num_robots, "M": 2, "1": 1,
     }  # fmt: skip
 
 
-def shape_of(axes: str, sizes: dict[str, int]) -> tuple[int, ...]:
-    """Shape of a field from the names of its axes."""
-    return tuple(sizes[a] if a in sizes else int(a) for a in axes.split())
-
-
-def allocate(fields: dict, sizes: dict[str, int], device: torch.device) -> dict[str, torch.Tensor]:
+def allocate(fields: dict[str, Field], sizes: dict[str, int], device: torch.device) -> dict[str, torch.Tensor]:
     """Zeroed tensors for ``fields`` (`STATE` or `SCRATCH`)."""
-    return {
-        name: torch.zeros(shape_of(axes, sizes), dtype=dtype, device=device)
-        for name, (axes, dtype, _) in fields.items()
-    }
+    return {name: torch.zeros(one.shape(sizes), dtype=one.dtype, device=device) for name, one in fields.items()}
 
 
 def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
     """Bytes of every field for one env."""
     one = sizes | {"E": 1}
-    result = {}
-    for name, (axes, dtype, _) in (STATE | SCRATCH).items():
-        result[name] = math.prod(shape_of(axes, one)) * dtype.itemsize
-    return result
+    return {name: math.prod(field.shape(one)) * field.dtype.itemsize for name, field in (STATE | SCRATCH).items()}
 
 
 def grid_memory_per_env(
@@ -151,11 +249,10 @@ def grid_memory_per_env(
 
 def warp_views(tensors: dict[str, torch.Tensor], first: int, last: int) -> SimpleNamespace:
     """Warp arrays over envs ``first`` to ``last`` of all state and scratch tensors."""
-    fields = STATE | SCRATCH
     views = {}
-    for name, tensor in tensors.items():
-        axes, _, kind = fields[name]
-        views[name] = wp.from_torch(tensor[first:last] if axes.startswith("E") else tensor, dtype=kind)
+    for name, field in (STATE | SCRATCH).items():
+        rows = tensors[name][first:last] if field.axes.startswith("E") else tensors[name]
+        views[name] = wp.from_torch(rows, dtype=field.kind)
     return SimpleNamespace(**views)
 
 

@@ -27,11 +27,11 @@ wp_unreached = wp.constant(wp.int32(UNREACHED))
 def _locate_robots(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     # Out:
@@ -211,7 +211,7 @@ def _look_around(
 def _find_open_ground(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     rows_per_env: int,
@@ -237,7 +237,7 @@ def _find_open_ground(
 def _first_cells(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]

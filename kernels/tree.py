@@ -48,13 +48,13 @@ def walk_branch(
 def _grow_tree(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
     # State in:
     seed: wp.array(dtype=wp.int32),  # [1]
-    env_id: wp.array(dtype=wp.int32),
-    episode: wp.array(dtype=wp.int32),
-    macro_step: wp.array(dtype=wp.int32),
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
+    macro_step: wp.array(dtype=wp.int32),  # [env]
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     sources: wp.array2d(dtype=wp.int32),  # [item, 1], the robot's cell; -1 = none
     rows_per_env: int,

@@ -131,26 +131,26 @@ def add_body(
 def _collect_occluders(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     planar: int,
     # Robots:
     robots: Robots,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch in:
-    facing: wp.array2d(dtype=wp.vec2),
-    near: wp.array3d(dtype=wp.int32),
-    near_count: wp.array2d(dtype=wp.int32),
+    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Scratch out:
-    bins: wp.array3d(dtype=wp.float32),
-    direction: wp.array3d(dtype=wp.vec3),
-    limit: wp.array3d(dtype=wp.vec2),
-    occluder_count: wp.array2d(dtype=wp.int32),
-    wall_count: wp.array2d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
-    error: wp.array(dtype=wp.int32),
+    bins: wp.array3d(dtype=wp.float32),  # [env, robot, bin]
+    direction: wp.array3d(dtype=wp.vec3),  # [env, robot, occluder]
+    limit: wp.array3d(dtype=wp.vec2),  # [env, robot, occluder]
+    occluder_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    wall_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Gather what can mask the radar of robot (e, i): static occluders, the nearest rows first, and other bodies."""
     e, i = wp.tid()
@@ -208,26 +208,26 @@ def _collect_occluders(
 def _scan_free(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     planar: int,
     # Robots:
     robots: Robots,
     lanes: int,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    pose: wp.array2d(dtype=wp.vec4),
-    center: wp.array2d(dtype=wp.vec3),
+    active: wp.array(dtype=wp.int32),  # [env]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch in:
-    bins: wp.array3d(dtype=wp.float32),
-    direction: wp.array3d(dtype=wp.vec3),
-    limit: wp.array3d(dtype=wp.vec2),
-    occluder_count: wp.array2d(dtype=wp.int32),
-    wall_count: wp.array2d(dtype=wp.int32),
+    bins: wp.array3d(dtype=wp.float32),  # [env, robot, bin]
+    direction: wp.array3d(dtype=wp.vec3),  # [env, robot, occluder]
+    limit: wp.array3d(dtype=wp.vec2),  # [env, robot, occluder]
+    occluder_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    wall_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Scratch out:
-    viewers_free: wp.array3d(dtype=wp.int32),
-    visible: wp.array3d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
-    error: wp.array(dtype=wp.int32),
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """List the free points that robot (e, i) sees now and count its view at each of them."""
     e, i, lane = wp.tid()
@@ -272,18 +272,18 @@ def _scan_free(
 def _scan_boundary(
     # Map:
     maps: Maps,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     lanes: int,
     # State in:
-    active: wp.array(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-    visible: wp.array3d(dtype=wp.int32),
-    visible_count: wp.array2d(dtype=wp.int32),
+    active: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State out:
-    seen_boundary: wp.array3d(dtype=wp.int32),
-    viewers_boundary: wp.array3d(dtype=wp.int32),
+    seen_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
+    viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
 ):
     """Mark the boundary points in range that touch a free point seen now by the same robot."""
     e, i, lane = wp.tid()

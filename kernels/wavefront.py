@@ -41,13 +41,13 @@ wp_skip = wp.constant(wp.int32(SKIP))
 def _start_search(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-    goal: wp.array2d(dtype=wp.vec2),
-    target: wp.array2d(dtype=wp.vec2),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
@@ -96,9 +96,9 @@ def _start_search(
 def _trace_path(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    goal: wp.array2d(dtype=wp.vec2),
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
@@ -139,12 +139,12 @@ def _trace_path(
 def _pick_waypoint(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
-    active: wp.array(dtype=wp.int32),
-    collided: wp.array2d(dtype=wp.int32),
-    center: wp.array2d(dtype=wp.vec3),
-    goal: wp.array2d(dtype=wp.vec2),
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     reach: wp.array2d(dtype=wp.float32),  # [env, robot], how far a waypoint may be [m]
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
@@ -153,7 +153,7 @@ def _pick_waypoint(
     path_ends: wp.array(dtype=wp.int32),  # [item]
     # State out:
     path_used: wp.array(dtype=wp.int32),  # [item]
-    target: wp.array2d(dtype=wp.vec2),
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """The farthest cell of the path in reach and in sight; the nearest one where none is; the goal itself
     once its cell is in sight, and where there is no path at all."""

@@ -1,0 +1,118 @@
+"""The table of state and scratch (`kernels/state.py`) is true: arrays, shapes, types, and who writes what."""
+
+import pytest
+import torch
+from kernel_source import arguments, uses
+from worlds import act, room
+
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.kernels.state import AXES, SCRATCH, STATE
+
+FIELDS = STATE | SCRATCH
+PLANNERS = ("dwa", "wavefront", "direct")
+
+
+def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=None) -> ExplorationEnv:
+    return ExplorationEnv(
+        worlds or [room(22, 19)], num_envs=envs, num_robots=robots, local_steps=3, num_threads=1,
+        planner=PlannerConfig(name=planner), comm=CommConfig(range=9.0) if limited else None,
+        observation=ObservationConfig(map="known"),
+    )  # fmt: skip
+
+
+def launches_of(env: ExplorationEnv) -> list[tuple]:
+    """Every launch of a macro step, an observation and a reset: kernel, and the field (or None) of each argument."""
+    found = []
+    e, n = env.num_envs, env.num_robots
+    for shard in env.simulation.shards:
+        fields = {id(array): name for name, array in vars(shard.view).items()}
+
+        def launch(kernel, dim, inputs, outputs, fields=fields):
+            found.append((kernel, [fields.get(id(one)) for one in (*inputs, *outputs)], len(inputs)))
+
+        shard.set_goals(launch)
+        shard.local_step(launch)
+        shard.place(launch)
+        if shard.wavefront is not None:
+            shard.wavefront.find_paths(launch)
+            shard.wavefront.pick_waypoints(launch)
+        pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in ((e, n, 4, 125, 125), (e, 3, 125, 125))]
+        shard.draw(launch, *pictures, torch.zeros(e, n, 4), torch.zeros(e, n, 4, 8, 8))
+    return found
+
+
+@pytest.fixture(scope="module")
+def met() -> list[tuple]:
+    """The launches of every planner, with perfect and with limited communication."""
+    return [one for planner in PLANNERS for limited in (False, True) for one in launches_of(make(planner, limited))]
+
+
+@pytest.mark.parametrize("robots, limited, envs", [(1, False, 5), (3, True, 4), (35, True, 2), (34, False, 3)])
+def test_every_array_stands_in_the_table(robots, limited, envs):
+    env = make("dwa", limited, robots, envs, [room(22, 19), room(31, 17)])
+    tensors, bank = env.simulation.tensors, env.bank
+    assert set(tensors) == set(FIELDS)
+    words = 1 + (robots > 32)
+    free, boundary = max(len(m.free) for m in env.maps), max(len(m.boundary) for m in env.maps)
+    lengths = {
+        "E": envs, "N": robots, "W": words, "F": free, "B": boundary, "H": words if limited else 1,
+        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 2, "R": 5, "1": 1,
+        "V": bank.free_in_range, "O": bank.boundary_in_range, "T": 3 * env.macro_steps + 1, "D": 384,
+    }  # fmt: skip
+    vectors = {"vec2f": (2,), "vec3f": (3,), "vec4f": (4,)}
+    for name, field in FIELDS.items():
+        axes = field.axes.split()
+        assert set(axes) <= set(AXES), name
+        vector = vectors.get(field.kind.__name__, ())
+        given = tensors[name].shape
+        assert len(given) == len(axes) + len(vector) and given[len(axes) :] == vector, name
+        for axis, length in zip(axes, given, strict=False):
+            assert length == lengths.get(axis, length), f"{name}: axis {axis}"
+        assert tensors[name].dtype == (torch.float32 if vector else field.dtype), name
+        view = vars(env.simulation.shards[0].view)[name]
+        assert view.dtype is field.kind and view.shape == given[: len(axes)], name
+
+
+def test_who_writes_each_array(met):
+    """Kernels as their source says, at every launch; the host by the counters that torch keeps of writes."""
+    writers = {name: set() for name in FIELDS}
+    for kernel, fields, _ in met:
+        written = uses(kernel.func).written
+        for argument, name in zip(arguments(kernel), fields, strict=True):
+            if name is not None and argument.name in written:
+                writers[name].add(kernel.key)
+    for name in host_writes():
+        writers[name].add("host")
+    assert writers == {name: set(field.written.split()) for name, field in FIELDS.items()}
+
+
+def test_signatures_name_the_axes_of_the_table(met):
+    """What a kernel calls the axes of an argument is what the table calls those of the array it gets."""
+    common = {"free": "point", "boundary": "point", "1": "word"}
+    for kernel, fields, _ in met:
+        for argument, name in zip(arguments(kernel), fields, strict=True):
+            if name is not None:
+                axes = [AXES[axis][0] for axis in FIELDS[name].axes.split()]
+                fits = [given in (axis, common.get(axis)) for given, axis in zip(argument.shape, axes, strict=True)]
+                assert all(fits), f"{kernel.key}: {argument.name} {argument.shape}, the table has {name} {axes}"
+
+
+def host_writes() -> set[str]:
+    """Fields that torch writes from the first reset on, in all that an env is asked to do."""
+    found, generator = set(), torch.Generator().manual_seed(0)
+    for planner in PLANNERS:
+        env = make(planner, limited=True)
+        before = {name: tensor._version for name, tensor in env.simulation.tensors.items()}
+        td = env.reset()
+        env.set_seed(4)
+        env.set_starts(None)
+        env.set_episodes(torch.arange(2))
+        env.step(td.update(act(env, generator)))
+        found |= {name for name, tensor in env.simulation.tensors.items() if tensor._version != before[name]}
+    return found
+
+
+def test_each_field_says_what_it_is():
+    for name, field in FIELDS.items():
+        assert len(field.meaning) > 10 and field.written, name
+    assert not set(STATE) & set(SCRATCH)
