@@ -98,7 +98,7 @@ def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Modu
     return TargetGenerator(config, shape.channels, shape.side, shape.regions), heads
 
 
-def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
+def make_policy(env, model: "str | ModelConfig" = "small", greedy: bool = False) -> ProbabilisticActor:
     """The trainable policy of a team, for the action that `env` takes.
 
     It reads ("agents", "observation", ...) and writes ("agents", "params", ...), ("agents", "action", ...)
@@ -108,6 +108,7 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
     Args:
         env: gives the specs and the device; not kept
         model: a preset's name or a ModelConfig
+        greedy: take the likeliest action, where nothing else is asked for; else it is drawn
     """
     config = model_config(model)
     shape = observation_shape(env, config)
@@ -122,6 +123,6 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
         distribution_class=RegionHeads if joint else Heads,
         distribution_kwargs={"heads": heads},
         return_log_prob=True,
-        default_interaction_type=InteractionType.RANDOM,
+        default_interaction_type=InteractionType.DETERMINISTIC if greedy else InteractionType.RANDOM,
     )
     return actor.to(env.device) if env.device is not None else actor

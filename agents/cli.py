@@ -33,7 +33,7 @@ VERBS = {
     "evaluate": Verb(
         "plays held-out episodes with a trained team or a classical policy",
         ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate checkpoint=RUN render=true render_envs=4",
-         "maexp evaluate policy=nearest_frontier scenario=maze"),
+         "maexp evaluate policy=universal,nearest_frontier scenario=maze"),
     ),
     "benchmark": Verb(
         "compares algorithms and classical policies over scenarios and seeds, in one table; resumable",
@@ -48,8 +48,14 @@ VERBS = {
     ),
     "export": Verb(
         "writes the policy of a run as a folder for robots (maexp.agents.runtime)",
-        ("maexp export RUN out=FOLDER",),
+        ("maexp export RUN out=FOLDER", "maexp export RUN out=FOLDER results=EVALUATION,EVALUATION"),
         ("checkpoint",),
+    ),
+    "policies": Verb(
+        "lists the trained policies that come with the package, and shows one",
+        ("maexp policies list", "maexp policies show universal"),
+        ("task", "name"),
+        ("list", "show"),
     ),
     "maps": Verb(
         "lists, makes, imports, checks and draws maps",

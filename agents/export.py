@@ -8,21 +8,45 @@ import logging
 import warnings
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
-from maexp.agents.runtime.folder import CONTRACT, FORMAT, NETWORK
+from maexp.agents.results import find_commit
+from maexp.agents.runtime.folder import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
 from maexp.agents.target_networks import TargetChooser
+from maexp.envs import ExplorationEnv
+from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.target_view import FEATURES
 
 OPSET = 18
-WEIGHTS, CARD = "weights.safetensors", "card.md"
 MOST = {"batch": 4096, "robots": 64, "candidates": 1024}
+RANGES, DISCS, COSINE, SINE = "radar ranges", "radar discs", "cosine, from the heading", "sine, left of the heading"
+UNITS = {
+    "score": DISCS, "value": DISCS, "planned": "0 or 1", "claimed": "share", "plan_gap": RANGES,
+    "travel": "log(1 + radar ranges)", "nearness": "1 / (1 + radar ranges)", "distance": RANGES, "detour": "ratio - 1",
+    "gain": DISCS, "size": "10 cells", "worth": "0 or 1", "gain_near": DISCS, "gain_around": "4 radar discs",
+    "ahead": COSINE, "aside": SINE, "way_ahead": COSINE, "way_aside": SINE,
+    "unknown_ahead": COSINE, "unknown_aside": SINE, "unknown_far": RANGES,
+    "rival": RANGES, "lead": RANGES, "nearest": "0 or 1", "own_last": RANGES, "mates_last": RANGES,
+    "count": "10 candidates", "speed": "of max_speed", "drive": RANGES, "time_left": "share of the whole time",
+    "known": "log(1 + radar discs)", "mates": "4 robots",
+}  # fmt: skip
+TEAM = ["batch", "robots"]
+INPUTS = {
+    "features": {"shape": [*TEAM, "candidates", len(FEATURES)], "type": "float32", "is": "see features and units"},
+    "mask": {"shape": [*TEAM, "candidates"], "type": "bool", "is": "which candidates there are"},
+    "comm": {"shape": [*TEAM, "robots"], "type": "bool", "is": "who hears whom"},
+}
+OUTPUTS = {"logits": {"shape": [*TEAM, "candidates"], "type": "float32", "is": "of taking the candidate, each robot"}}
+PACKAGES = ("maexp", "torch", "onnx", "onnxscript", "safetensors")
 
 
-def export_policy(policy: torch.nn.Module, env, folder: Path, name: str, card: str) -> None:
+def export_policy(
+    policy: torch.nn.Module, env: ExplorationEnv, folder: Path, name: str, card: str, trained: dict[str, Any]
+) -> None:
     """Write the folder of a policy that chooses among targets.
 
     Args:
@@ -31,6 +55,7 @@ def export_policy(policy: torch.nn.Module, env, folder: Path, name: str, card: s
         folder: new or empty.
         name: of the policy.
         card: what it was trained on, how well it does and what it is not good for, in Markdown.
+        trained: how it was trained, for the contract; `scenarios` names where.
 
     Raises:
         UserError: the policy chooses regions, the folder holds something, or an extra is missing.
@@ -38,17 +63,16 @@ def export_policy(policy: torch.nn.Module, env, folder: Path, name: str, card: s
     chooser = find_chooser(policy)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"out={folder} holds something already and is left alone: choose another name.")
-    try:
-        from safetensors.torch import save
-    except ImportError as error:
-        raise UserError("Exporting needs safetensors: pip install 'maexp[export]'.") from error
+    from safetensors.torch import save
+
     weights = save({key: value.contiguous() for key, value in chooser.state_dict().items()})
     files = {NETWORK: to_onnx(chooser, env.num_robots), WEIGHTS: weights}
-    contract = describe(env, name) | {"sha256": {key: hashlib.sha256(one).hexdigest() for key, one in files.items()}}
+    sums = {key: hashlib.sha256(one).hexdigest() for key, one in files.items()}
     for file, content in files.items():
         write_file(folder / file, lambda out, content=content: out.write(content))
     write_text(folder / CARD, card)
-    write_json(folder / CONTRACT, contract)  # last: a folder without it is no policy
+    # Last: a folder without it is no policy.
+    write_json(folder / CONTRACT, describe(chooser, env, name, trained) | {"sha256": sums})
 
 
 def find_chooser(policy: torch.nn.Module) -> TargetChooser:
@@ -63,30 +87,58 @@ def find_chooser(policy: torch.nn.Module) -> TargetChooser:
     raise UserError("This policy does not choose among frontier targets: train one with action=targets to export it.")
 
 
-def describe(env, name: str) -> dict:
+def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: dict[str, Any]) -> dict[str, Any]:
     """What goes in and out, in which units, and what the policy was trained for."""
-    robots = env.simulation.robot_tensors
+    places = {one: numbers_of(find_scenario(one)) for one in trained.get("scenarios", [])}
+    own = numbers_of_env(env)
+    if env.scenario.name in places:
+        places[env.scenario.name] = own
+    several = len(places) > 1  # lengths count in radar ranges: any will do, those of an imported floor suit robots
     return {
         "format": FORMAT,
         "name": name,
-        "inputs": {
-            "features": ["batch", "robots", "candidates", len(FEATURES)],
-            "mask": ["batch", "robots", "candidates"],
-            "comm": ["batch", "robots", "robots"],
-        },
-        "outputs": {"logits": ["batch", "robots", "candidates"]},
+        "inputs": INPUTS,
+        "outputs": OUTPUTS,
         "features": list(FEATURES),
-        "units": "lengths in radar ranges, areas in radar discs, angles as cosine and sine from the heading",
+        "units": UNITS,
+        "frames": "distances and bearings are the same in every frame; bearings are taken from a robot's heading",
         "candidates": env.observation_config.targets,
+        "model": {
+            "target_width": chooser.head.in_features,
+            "target_heads": chooser.encoder.among_targets.heads,
+            "score_weight": chooser.score_weight,
+        },
+        **(numbers_of(find_scenario("pointcloud")) if several else own),
+        "trained": trained | {"scenarios": places},
+        "team_sizes": {"trained": trained.get("num_robots", [env.num_robots]), "most": MOST["robots"]},
+        "opset": OPSET,
+        "versions": {one: metadata.version(one) for one in PACKAGES},
+        "commit": find_commit(),
+    }
+
+
+def numbers_of_env(env: ExplorationEnv) -> dict[str, float]:
+    """What robots are like in an env, in m and s: those that a policy looks at, and the resolution."""
+    robots = env.simulation.robot_tensors
+    return {
         "radar_range": max(one.range for one in env.radar_configs),
         "robot_radius": float(robots["threshold"].max()),
         "max_speed": float(robots["max_speed"].max()),
         "max_accel": float(robots["max_accel"].max()),
         "seconds": 0.1 * env.local_steps,
         "resolution": float(env.maps[0].resolution),
-        "num_robots": env.num_robots,
-        "opset": OPSET,
-        "versions": {one: metadata.version(one) for one in ("maexp", "torch", "onnx", "onnxscript")},
+    }
+
+
+def numbers_of(row: Scenario) -> dict[str, float]:
+    """The same of a scenario."""
+    return {
+        "radar_range": row.radar_range,
+        "robot_radius": row.collision_threshold,
+        "max_speed": row.max_speed,
+        "max_accel": row.max_accel,
+        "seconds": 0.1 * row.local_steps,
+        "resolution": row.resolution,
     }
 
 
@@ -117,4 +169,17 @@ def to_onnx(chooser: TargetChooser, robots: int) -> bytes:
         )  # fmt: skip
     out = io.BytesIO()
     program.save(out)
-    return out.getvalue()
+    return without_traces(out.getvalue())
+
+
+def without_traces(network: bytes) -> bytes:
+    """The network without the lines of code that it came from: they name folders of this machine."""
+    import onnx
+
+    model = onnx.load_from_string(network)
+    graph = model.graph
+    for part in (model, graph, *model.functions, *graph.node, *graph.value_info, *graph.input, *graph.output,
+                 *graph.initializer, *(node for one in model.functions for node in one.node)):  # fmt: skip
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    return model.SerializeToString(deterministic=True)

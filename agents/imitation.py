@@ -19,11 +19,13 @@ from maexp.agents.build import choose_device, make_env
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.collect import batch_statistics, divide_teams
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.exported import is_exported, load_policy_folder, show_targets
 from maexp.agents.files import write_text
 from maexp.agents.losses import check_finite
 from maexp.agents.model import PRESETS, ModelConfig
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
+from maexp.agents.runtime.shipped import advise, shipped_names
 from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.resolved import model_settings
@@ -41,10 +43,14 @@ def check_warm_start(cfg: Any) -> None:
     if cfg.warm_start in POLICIES:
         check_goals([cfg.warm_start], cfg.planner.name)
         _check_kind(cfg, "regions")
+    elif cfg.warm_start is not None and is_exported(cfg.warm_start):
+        _check_kind(cfg, "targets")
+        show_targets(cfg, [cfg.warm_start], "warm_start")
     elif cfg.warm_start is not None and not Path(cfg.warm_start).exists():
+        names = [*POLICIES, *shipped_names()]
         raise UserError(
-            f"warm_start={cfg.warm_start} is neither a run's folder, a checkpoint, nor a policy: choose one of "
-            f"{', '.join(POLICIES)}."
+            f"warm_start={cfg.warm_start} is neither a run's folder, a checkpoint, nor a policy: "
+            f"{advise(cfg.warm_start, names)}".rstrip("?") + "."
         )
 
 
@@ -62,6 +68,8 @@ def load_teacher(cfg: Any, env: Any) -> Any:
     """The policy to imitate in `env`."""
     if cfg.warm_start in POLICIES:
         return POLICIES[cfg.warm_start](env)
+    if is_exported(cfg.warm_start):
+        return load_policy_folder(cfg.warm_start, env, "warm_start")
     _, saved = find_checkpoint(cfg.warm_start)
     check_action(saved, cfg)
     _check_kind(cfg, model_of(saved).action)

@@ -92,7 +92,7 @@ def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
 
 def test_every_verb_composes():
     for verb in SCHEMAS:
-        words = ["task=list"] if verb in ("maps", "bench") else []
+        words = ["task=list"] if verb in ("maps", "policies", "bench") else []
         assert compose_config(verb, words).hydra.run.dir.endswith(f"-{verb}")
 
 

@@ -90,7 +90,7 @@ def folder(policy, tmp_path_factory):
     for name in ("onnx", "onnxscript", "onnxruntime", "safetensors"):
         pytest.importorskip(name, reason=f"THE EXTRA maexp[export] IS NOT INSTALLED ({name}): folders are not tested")
     where = tmp_path_factory.mktemp("policies") / "small"
-    export_policy(policy, make_env(), where, "small", "# small\n")
+    export_policy(policy, make_env(), where, "small", "# small\n", {"scenarios": ["maze_small"]})
     return where
 
 
@@ -132,7 +132,7 @@ def test_the_contract_gives_the_defaults(folder):
     planner, env = TeamPlanner(folder), make_env()
     assert planner.radar_range == env.radar_configs[0].range
     assert planner.robot_radius == pytest.approx(0.75)
-    assert planner.learned.contract.motion == motion_of(env)
+    assert planner.motion == planner.learned.contract.motion == motion_of(env)
     assert TeamPlanner(folder, radar_range=4.0).radar_range == 4.0
 
 
@@ -172,10 +172,10 @@ def test_a_network_that_is_none_is_a_sentence(folder, tmp_path):
 
 def test_what_cannot_be_exported_is_a_sentence(policy, folder, tmp_path):
     with pytest.raises(UserError, match="holds something already"):
-        export_policy(policy, make_env(), folder, "small", "")
+        export_policy(policy, make_env(), folder, "small", "", {})
     regions = make_policy(ExplorationEnv(maps=[make_map("maze_small", 1)], num_envs=1), "small")
     with pytest.raises(UserError, match="action=targets"):
-        export_policy(regions, make_env(), tmp_path / "new", "regions", "")
+        export_policy(regions, make_env(), tmp_path / "new", "regions", "", {})
     assert not (tmp_path / "new").exists()
 
 

@@ -16,11 +16,12 @@ from maexp.agents.commands.run_folder import short
 from maexp.agents.comparison import choose_best, describe_differences
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluate import EvaluationResult, evaluate_recorded, play, pool
+from maexp.agents.exported import check_policies, load_policy_folder, policy_name, show_targets
 from maexp.agents.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run, print_results, result_names, write_results
-from maexp.agents.settings.checks import check_counts, check_distinct, check_goals, team_sizes
+from maexp.agents.settings.checks import check_counts, check_goals, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -48,16 +49,13 @@ def check(cfg: Any) -> None:
     """Raise UserError for counts out of range and unknown policies."""
     check_counts(cfg, "num_envs", "episodes")
     team_sizes(cfg.num_robots)
-    for name in policy_names(cfg):
-        if name not in POLICIES:
-            raise UserError(f"policy={name} is unknown: choose one of {', '.join(POLICIES)}.")
-    check_distinct("policy", policy_names(cfg))
+    check_policies(policy_names(cfg))
     check_goals(policy_names(cfg), cfg.planner.name)
     check_render(cfg)
 
 
 def policy_names(cfg: Any) -> list[str]:
-    """The classical policies asked for."""
+    """The policies asked for by name or folder."""
     if cfg.policy is None:
         return []
     return [cfg.policy] if isinstance(cfg.policy, str) else [str(one) for one in cfg.policy]
@@ -70,13 +68,14 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
-        if cfg.checkpoint is None and cfg.observation.pictures is None:  # classical planners look at no pictures
+        show_targets(cfg, policy_names(cfg))
+        if cfg.checkpoint is None and cfg.observation.pictures is None:  # neither planners nor these look at pictures
             cfg.observation.pictures = False
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0], maps)}
-        policies |= {name: name for name in policy_names(cfg)}
+        policies |= {policy_name(word): open_player(word, envs[0][0]) for word in policy_names(cfg)}
         best = {}
-        if cfg.checkpoint is not None:
+        if not all(isinstance(one, str) for one in policies.values()):  # somebody has learned
             best = {size: choose_best(cfg, suite, policy_names(cfg), size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
@@ -100,6 +99,11 @@ def load_policy(cfg: Any, env: Any, maps: list) -> Any:
     policy = make_policy(env, model_settings(cfg))
     load_matching(policy, saved["policy"])
     return policy
+
+
+def open_player(word: str, env: Any) -> Any:
+    """What `bind` takes: the name of a classical policy, or a trained one."""
+    return word if word in POLICIES else load_policy_folder(word, env)
 
 
 def bind(policy: Any, env: Any) -> Any:
@@ -142,7 +146,7 @@ def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Pa
 
 
 def report(
-    cfg: Any, results: list[EvaluationResult], suite: MapSuite, best: dict[int, str | None], path: Path, **extra: float
+    cfg: Any, results: list[EvaluationResult], suite: MapSuite, best: dict[int, str | None], path: Path, **extra: Any
 ) -> None:
     """The table on the terminal, how far the learned team is ahead of the best classical planner, and the JSON.
 
@@ -151,7 +155,7 @@ def report(
     """
     seconds = sum(one.seconds for one in results)
     known = {str(size): name for size, name in best.items() if name is not None}
-    extra |= {"best_classical": known} if known else {}
+    extra |= {"held_out": suite.is_held_out} | ({"best_classical": known} if known else {})
     write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
     for sentence in describe_differences(results, best):

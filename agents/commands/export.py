@@ -1,21 +1,20 @@
 """`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.runtime`)."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.build import load_maps, make_env
+from maexp.agents.card import RESULTS, find_results, write_card
 from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.evaluate import load_policy
 from maexp.agents.commands.run_folder import check_writable, remove_if_empty, short
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.export import export_policy, find_chooser
-from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.checks import team_sizes
+from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
-
-SHOWN = ("exploration_ratio", "coverage_auc", "coverage_step_85_censored", "success_rate", "collisions")
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -33,7 +32,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 def check(cfg: Any) -> None:
     """Raise UserError for what cannot be written."""
-    check_counts(cfg, "num_robots")
+    team_sizes(cfg.num_robots)
     if not cfg.out:
         raise UserError("out is missing: name the folder to write, as in maexp export RUN out=FOLDER.")
     check_writable(Path(cfg.out).absolute())
@@ -42,51 +41,43 @@ def check(cfg: Any) -> None:
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Write the folder."""
     out = Path(cfg.out)
+    sizes = team_sizes(cfg.num_robots)
+    path, saved = find_checkpoint(cfg.checkpoint)
     with blame_input():
-        env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out[:1], cfg.num_robots, 1)
+        env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out[:1], sizes[0], 1)
         policy = load_policy(cfg, env, [])  # it is not played: no map of its training need still be there
         find_chooser(policy)
-        name = cfg.name or out.absolute().name
-        export_policy(policy, env, out, name, write_card(cfg, name))
+        name, trained = cfg.name or out.absolute().name, describe_training(cfg, saved)
+        card = write_card(name, trained, result_files(cfg, path))
+        export_policy(policy, env, out, name, card, trained)
     remove_if_empty(where)
-    sizes = ", ".join(f"{file.name} ({file.stat().st_size / 1024:.0f} kB)" for file in sorted(out.iterdir()))
-    print(f"Written to {short(out.absolute())}: {sizes}")
+    files = ", ".join(f"{file.name} ({file.stat().st_size / 1024:.0f} kB)" for file in sorted(out.iterdir()))
+    print(f"Written to {short(out.absolute())}: {files}")
     return 0
 
 
-def write_card(cfg: Any, name: str) -> str:
-    """What the policy was trained on and how well it does, in Markdown, as far as the run says it."""
-    path, saved = find_checkpoint(cfg.checkpoint)
-    lines = [
-        f"# {name}", "",
-        f"Chooses frontier targets for teams of {cfg.num_robots} robots. Trained on `{cfg.scenario.name}` with "
-        f"`{cfg.algorithm.name}`, seed {cfg.seed}, up to iteration {saved['iteration']} ({path.name}).", "",
-    ]  # fmt: skip
-    lines += read_results(path.parent.parent / "summary.json")
-    lines += [
-        "Not for maps without a common frame, nor where people walk: it has seen neither.", "",
-    ]  # fmt: skip
-    return "\n".join(lines)
+def describe_training(cfg: Any, saved: dict) -> dict[str, Any]:
+    """How the policy of a checkpoint was trained."""
+    settings = settings_of(saved)
+    return {
+        "scenarios": [cfg.scenario.name, *(cfg.scenario.also or [])],
+        "num_robots": team_sizes(cfg.num_robots),
+        "algorithm": cfg.algorithm.name,
+        "seed": cfg.seed,
+        "iteration": saved["iteration"],
+        "frames": settings["total_frames"],
+        "commit": saved.get("commit"),
+    }
 
 
-def read_results(file: Path) -> list[str]:
-    """The run's evaluation on held-out maps as a table; a sentence where there is none."""
-    try:
-        summary = json.loads(file.read_text())
-    except (OSError, ValueError):
-        return ["It has not been evaluated.", ""]
-    rows = [(policy, values) for policy, values in summary.items() if SHOWN[0] in values]
-    lines = ["On held-out maps, mean and 95 % interval:", "", f"| policy | {' | '.join(SHOWN)} |"]
-    lines.append("| --- " * (len(SHOWN) + 1) + "|")
-    for policy, values in rows:
-        cells = [_cell(values.get(metric)) for metric in SHOWN]
-        lines.append(f"| {policy} | {' | '.join(cells)} |")
-    return [*lines, ""]
+def result_files(cfg: Any, checkpoint: Path) -> list[Path]:
+    """Results of the evaluations that are named, or else of the run's own."""
+    if cfg.results:
+        return [find_results(Path(one)) for one in split_folders(cfg.results)]
+    own = checkpoint.parent.parent / RESULTS[1]
+    return [own] if own.is_file() else []
 
 
-def _cell(value: Any) -> str:
-    if not isinstance(value, dict) or value.get("mean") is None:
-        return ""
-    low, high = (value.get("ci95") or [None, None])[:2]
-    interval = "" if low is None or high is None else f" ({low:.3g} to {high:.3g})"
-    return f"{value['mean']:.3g}{interval}"
+def split_folders(text: str) -> list[str]:
+    """`a,b` as two folders, where there is none of that name."""
+    return [text] if Path(text).exists() else [one.strip() for one in text.split(",") if one.strip()]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.exported import open_policy
 from maexp.agents.files import write_json
-from maexp.agents.policies import POLICIES
 from maexp.agents.runtime import CHOICES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
@@ -38,9 +38,8 @@ def check(cfg: Any) -> None:
     check_counts(cfg, "episode", "people", "seed", least=0)
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
-    known = [name for name in CHOICES if name in POLICIES]
-    if cfg.policy not in known:
-        raise UserError(f"policy={cfg.policy} is unknown: choose one of {', '.join(known)}.")
+    if cfg.policy not in CHOICES:
+        open_policy(cfg.policy, others=CHOICES)
     if importlib.util.find_spec("irsim") is None:
         raise UserError('maexp irsim needs the simulator ir-sim: pip install "maexp[irsim]".')
 
@@ -54,7 +53,8 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     with blame_input():
         world = import_map(cfg.floor, num_robots=cfg.num_robots, **given(cfg.importing))
         config = make_config(cfg, world)
-        env = ours.make_team(world, cfg.num_robots, config)
+        targets = 0 if cfg.policy in CHOICES else open_policy(cfg.policy)[1].candidates
+        env = ours.make_team(world, cfg.num_robots, config, targets)
         starts = ours.draw_starts(env, cfg.episode)
         frames: list[np.ndarray] = []
         trial = run_trial(

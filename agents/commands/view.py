@@ -10,11 +10,11 @@ import numpy as np
 
 from maexp.agents.build import import_files, load_maps, make_env
 from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.commands.evaluate import bind, load_policy
+from maexp.agents.commands.evaluate import bind, load_policy, open_player
 from maexp.agents.commands.run_folder import remove_if_empty, short
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.exported import check_policies, policy_name, show_targets
 from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
-from maexp.agents.policies import POLICIES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -65,8 +65,8 @@ def check(cfg: Any) -> None:
         raise UserError(f"episode={cfg.episode} must be a whole number from 0 to {last}.")
     if cfg.seconds is not None and not 0 <= cfg.seconds < math.inf:
         raise UserError(f"seconds={cfg.seconds:g} must be a time after the start of the episode, 0 s or more.")
-    if cfg.policy is not None and cfg.policy not in POLICIES:
-        raise UserError(f"policy={cfg.policy} is unknown: choose one of {', '.join(POLICIES)}.")
+    if cfg.policy is not None and not holds_episodes(cfg.place):  # there it only picks some of what was recorded
+        check_policies([cfg.policy])
     if cfg.policy is not None and cfg.checkpoint is not None:
         raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
     if cfg.renderer not in show.RENDERERS:
@@ -86,6 +86,11 @@ def check(cfg: Any) -> None:
 
         with blame_input():
             import_viser()
+
+
+def holds_episodes(place: str | None) -> bool:
+    """Whether recorded episodes are to be seen."""
+    return place is not None and Path(place).exists() and bool(episode_files(Path(place)))
 
 
 def wants_page(cfg: Any) -> bool:
@@ -131,8 +136,13 @@ def find_subject(cfg: Any, where: Path) -> tuple[list[Episode], PointCloudMap | 
     if cfg.checkpoint is None and cfg.policy is None:
         return [], find_map(cfg, place)
     maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
+    if cfg.checkpoint is None:
+        show_targets(cfg, [cfg.policy])
     env = make_env(cfg, maps, cfg.num_robots)
-    policy, name = (cfg.policy, cfg.policy) if cfg.checkpoint is None else (load_policy(cfg, env, maps), "trained")
+    if cfg.checkpoint is None:
+        policy, name = open_player(cfg.policy, env), policy_name(cfg.policy)
+    else:
+        policy, name = load_policy(cfg, env, maps), "trained"
     first = cfg.episode or 0
     episodes = play_teams(env, bind(policy, env), name, first=first, seed=cfg.seed)
     (where / EPISODES).mkdir()

@@ -7,14 +7,15 @@ import math
 import numpy as np
 import torch
 
+from maexp.agents.exported import load_policy_folder
 from maexp.agents.policies import POLICIES
-from maexp.envs import ExplorationEnv, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
+from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
 
 from .config import DT, TrialConfig
 
 
-def make_team(world: PointCloudMap, num_robots: int, config: TrialConfig) -> ExplorationEnv:
-    """A team of differential drives on the floor, for the trial's time."""
+def make_team(world: PointCloudMap, num_robots: int, config: TrialConfig, targets: int = 0) -> ExplorationEnv:
+    """A team of differential drives on the floor, for the trial's time, each shown so many targets."""
     local = max(1, round(config.decide / DT))
     robot = RobotConfig(
         kind="differential", max_speed=config.max_speed, max_accel=config.max_accel, max_yaw_rate=config.max_yaw_rate
@@ -23,6 +24,7 @@ def make_team(world: PointCloudMap, num_robots: int, config: TrialConfig) -> Exp
         world, 1, num_robots, seed=config.seed, robot=robot, radar=RadarConfig(range=config.radar_range),
         planner=PlannerConfig(name="wavefront"), local_steps=local, success_coverage=1.0, num_threads=1,
         macro_steps=math.ceil(config.seconds / (local * DT)),
+        observation=ObservationConfig(pictures=False, targets=targets),
     )  # fmt: skip
 
 
@@ -36,11 +38,12 @@ def draw_starts(env: ExplorationEnv, episode: int) -> np.ndarray:
 def run_ours(env: ExplorationEnv, policy: str, episode: int) -> tuple[list[float], np.ndarray]:
     """An evaluation episode: coverage every DT, the first at the start, and who has collided."""
     curve: list[float] = []
-    choose = POLICIES[policy](env)
+    choose = POLICIES[policy](env) if policy in POLICIES else load_policy_folder(policy, env)
     env.set_step_hook(lambda env: curve.append(env.snapshot()["coverage"]))
     now = _begin(env, episode)
     while not bool(now["done"]):
-        now = env.step(choose(now))["next"]
+        with torch.no_grad():
+            now = env.step(choose(now))["next"]
     env.set_step_hook(None)
     return curve, now["info", "collided"][0].numpy()
 

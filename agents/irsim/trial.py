@@ -70,14 +70,17 @@ def run_trial(
 
     Args:
         world: a floor.
-        policy: name that `TeamPlanner` knows.
+        policy: a name or folder that `TeamPlanner` knows.
         starts: x, y [m] and heading [rad].
         config: the team and what disturbs it.
         watch: called at every decision.
     """
     floor = make_floor(world)
     simulator = Simulator(floor, starts, config)
-    planner = TeamPlanner(policy, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed)
+    planner = TeamPlanner(
+        policy, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed,
+        max_speed=config.max_speed, max_accel=config.max_accel, seconds=config.decide,
+    )  # fmt: skip
     rng = np.random.default_rng([config.seed, 11])
     alive = np.ones(len(starts), bool)  # a bumper tells who has collided: the others take it for an obstacle
     odometry = Odometry(simulator.poses, config.pose_noise, config.pose_drift, rng)

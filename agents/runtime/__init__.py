@@ -2,5 +2,6 @@
 
 from .choices import CHOICES
 from .planner import Plan, TeamPlanner
+from .shipped import shipped_names
 
-__all__ = ["CHOICES", "Plan", "TeamPlanner"]
+__all__ = ["CHOICES", "Plan", "TeamPlanner", "shipped_names"]

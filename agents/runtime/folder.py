@@ -1,4 +1,5 @@
-"""A trained policy as a folder: `policy.onnx`, and `contract.json`: what goes in and what it was trained for.
+"""A trained policy as a folder: `policy.onnx`, `weights.safetensors`, and `contract.json`: what goes in and what it
+was trained for.
 
 Written by `maexp.agents.export`. Nothing in it is unpickled; a file that was changed is refused.
 """
@@ -7,16 +8,20 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .features import FEATURES, Candidates, Motion, list_candidates
 from .scene import Scene
+from .shipped import CONTRACT
 
-FORMAT = "maexp-policy-1"
-CONTRACT, NETWORK = "contract.json", "policy.onnx"
+FORMAT = "maexp-policy-2"
+NETWORK, WEIGHTS, CARD = "policy.onnx", "weights.safetensors", "card.md"
+AGAIN = "export the policy again"
+INPUTS = ("features", "mask", "comm")
 NUMBERS = ("radar_range", "robot_radius", "max_speed", "max_accel", "seconds")
 
 
@@ -29,6 +34,7 @@ class Contract:
         candidates: targets that each robot is shown.
         radar_range, robot_radius: [m].
         motion: how its robots moved.
+        content: all that the file says.
     """
 
     name: str
@@ -36,6 +42,7 @@ class Contract:
     radar_range: float
     robot_radius: float
     motion: Motion
+    content: dict[str, Any] = field(default_factory=dict, repr=False)
 
 
 class LearnedChoice:
@@ -64,6 +71,9 @@ class LearnedChoice:
         except Exception as error:  # onnxruntime raises classes of its own
             reason = " ".join(str(error).split())[:200]
             raise ValueError(f"{folder / NETWORK} is not a network that onnxruntime runs ({reason})") from None
+        taken = {one.name: one.shape for one in self.session.get_inputs()}
+        if tuple(taken) != INPUTS or taken["features"][3:] != [len(FEATURES)]:
+            raise ValueError(f"{folder / NETWORK} takes {taken}, not {len(FEATURES)} features a candidate: {AGAIN}")
 
     def logits(self, candidates: Candidates) -> np.ndarray:
         """What speaks for every candidate, float32 [n, M]."""
@@ -75,10 +85,9 @@ class LearnedChoice:
         }
         return self.session.run(["logits"], inputs)[0][0]
 
-    def choose(self, scene: Scene, heading, speed, last, time_left: float) -> np.ndarray:
+    def choose(self, scene: Scene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
         """The target of every robot, int64 [n]; the arguments of `list_candidates`."""
-        count, motion = self.contract.candidates, self.contract.motion
-        candidates = list_candidates(scene, count, heading, speed, last, time_left, motion)
+        candidates = list_candidates(scene, self.contract.candidates, heading, speed, last, time_left, motion)
         best = np.where(candidates.mask, self.logits(candidates), -np.inf).argmax(-1)
         return candidates.target[np.arange(len(best)), best]
 
@@ -89,25 +98,40 @@ def read_contract(folder: Path) -> Contract:
     Raises:
         ValueError: what is wrong with it.
     """
-    again = "export the policy again"
     try:
-        content = json.loads((folder / CONTRACT).read_text(encoding="utf-8"))
-        network = (folder / NETWORK).read_bytes()
-    except OSError as error:
-        raise ValueError(f"{folder} is not the folder of a policy: {error.strerror} ({error.filename})") from None
-    except ValueError:
-        raise ValueError(f"{folder / CONTRACT} is not JSON: {again}") from None
+        content = json.loads(_read(folder, CONTRACT))
+    except ValueError as error:
+        if not isinstance(error, json.JSONDecodeError | UnicodeDecodeError):
+            raise
+        raise ValueError(f"{folder / CONTRACT} is not JSON: {AGAIN}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{folder / CONTRACT} is not a contract of the kind {FORMAT}: {again}")
+        raise ValueError(f"{folder / CONTRACT} is not a contract of the kind {FORMAT}: {AGAIN}")
     if content.get("features") != list(FEATURES):
-        raise ValueError(f"{folder} was made for other features than this version of maexp has: {again}")
-    sums = content.get("sha256")
-    if not isinstance(sums, dict) or sums.get(NETWORK) != hashlib.sha256(network).hexdigest():
-        raise ValueError(f"{folder / NETWORK} is not the file that its contract names: {again}")
+        raise ValueError(f"{folder} was made for other features than this version of maexp has: {AGAIN}")
     numbers = [content.get(name) for name in NUMBERS]
     count = content.get("candidates")
     right = all(type(one) in (int, float) and 0 < one < 1e6 for one in numbers)
     if not right or type(count) is not int or not 0 < count <= 1024:
-        raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {again}")
+        raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {AGAIN}")
+    read_checked(folder, content, NETWORK)
     radar_range, robot_radius, *motion = map(float, numbers)
-    return Contract(str(content.get("name", folder.name)), count, radar_range, robot_radius, Motion(*motion))
+    return Contract(str(content.get("name", folder.name)), count, radar_range, robot_radius, Motion(*motion), content)
+
+
+def read_checked(folder: Path, content: dict[str, Any], file: str) -> bytes:
+    """A file of the folder, if it is the one that the contract names.
+
+    Raises:
+        ValueError: it is missing or another one.
+    """
+    data, sums = _read(folder, file), content.get("sha256")
+    if not isinstance(sums, dict) or sums.get(file) != hashlib.sha256(data).hexdigest():
+        raise ValueError(f"{folder / file} is not the file that its contract names: {AGAIN}")
+    return data
+
+
+def _read(folder: Path, file: str) -> bytes:
+    try:
+        return (folder / file).read_bytes()
+    except OSError as error:
+        raise ValueError(f"{folder} is not the folder of a policy: {error.strerror} ({error.filename})") from None

@@ -16,6 +16,7 @@ from .features import Motion
 from .folder import Contract, LearnedChoice
 from .grid import FREE, KnownGrid, read_grid
 from .scene import Scene, look_at
+from .shipped import find_policy
 from .team import Team, read_team
 from .watch import Watch
 from .ways import trace
@@ -51,7 +52,8 @@ class TeamPlanner:
     """Chooses where each robot of a team should go next, call by call.
 
     Args:
-        policy: one of the classical planners, `maexp.agents.runtime.CHOICES`, or the folder of a trained policy.
+        policy: one of the classical planners, `maexp.agents.runtime.CHOICES`, a trained policy that ships, by its name
+            (`shipped_names()`), or the folder of another one.
         radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
         robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list;
             None: as the policy was trained, 0.3 m for planners.
@@ -61,6 +63,8 @@ class TeamPlanner:
         least_area: targets with less unknown area in sight do not count [m^2]; None: what the smallest robot covers.
         patience: how long a robot may stand still on its way, or beside a target that stays [s].
         pause: how long a target is given up for the first time; longer every time, the third for good [s].
+        max_speed, max_accel, seconds: of the robots [m/s, m/s^2], and between two calls [s]; only trained policies look
+            at them; None: as the policy was trained.
         seed: of choices at random.
     """
 
@@ -76,13 +80,19 @@ class TeamPlanner:
         least_area: float | None = None,
         patience: float = 10.0,
         pause: float = 60.0,
+        max_speed: float | None = None,
+        max_accel: float | None = None,
+        seconds: float | None = None,
         seed: int = 0,
     ):
-        self.learned = None if policy in CHOICES else _open(policy)
+        self.learned = None if policy in CHOICES else LearnedChoice(find_policy(policy, CHOICES))
         self.policy, self.bounded, self.seed = policy, bounded, seed
         defaults = DEFAULTS if self.learned is None else self.learned.contract
         self.radar_range = _positive("radar_range", defaults.radar_range if radar_range is None else radar_range)
         self.robot_radius = defaults.robot_radius if robot_radius is None else robot_radius
+        given = {"max_speed": max_speed, "max_accel": max_accel, "seconds": seconds}
+        given = {name: _positive(name, value) for name, value in given.items() if value is not None}
+        self.motion = replace(defaults.motion, **given)
         self.clearance_factor = _positive("clearance_factor", clearance_factor)
         self.occupied = _positive("occupied", occupied)
         self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
@@ -187,7 +197,8 @@ class TeamPlanner:
         robots = scene.robots
         last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
         heading = team.yaw[robots] - scene.grid.yaw
-        return self.learned.choose(scene, heading, team.speed[robots], scene.grid.from_map(last), time_left)
+        last = scene.grid.from_map(last)
+        return self.learned.choose(scene, heading, team.speed[robots], last, time_left, self.motion)
 
     def _finish(self, plan: Plan) -> Plan:
         """Log what has not been said in the call before."""
@@ -196,15 +207,6 @@ class TeamPlanner:
                 LOG.warning(note)
         self.said = frozenset(plan.notes)
         return plan
-
-
-def _open(policy) -> LearnedChoice:
-    """The trained policy of a folder."""
-    if not isinstance(policy, str | Path) or not Path(policy).is_dir():
-        raise ValueError(
-            f"policy={policy!r} is unknown: choose one of {', '.join(CHOICES)}, or the folder of a trained policy"
-        )
-    return LearnedChoice(policy)
 
 
 def _describe(team: Team, scene: Scene, chosen: np.ndarray, notes: list[str]) -> Plan:

@@ -11,13 +11,14 @@ from maexp.agents.settings.schema import schema
 from maexp.envs.starts import STARTS
 
 PATHS = (
-    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "hydra.run.dir",
-    "hydra.sweep.dir",
+    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results",
+    "hydra.run.dir", "hydra.sweep.dir",
 )  # fmt: skip
 RENAMED = {"algorithm.preset": "tuning", "model.preset": "model", "planner.name": "planner"}
 """Settings that are groups now: a choice brings all its values."""
 LISTS = {
     "train": ("num_robots",),
+    "export": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
     "bench": ("num_robots", "axes"),
     "benchmark": (

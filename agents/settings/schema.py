@@ -168,7 +168,7 @@ class TrainSettings(LearnerSettings):
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
     classical: Any = setting(None, "planners played beside the trained team; default: three that are good and cheap")
-    warm_start: str | None = setting(None, "policy to imitate first: a classical one, a run's folder or a checkpoint")
+    warm_start: str | None = setting(None, "policy to imitate first: a name, or a folder: of a run, or exported")
     warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
@@ -185,7 +185,7 @@ class EvaluateSettings(LearnerSettings):
     preset: str = MISSING
     action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
-    policy: Any = setting(None, f"{', '.join(POLICIES)}; several as policy=random,voronoi")
+    policy: Any = setting(None, f"{', '.join(POLICIES)}, or a trained one or its folder; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
@@ -200,7 +200,7 @@ class ViewSettings(LearnerSettings):
     action: str = MISSING  # which file of conf/action
     place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
     index: int = setting(0, "which map of the scenario")
-    policy: str | None = setting(None, "a classical policy to watch, on the map given or a held-out one")
+    policy: str | None = setting(None, "a policy to watch, classical or trained, on the map given or a held-out one")
     checkpoint: str | None = None  # what `place` becomes where it is a run
     num_robots: int = setting(3, "robots in a team")
     num_envs: int = setting(1, "teams to watch, each in a held-out episode of its own")
@@ -225,7 +225,16 @@ class ExportSettings(LearnerSettings):
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file, whose policy chooses targets")
     out: str | None = setting(None, "folder to write, new or empty")
     name: str | None = setting(None, "of the policy; default: the folder's")
-    num_robots: int = setting(3, "robots in a team")
+    results: str | None = setting(None, "evaluations for its card: results=FOLDER,FOLDER; default: the run's own")
+    num_robots: Any = setting(3, "robots in a team")
+
+
+@dataclass
+class PoliciesSettings:
+    """`maexp policies`."""
+
+    task: str = MISSING
+    name: str | None = setting(None, "show: the policy, or the folder of one")
 
 
 @dataclass
@@ -246,7 +255,7 @@ class IrsimSettings:
     """`maexp irsim`."""
 
     floor: str | None = setting(None, "a floor's file, as for maexp maps import")
-    policy: str = setting("cost_utility", "a classical policy")
+    policy: str = setting("cost_utility", "a classical policy, or a trained one or its folder")
     num_robots: int = setting(3, "robots in the team")
     seconds: float | None = setting(None, "length of the trial [s]; default: an episode of our simulator on this floor")
     episode: int = setting(0, "the robots start where they do in this evaluation episode of our simulator")
@@ -313,6 +322,7 @@ SCHEMAS = {
     "evaluate": EvaluateSettings,
     "view": ViewSettings,
     "export": ExportSettings,
+    "policies": PoliciesSettings,
     "maps": MapsSettings,
     "irsim": IrsimSettings,
     "bench": BenchSettings,

@@ -1,0 +1,117 @@
+"""The card of an exported policy: what it was trained on, how well it does, what it is not good for, in Markdown."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.errors import UserError
+
+SHOWN = {
+    "exploration_ratio": "coverage",
+    "coverage_auc": "over time",
+    "coverage_step_85_censored": "85 % at step",
+    "coverage_step_95_censored": "95 % at step",
+    "success_rate": "success",
+    "collisions": "collisions",
+}
+RESULTS = ("results.json", "summary.json")  # of maexp evaluate, of maexp train
+NEXT = "coverage_auc"  # differences are told in it
+
+
+def write_card(name: str, trained: dict[str, Any], files: list[Path]) -> str:
+    """The card.
+
+    Args:
+        trained: how it was trained, as in the contract, with the names of its scenarios.
+        files: results of its evaluations.
+    """
+    places = ", ".join(f"`{one}`" for one in trained["scenarios"])
+    teams = ", ".join(map(str, trained["num_robots"]))
+    lines = [
+        f"# {name}", "",
+        "Chooses which frontier target each robot of a team goes to next. It starts from what the classical planner "
+        "`cost_utility` thinks of a target, and has learned where to differ.", "",
+        "## Training", "",
+        f"`{trained['algorithm']}` on {places}, teams of {teams}, {trained['frames']:,} macro steps of teams, seed "
+        f"{trained['seed']}, commit {trained['commit']}.", "",
+        "## Results", "",
+    ]  # fmt: skip
+    for file in files:
+        lines += describe_results(file)
+    if not files:
+        lines += ["It has not been evaluated.", ""]
+    lines += [
+        "## Not good for", "",
+        "- maps without a common frame, and robots that do not hear each other: it has seen neither;",
+        "- places where people walk: it knows nothing of what moves;",
+        "- robots that see less than all around.", "",
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def find_results(place: Path) -> Path:
+    """The results in the folder of a run or an evaluation.
+
+    Raises:
+        UserError: there are none.
+    """
+    found = [place / name for name in RESULTS if (place / name).is_file()]
+    if not found:
+        raise UserError(f"results={place} holds no results.json: give the folder of an evaluation of the policy.")
+    return found[0]
+
+
+def describe_results(file: Path) -> list[str]:
+    """An evaluation as a table, with its differences to the best classical planner.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        content = json.loads(file.read_text())
+        run = content["run"]
+        rows = {name: values for name, values in content.items() if next(iter(SHOWN)) in values}
+        teams = f"teams of {run['num_robots'][0]}, " if len(run["num_robots"]) == 1 else ""
+        lines = [
+            f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval, "
+            f"commit {run['commit']}:", "",
+            f"| policy | {' | '.join(SHOWN.values())} |",
+            "| --- " * (len(SHOWN) + 1) + "|",
+        ]  # fmt: skip
+        for name, values in rows.items():
+            lines.append(f"| {name} | {' | '.join(_cell(values.get(one)) for one in SHOWN)} |")
+        return [*lines, "", *_differences(content)]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{file} is not the results of an evaluation ({type(error).__name__}: {reason}).") from error
+
+
+def describe_maps(run: dict[str, Any]) -> str:
+    """How many maps there were, or which."""
+    maps = run["maps"]
+    count = f"{len(maps)} {'held-out ' * bool(run.get('held_out'))}maps"
+    return count if run.get("held_out") or len(maps) > 5 else ", ".join(maps)
+
+
+def _differences(content: dict[str, Any]) -> list[str]:
+    """A sentence a learned team: how far it is ahead of the best classical planner on the same episodes."""
+    sentences = []
+    for size, planner in content["run"].get("best_classical", {}).items():
+        for name, rivals in content.get("difference", {}).items():
+            label = next((one for one in (f"{planner} N={size}", planner) if one in rivals), None)
+            if label is not None:
+                low, high = (100 * end for end in rivals[label][NEXT]["ci95"])
+                sentences += [
+                    f"{name} less {label}, the best classical planner on the validation maps, on the same episodes: "
+                    f"{100 * rivals[label][NEXT]['mean']:+.2f} points of coverage over time "
+                    f"({low:+.2f} to {high:+.2f}).", "",
+                ]  # fmt: skip
+    return sentences
+
+
+def _cell(value: Any) -> str:
+    if not isinstance(value, dict) or value.get("mean") is None:
+        return ""
+    low, high = (value.get("ci95") or [None, None])[:2]
+    interval = "" if low is None or high is None else f" ({low:.3g} to {high:.3g})"
+    return f"{value['mean']:.3g}{interval}"

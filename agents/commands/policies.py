@@ -1,0 +1,50 @@
+"""`maexp policies`: the trained policies that come with the package."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.runtime.folder import CARD, read_contract
+from maexp.agents.runtime.shipped import SHIPPED, find_policy, shipped_names
+from maexp.agents.settings.runs import Recipe
+
+
+def prepare(overrides: list[str]) -> Recipe:
+    return Recipe(overrides)
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> None:
+    """Nothing is written."""
+
+
+def check(cfg: Any) -> None:
+    """Raise UserError for a name too much or too few."""
+    if cfg.task == "list" and cfg.name:
+        raise UserError(f"maexp policies list lists all and takes no name: leave {cfg.name} out.")
+    if cfg.task == "show" and not cfg.name:
+        raise UserError(f"maexp policies show needs a name after it: {', '.join(shipped_names())}.")
+
+
+def run(cfg: Any, where: None, overrides: list[str]) -> int:
+    """Print one line a policy, or the card of one and where it lies."""
+    with blame_input():
+        if cfg.task == "list":
+            for name in shipped_names():
+                print(describe(name))
+            return 0
+        place = find_policy(cfg.name)
+        read_contract(place)
+        print((place / CARD).read_text())
+        print(f"Folder: {place}")
+    return 0
+
+
+def describe(name: str) -> str:
+    """A line about a policy that ships."""
+    place = SHIPPED / name
+    contract = read_contract(place)
+    trained = contract.content["trained"]
+    size = sum(file.stat().st_size for file in place.iterdir()) / 1024
+    teams = ", ".join(map(str, trained["num_robots"]))
+    return f"{name:<14}{trained['algorithm']} on {', '.join(trained['scenarios'])}; teams of {teams}; {size:.0f} kB"

@@ -1,0 +1,41 @@
+"""The trained policies that come with the package, and the folder that a policy's name or path stands for."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+CONTRACT = "contract.json"
+SHIPPED = Path(__file__).resolve().parents[1] / "shipped"
+
+
+def shipped_names() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(one.parent.name for one in SHIPPED.glob(f"*/{CONTRACT}"))
+
+
+def find_policy(policy: str | Path, others: Iterable[str] = (), setting: str = "policy") -> Path:
+    """The folder of a trained policy: of one that ships, by its name, or the one that is named itself.
+
+    Args:
+        others: further names that could have been meant, for the message.
+        setting: what the message calls it.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if str(policy) in shipped_names():
+        return SHIPPED / str(policy)
+    if isinstance(policy, str | Path) and Path(policy).is_dir():
+        return Path(policy)
+    if isinstance(policy, str | Path) and Path(policy).exists():
+        raise ValueError(f"{setting}={policy} is a file: give the folder that maexp export wrote")
+    raise ValueError(f"{setting}={policy} is unknown: {advise(str(policy), [*others, *shipped_names()])}")
+
+
+def advise(word: str, names: list[str]) -> str:
+    """What to give instead of a name that is unknown: those near it, or all."""
+    if near := difflib.get_close_matches(word, names, 3, 0.7):
+        return f"did you mean {' or '.join(near)}?"
+    return f"choose one of {', '.join(names)}, or the folder of a trained policy"
