@@ -16,8 +16,9 @@ from maexp.envs.nav_grid import bank_nav_grids
 from maexp.kernels import targets
 from maexp.kernels.frontier import mark_frontier
 from maexp.kernels.geodesic import STRAIGHT, UNREACHED
-from maexp.kernels.known_grid import KnownGrids, PassableGrids
+from maexp.kernels.known_grid import KnownGrids
 from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.passable import PassableGrids
 from maexp.kernels.tree import _grow_tree
 from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks

@@ -8,8 +8,8 @@ import torch
 from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
+from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, grid_memory_per_env, memory_per_env
-from maexp.kernels.step import Settings, Simulation
 from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PIXELS
 
 KINDS = {
@@ -72,7 +72,7 @@ def reward_weights(env) -> RewardWeights:
     for name in ("explore", "overlap", "time", "unfinished", "success", "collision", "points", "events"):
         setattr(weights, name, float(getattr(cfg, name)))
     weights.time_sign = 1.0 if cfg.time_on == "covered" else 0.0
-    weights.goal_coverage = env.success_coverage
+    weights.success_coverage = env.success_coverage
     weights.horizon = env.local_steps * env.macro_steps if cfg.charge_rest else 0
     return weights
 
@@ -82,17 +82,17 @@ def step_settings(env) -> Settings:
     planner, comm = env.planner_config, env.comm_config
     return Settings(
         planner=planner.name,
-        num_accels=planner.num_accel,
-        num_turns=planner.num_steering,
+        num_accel=planner.num_accel,
+        num_steering=planner.num_steering,
         horizon=planner.horizon,
         clearance_weight=planner.clearance_weight,
         replan_steps=planner.replan_steps,
         footprint=env.collision == "footprint",
-        comm_limited=comm.limited,
+        limited=comm.limited,
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
         draw_known=env.observation_config.map == "known",
-        goal_coverage=env.success_coverage,
+        success_coverage=env.success_coverage,
     )
 
 

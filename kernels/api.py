@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from maexp.kernels import merge, visibility
-from maexp.kernels.launches import lanes_on, launch_on
+from maexp.kernels.launches import lanes_on, launch_named, launch_on
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
 
@@ -22,7 +22,7 @@ def visible_points(
     heading: float = 0.0,
     field_of_view: float = 2.0 * math.pi,
 ) -> torch.Tensor:
-    """Free points that a radar at ``origin`` sees (ray-masked point filtering; design 4.1, paper section IV-A).
+    """Free points that a radar at ``origin`` sees (ray-masked point filtering; paper, section IV-A).
 
     Args:
         free: free points [m], shape [n_free, 3] (or [n_free, 2], taken as z = 0).
@@ -115,35 +115,31 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     robots = Robots()
     robots.radar_range, robots.radar_cos_beam, robots.radar_alpha2 = full(reach), full(1.0 - alpha1), full(alpha2)
     robots.radar_cos_fov = full(math.cos(0.5 * field_of_view) if field_of_view < 2.0 * math.pi else -2.0)
-    one = ints(1)
-    pose_t, center_t = zeros(1, 1, 4, dtype=torch.float32), zeros(1, 1, 3, dtype=torch.float32)
-    pose_t[..., 3] = heading
-    pose, center = wp.from_torch(pose_t, dtype=wp.vec4), wp.from_torch(center_t, dtype=wp.vec3)
-    facing = wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2)  # only other robots' are read
-    bins = wp.from_torch(zeros(1, 1, 3 * int(BINS), dtype=torch.float32))
-    direction = wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3)
-    limit = wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2)
-    counts = [wp.from_torch(zeros(1, 1)) for _ in range(3)]
-    near, near_count = wp.from_torch(zeros(1, 1, 1)), wp.from_torch(zeros(1, 1))  # nobody else is there
-    views = zeros(1, 1, count)
-    listed, error = wp.from_torch(zeros(1, 1, count)), wp.from_torch(zeros(1))
-    launch, lanes = launch_on(device), lanes_on(wp.device_from_torch(device), 4096)
-    map_id, planar = ints(0), int(not free[:, 2].any() and not occluders[:, 2].any())
-    launch(
-        visibility._collect_occluders, dim=(1, 1),
-        inputs=[maps, map_id, planar, robots, one, pose, center, facing, near, near_count],
-        outputs=[bins, direction, limit, *counts, error],
-    )  # fmt: skip
-    launch(
-        visibility._scan_free, dim=(1, 1, lanes),
-        inputs=[maps, map_id, planar, robots, lanes, one, pose, center, bins, direction, limit, *counts[:2]],
-        outputs=[wp.from_torch(views), listed, counts[2], error],
-    )  # fmt: skip
+    pose, center = zeros(1, 1, 4, dtype=torch.float32), zeros(1, 1, 3, dtype=torch.float32)
+    pose[..., 3] = heading
+    views, dim, lanes = zeros(1, 1, count), (1, 1), lanes_on(wp.device_from_torch(device), 4096)
+    values = {
+        "maps": maps, "map_id": ints(0), "robots": robots, "active": ints(1), "lanes": lanes,
+        "planar": int(not free[:, 2].any() and not occluders[:, 2].any()),
+        "pose": wp.from_torch(pose, dtype=wp.vec4), "center": wp.from_torch(center, dtype=wp.vec3),
+        "near": wp.from_torch(zeros(1, 1, 1)), "near_count": wp.from_torch(zeros(1, 1)),  # nobody else is there
+        "facing": wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2),  # only other robots' are read
+        "bins": wp.from_torch(zeros(1, 1, 3 * int(BINS), dtype=torch.float32)),
+        "direction": wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3),
+        "limit": wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2),
+        "occluder_count": wp.from_torch(zeros(1, 1)), "wall_count": wp.from_torch(zeros(1, 1)),
+        "visible": wp.from_torch(zeros(1, 1, count)), "visible_count": wp.from_torch(zeros(1, 1)),
+        "viewers_free": wp.from_torch(views), "error": wp.from_torch(zeros(1)),
+    }  # fmt: skip
+    launch = launch_on(device)
+    found = "error bins direction limit occluder_count wall_count visible_count"
+    launch_named(launch, visibility._collect_occluders, dim, found, values)
+    launch_named(launch, visibility._scan_free, (*dim, lanes), "viewers_free error visible_count visible", values)
     return views[0, 0] != 0
 
 
 def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
-    """What every robot knows once each has heard the others it can hear (design 4.2).
+    """What every robot knows once each has heard the others it can hear.
 
     Args:
         seen: bool [E, N, n], which points each robot has seen.
@@ -167,10 +163,9 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     known = torch.zeros_like(flags)
     active = torch.ones(seen.shape[0], dtype=torch.int32, device=seen.device)
     words, told = wp.from_torch(flags), wp.from_torch(torch.zeros_like(flags))
-    launch_on(words.device)(
-        merge._share_points, dim=(seen.shape[0], seen.shape[2]),
-        inputs=[wp.from_torch(active), wp.from_torch(hears), words, told], outputs=[wp.from_torch(known)],
-    )  # fmt: skip
+    values = {"active": wp.from_torch(active), "hears": wp.from_torch(hears), "seen": words, "told": told}
+    values["known"] = wp.from_torch(known)
+    launch_named(launch_on(words.device), merge._share_points, (seen.shape[0], seen.shape[2]), "known", values)
     return unpack_flags(known, robots)
 
 

@@ -1,9 +1,15 @@
-"""Collisions (design 4.3): by distance of centres, or by oriented footprints. A collided robot stops for good."""
+"""Collisions: by distance of centres, or by oriented footprints. A collided robot stops for good."""
+
+from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.dynamics import rectangle_distance, rectangles_gap
+from maexp.kernels.geometry import rectangle_distance, rectangles_gap
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -41,6 +47,7 @@ def _detect_collisions(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
+    # Settings:
     footprint: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
@@ -50,9 +57,10 @@ def _detect_collisions(
     near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State in and out:
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
-    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # Out:
+    # State out:
+    slip: wp.array2d(dtype=wp.float32),  # [env, robot]
+    # Scratch out:
     crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Mark the robots that collide in this local step in ``crashed``, and for good in ``collided``."""
@@ -83,3 +91,8 @@ def _detect_collisions(
         # It stops where it is. Other robots' tests read its place and heading, which stay.
         pose[e, i] = wp.vec4(pose[e, i][0], pose[e, i][1], 0.0, theta)
         slip[e, i] = 0.0
+
+
+def detect_collisions(launch: Launch, shard: "Shard") -> None:
+    """Stop the robots that collide in this local step."""
+    shard.call(launch, _detect_collisions, "pose collided slip crashed")

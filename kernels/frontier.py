@@ -21,8 +21,9 @@ wp_free = wp.constant(wp.uint8(FREE))
 
 @wp.kernel(enable_backward=False)
 def _mark_frontier(
-    # Grid:
+    # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    # Map:
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     width: wp.array(dtype=wp.int32),  # [grid]
     height: wp.array(dtype=wp.int32),  # [grid]

@@ -93,20 +93,21 @@ def _lower_label(
 
 @wp.kernel(enable_backward=False)
 def _search_distance(
-    # Grid:
+    # In:
     passable: wp.array2d(dtype=wp.uint8),  # [row, cell], 0 blocked, 1 open, 2 tight
     row_of_item: wp.array(dtype=wp.int32),  # [item]
+    # Map:
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     width: wp.array(dtype=wp.int32),  # [grid]
     height: wp.array(dtype=wp.int32),  # [grid]
-    # Query:
+    # In:
     sources: wp.array2d(dtype=wp.int32),  # [item, source], -1 = none
     stop: wp.array(dtype=wp.int32),  # [item], the cell whose distance is wanted; -1 = those of all; SKIP
     # Scratch:
     next: wp.array2d(dtype=wp.int32),  # [item, cell], of its bucket's list
     previous: wp.array2d(dtype=wp.int32),  # [item, cell]
     buckets: wp.array2d(dtype=wp.int32),  # [item, bucket], first cell; -1 = none
-    # State in and out:
+    # In and out:
     touched: wp.array2d(dtype=wp.int32),  # [item, 2], first and last cell with a label
     # Out:
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]

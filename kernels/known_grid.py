@@ -1,19 +1,17 @@
-"""Navigation grids: what a team (or each robot) knows of its map, cell by cell, and where its robots fit.
+"""Navigation grids: what a team (or each robot) knows of its map, cell by cell.
 
 Rows: `rows_per_env` consecutive rows belong to one env, one row where knowledge is shared, one per robot
 where communication is limited. Cells are numbered ``iy * width + ix`` with the width of the env's map.
 
-Painting enters what has become known since the last time, and lists the cells that changed; masks follow that list.
+Painting enters what has become known since the last time, and lists the cells that changed.
 Knowledge only grows within an episode. A row where less is known than was painted (a new episode, a state that was
 loaded), or whose env has another map, is cleared and painted anew: nobody has to say so.
 """
 
-import numpy as np
 import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
-from maexp.kernels.launches import lanes_on
+from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
 wp_unknown = wp.constant(wp.uint8(UNKNOWN))
@@ -60,18 +58,6 @@ def wall_words(width: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def _assign_grids(
-    # State in:
-    map_id: wp.array(dtype=wp.int32),  # [env]
-    rows_per_env: int,
-    # Out:
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
-):
-    row = wp.tid()
-    grid_of_row[row] = map_id[row / rows_per_env]
-
-
-@wp.kernel(enable_backward=False)
 def _begin_painting(
     # Out:
     met: wp.array(dtype=wp.int32),  # [row]
@@ -112,24 +98,26 @@ def _paint_points(
     map_id: wp.array(dtype=wp.int32),  # [env]
     point_begin: wp.array(dtype=wp.int32),  # [map + 1]
     point_cell: wp.array(dtype=wp.int32),  # [points of all maps]
-    # State in:
-    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
     grid_of_row: wp.array(dtype=wp.int32),  # [row], map of what is painted
-    stale: wp.array(dtype=wp.int32),  # [row]
+    # Settings:
     again: int,  # 0: every row; 1: rows that were cleared
     rows_per_env: int,
     value: wp.uint8,
     shift: int,  # of this layer's points in `painted`
     lanes: int,
-    # State in and out:
+    # State in:
+    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    # In:
+    stale: wp.array(dtype=wp.int32),  # [row]
+    # In and out:
     painted: wp.array2d(dtype=wp.uint8),  # [row, point]
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
-    # Out:
     met: wp.array(dtype=wp.int32),  # [row], known points
     total: wp.array(dtype=wp.int32),  # [row], painted points
-    news: wp.array2d(dtype=wp.int32),  # [row, slot]
     news_count: wp.array(dtype=wp.int32),  # [row]
+    # Out:
+    news: wp.array2d(dtype=wp.int32),  # [row, slot]
 ):
     """Gives `value` to the cells of points known now and not yet painted, and to the voids that follow them.
 
@@ -174,12 +162,14 @@ def _paint_points(
 
 @wp.kernel(enable_backward=False)
 def _find_stale(
-    # State in:
+    # Map:
     map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
     rows_per_env: int,
-    met: wp.array(dtype=wp.int32),  # [row]
     capacity: int,
-    # State in and out:
+    # In:
+    met: wp.array(dtype=wp.int32),  # [row]
+    # In and out:
     total: wp.array(dtype=wp.int32),  # [row]
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     news_count: wp.array(dtype=wp.int32),  # [row]
@@ -199,9 +189,10 @@ def _find_stale(
 
 @wp.kernel(enable_backward=False)
 def _clear_stale(
-    # State in:
-    stale: wp.array(dtype=wp.int32),  # [row]
+    # Settings:
     lanes: int,
+    # In:
+    stale: wp.array(dtype=wp.int32),  # [row]
     # Out:
     painted: wp.array2d(dtype=wp.uint8),  # [row, point]
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
@@ -215,126 +206,6 @@ def _clear_stale(
             known[row, cell] = wp_unknown
         for word in range(lane, walls.shape[1], lanes):
             walls[row, word] = 0
-
-
-@wp.kernel(enable_backward=False)
-def _open_cells(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    # State in:
-    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
-    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
-    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    through_unknown: int,
-    lanes: int,
-    # Out:
-    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
-):
-    """Masks to be drawn anew: open but for obstacles."""
-    row, lane = wp.tid()
-    m = grid_of_row[row]
-    source = known_of_row[row]
-    if news_count[source] >= 0:
-        return
-    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
-        state = known[source, cell]
-        open = state == wp_free or (state == wp_unknown and through_unknown != 0)
-        passable[row, cell] = wp.where(open, wp.uint8(1), wp.uint8(0))
-
-
-@wp.func
-def near_wall(
-    known: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int, radius: float
-) -> bool:
-    """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
-    reach = int(wp.ceil(radius))
-    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-            if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
-                if known[row, v * w + u] == wp_obstacle:
-                    return True
-    return False
-
-
-@wp.kernel(enable_backward=False)
-def _open_news(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    # State in:
-    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
-    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
-    news_count: wp.array(dtype=wp.int32),  # [known row]
-    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    lanes: int,
-    # Out:
-    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
-):
-    """Opens cells that have become known to be free; the next launches close those near obstacles."""
-    row, lane = wp.tid()
-    source = known_of_row[row]
-    for k in range(lane, news_count[source], lanes):
-        if known[source, news[source, k]] == wp_free:
-            passable[row, news[source, k]] = wp.uint8(1)
-
-
-@wp.func
-def close_around(
-    cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)
-):
-    """Gives `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
-    x = cell % w
-    y = cell / w
-    reach = int(wp.ceil(r))
-    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-            if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
-                if passable[row, v * w + u] != wp_blocked:
-                    passable[row, v * w + u] = value
-
-
-@wp.kernel(enable_backward=False)
-def _close_cells(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    # State in:
-    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
-    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
-    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
-    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
-    radius: wp.array(dtype=wp.float32),  # [mask row], distance from known obstacle cells [m]
-    margin: float,  # the same, on top, in cells
-    value: wp.uint8,
-    through_unknown: int,
-    lanes: int,
-    # Out:
-    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
-):
-    """Closes the surroundings of obstacles (those that are news), and cells that have opened near older ones.
-
-    Threads that write the same cell write the same.
-    """
-    row, lane = wp.tid()
-    m = grid_of_row[row]
-    w = grids.width[m]
-    h = grids.height[m]
-    source = known_of_row[row]
-    r = radius[row] / grids.cell[m] + margin
-    if news_count[source] < 0:
-        for cell in range(lane, w * h, lanes):
-            if known[source, cell] == wp_obstacle:
-                close_around(cell, w, h, row, r, value, passable)
-    for k in range(lane, news_count[source], lanes):
-        cell = news[source, k]
-        if known[source, cell] == wp_obstacle:
-            if value == wp_blocked:
-                passable[row, cell] = wp_blocked
-            close_around(cell, w, h, row, r, value, passable)
-        elif through_unknown == 0:
-            if near_wall(known, source, cell % w, cell / w, w, h, r):
-                passable[row, cell] = value
 
 
 class KnownGrids:
@@ -378,30 +249,30 @@ class KnownGrids:
         self.news_count = wp.full(rows, -1, dtype=wp.int32, device=device)
         self.met, self.total, self.stale = (wp.zeros(rows, dtype=wp.int32, device=device) for _ in range(3))
 
-    def paint(self, launch) -> None:
-        """Brings `known` up to date; ``launch(kernel, dim, inputs, outputs)`` launches or records."""
-        rows = self.known.shape[0]
-        launch(_begin_painting, rows, [], [self.met, self.news_count])
+    def paint(self, launch: Launch) -> None:
+        """Bring `known` up to date."""
+        rows, values = self.known.shape[0], vars(self) | {"capacity": self.news.shape[1]}
+        launch_named(launch, _begin_painting, rows, "met news_count", values)
         self._paint_layers(launch, again=0)
-        launch(
-            _find_stale, rows, [self.map_id, self.rows_per_env, self.met, self.news.shape[1]],
-            [self.total, self.grid_of_row, self.news_count, self.stale],
-        )  # fmt: skip
-        launch(_clear_stale, (rows, self.lanes), [self.stale, self.lanes], [self.painted, self.known, self.walls])
+        launch_named(launch, _find_stale, rows, "total grid_of_row news_count stale", values)
+        launch_named(launch, _clear_stale, (rows, self.lanes), "painted known walls", values)
         self._paint_layers(launch, again=1)
 
-    def _paint_layers(self, launch, again: int) -> None:
-        maps, grids, after_free = self.maps, self.grids, self.free_flags.shape[2]
-        layers = [
-            (maps.boundary_begin, grids.boundary_cell, self.boundary_flags, OBSTACLE, after_free),
-            (maps.free_begin, grids.free_cell, self.free_flags, FREE, 0),
-        ]
-        for begin, cell, flags, value, shift in layers:
-            launch(
-                _paint_points, (self.known.shape[0], self.lanes),
-                [self.grids, self.map_id, begin, cell, flags, self.grid_of_row, self.stale, again, self.rows_per_env,
-                 wp.uint8(value), shift, self.lanes],
-                [self.painted, self.known, self.walls, self.met, self.total, self.news, self.news_count],
+    def _paint_layers(self, launch: Launch, again: int) -> None:
+        """Paint obstacles, then free points."""
+        maps, grids = self.maps, self.grids
+        obstacles = {
+            "point_begin": maps.boundary_begin, "point_cell": grids.boundary_cell, "flags": self.boundary_flags,
+            "value": wp.uint8(OBSTACLE), "shift": self.free_flags.shape[2],
+        }  # fmt: skip
+        free = {
+            "point_begin": maps.free_begin, "point_cell": grids.free_cell, "flags": self.free_flags,
+            "value": wp.uint8(FREE), "shift": 0,
+        }  # fmt: skip
+        for layer in (obstacles, free):
+            launch_named(
+                launch, _paint_points, (self.known.shape[0], self.lanes),
+                "painted known walls met total news_count news", vars(self) | layer | {"again": again},
             )  # fmt: skip
 
 
@@ -413,61 +284,3 @@ def news_capacity(cells: int) -> int:
 def wall_capacity(grids: NavGrids) -> int:
     """Words of the bitmap of walls of the largest grid."""
     return int((grids.height.numpy() * -(-grids.width.numpy() // 32)).max())
-
-
-class PassableGrids:
-    """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep. Paint after every painting
-    of those.
-
-    Args:
-        known: the grids to read.
-        radius: float32 [E, K], distance to keep from known obstacles [m]; K masks per env. Where every robot
-            has a known row of its own, K must be the number of robots.
-        comfort: float32 [E, K], distance below which a cell is tight [m]; None: no cell is.
-        margin: the same on top of both, in cells, for what the grid rounds away.
-        through_unknown: whether unknown cells count as passable.
-
-    Attributes:
-        passable: uint8 [E * K, cells]: `BLOCKED`, `OPEN` or `TIGHT`.
-        grid_of_row: int32 [E * K], the map of each row; set by `paint`.
-    """
-
-    def __init__(
-        self,
-        known: KnownGrids,
-        radius: np.ndarray,
-        comfort: np.ndarray | None,
-        margin: float,
-        through_unknown: bool,
-    ):
-        envs, masks = radius.shape
-        if known.rows_per_env not in (1, masks):
-            raise ValueError(f"{known.rows_per_env} known rows per env need as many masks, got {masks}")
-        device = known.known.device
-        self.known, self.masks = known, masks
-        self.margin, self.through_unknown = float(margin), int(through_unknown)
-        rings = [(comfort, TIGHT), (radius, BLOCKED)] if comfort is not None else [(radius, BLOCKED)]
-        self.rings = [(wp.array(r.reshape(-1), dtype=wp.float32, device=device), value) for r, value in rings]
-        rows = range(envs * masks)
-        source = [row if known.rows_per_env == masks else row // masks for row in rows]
-        self.known_of_row = wp.array(source, dtype=wp.int32, device=device)
-        self.grid_of_row = wp.zeros(len(rows), dtype=wp.int32, device=device)
-        self.passable = wp.zeros((len(rows), known.known.shape[1]), dtype=wp.uint8, device=device)
-
-    def paint(self, launch) -> None:
-        """Brings `passable` up to date with `known`."""
-        launch(_assign_grids, self.grid_of_row.shape, [self.known.map_id, self.masks], [self.grid_of_row])
-        known, lanes = self.known, self.known.lanes
-        dim, all_known = (self.passable.shape[0], lanes), [known.grids, self.grid_of_row, known.known]
-        launch(
-            _open_cells, dim, [*all_known, known.news_count, self.known_of_row, self.through_unknown, lanes],
-            [self.passable],
-        )  # fmt: skip
-        inputs = [*all_known, known.news, known.news_count, self.known_of_row]
-        if not self.through_unknown:
-            launch(_open_news, dim, [*inputs, lanes], [self.passable])
-        for radius, value in self.rings:
-            launch(
-                _close_cells, dim,
-                [*inputs, radius, self.margin, wp.uint8(value), self.through_unknown, lanes], [self.passable],
-            )  # fmt: skip

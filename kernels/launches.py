@@ -5,7 +5,7 @@ filled, or is about to read, would be met too early or too late.
 """
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -15,6 +15,9 @@ import warp as wp
 KNOWN = wp.config.version.startswith("1.19.")
 """Whether this is a Warp whose way of calling CPU kernels (nowhere documented) is the one below."""
 
+
+Launch = Callable[[wp.Kernel, int | tuple[int, ...], Sequence, Sequence], None]
+"""``launch(kernel, dim, inputs, outputs)`` launches a kernel at once, or records it."""
 
 CPU_LANES = 1
 """Threads that share the work of a robot or a row on the CPU, where a thread costs more than an item."""
@@ -30,7 +33,7 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
     return None if device.is_cpu else wp.stream_from_torch(torch.cuda.current_stream(wp.device_to_torch(device)))
 
 
-def launch_on(device: wp.Device | torch.device | str) -> Callable:
+def launch_on(device: wp.Device | torch.device | str) -> Launch:
     """``launch(kernel, dim, inputs, outputs)`` on a device, in order with what torch does there."""
     device = wp.get_device(str(device))
 
@@ -38,6 +41,25 @@ def launch_on(device: wp.Device | torch.device | str) -> Callable:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, stream=current_stream(device))
 
     return launch
+
+
+def launch_named(
+    launch: Launch, kernel: wp.Kernel, dim: int | tuple[int, ...], writes: str, values: Mapping[str, Any]
+) -> None:
+    """Launch a kernel with the values that its parameters are named after.
+
+    Args:
+        writes: the parameters that it writes: its last ones, in their order.
+        values: by name; more than it takes.
+    """
+    names, outputs = [argument.label for argument in kernel.adj.args], writes.split()
+    first = len(names) - len(outputs)
+    if names[first:] != outputs:
+        raise ValueError(f"{kernel.key} ends with the parameters {' '.join(names[first:])}, not with {writes}")
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise ValueError(f"{kernel.key} takes {', '.join(missing)}, which nothing here is named")
+    launch(kernel, dim, [values[name] for name in names[:first]], [values[name] for name in outputs])
 
 
 def finish_filling(device: wp.Device | torch.device | str) -> None:

@@ -1,4 +1,4 @@
-"""Maps of the robots and of the team (design 4.2): counting what is new, overlap, merging, sharing.
+"""Maps of the robots and of the team: counting what is new, overlap, merging, sharing.
 
 Flags live in words of 32 robots, ``[env, word, point]``: ``seen`` holds everything a robot has scanned itself,
 ``known`` what it also heard from others. How many robots have ever seen a point is counted beside (``viewers``, and in
@@ -6,9 +6,16 @@ its upper half how many see it in this local step), so that no kernel goes throu
 All sums are integers: weights are spacing squared in the map's unit, 1 on maps of even density.
 """
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
+from maexp.kernels.geometry import segment_distance
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -21,9 +28,10 @@ def _count_points(
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    # Scratch in:
     visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # Out:
+    # Scratch out:
     fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
     overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
@@ -53,9 +61,10 @@ def _merge_scan(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    # Scratch in:
     visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # State out:
+    # State in and out:
     seen_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
     viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
     covered: wp.array(dtype=wp.int32),  # [env]
@@ -92,11 +101,12 @@ def _hear_robots(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
+    comm_range: float,
+    line_of_sight: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
-    comm_range: float,
-    line_of_sight: int,
     # State out:
     comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
     hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
@@ -127,19 +137,13 @@ def _hear_robots(
             hears[e, i, w] = hears[e, i, w] | (1 << (other % ROBOTS_PER_WORD))
 
 
-@wp.func
-def segment_distance(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
-    along = b - a
-    t = wp.clamp(wp.dot(p - a, along) / wp.max(wp.dot(along, along), 1.0e-12), 0.0, 1.0)
-    return wp.length(p - a - t * along)
-
-
 @wp.kernel
 def _share_points(
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
     seen: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    # Scratch in:
     told: wp.array3d(dtype=wp.int32),  # [env, word, point]
     # State out:
     known: wp.array3d(dtype=wp.int32),  # [env, word, point]
@@ -177,3 +181,21 @@ def _copy_flags(
     e, w, j = wp.tid()
     if active[e] != 0:
         copy[e, w, j] = flags[e, w, j]
+
+
+def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
+    """Count what is new and what overlaps, and add the scan to the team's map, where ``running`` [env] is set."""
+    shard.call(launch, _count_points, "fresh overlap", active=running)
+    shard.call(launch, _merge_scan, "seen_free viewers_free covered shared", active=running)
+
+
+def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
+    """Let robots hear from others, where communication is limited and ``running`` [env] is set."""
+    if not shard.settings.limited:
+        return
+    shard.call(launch, _hear_robots, "comm hears", active=running)
+    for what in ("free", "boundary"):
+        seen, told, known = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "told", "known"))
+        envs, _, points = known.shape
+        shard.call(launch, _copy_flags, "copy", known.shape, active=running, flags=known, copy=told)
+        shard.call(launch, _share_points, "known", (envs, points), active=running, seen=seen, told=told, known=known)

@@ -1,13 +1,20 @@
-"""What the policy sees: pictures, poses, region offsets (design 2, 4.2; paper, section IV-D).
+"""What the policy sees: pictures, poses, region offsets (paper, section IV-D).
 
 Picture: a square frame around the extent, x along the first axis, flattened to 125 * 125 pixels.
 Which points a pixel shows is fixed per map (`Maps.pixel_point`, and the other way `Maps.point_pixel`).
 """
 
+from typing import TYPE_CHECKING
+
+import torch
 import warp as wp
 
-from maexp.kernels.dynamics import rectangle_distance
+from maexp.kernels.geometry import rectangle_distance
+from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.types import PI, PIXELS, REGIONS, ROBOTS_PER_WORD, Maps, Robots, point_xy
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -58,8 +65,8 @@ def _draw_points(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    mask: wp.array(dtype=wp.int32),  # [env]
-    robot_count: int,
+    # Settings:
+    num_robots: int,
     team_bits: int,
     lanes: int,
     # State in:
@@ -68,6 +75,8 @@ def _draw_points(
     seen_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
     viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
     viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
     # Out:
     picture: wp.array4d(dtype=wp.uint8),  # [env, robot, channel, pixel]
     team: wp.array3d(dtype=wp.uint8),  # [env, channel, pixel]
@@ -101,7 +110,7 @@ def _draw_points(
                     shown = count_viewers(maps, m, e, p, free_count, seen_free, viewers_free)
                     team[e, 2, p] = wp.uint8(wp.min(shown, 255))
                 if team_bits != 0:
-                    for i in range(robot_count):
+                    for i in range(num_robots):
                         picture[e, i, channel, p] = ON
             if team_bits == 0:
                 for w in range(draw_free.shape[1]):
@@ -124,16 +133,18 @@ def _list_bodies(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    mask: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
     # State in:
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
+    # State in and out:
+    error: wp.array(dtype=wp.int32),  # [env]
     # Scratch out:
     body_pixel: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     body_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """List the pixels whose centres lie in the body of robot (e, i), and the one nearest to its centre."""
     e, i = wp.tid()
@@ -178,12 +189,13 @@ def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.ar
 @wp.kernel
 def _draw_robots(
     # State in:
-    mask: wp.array(dtype=wp.int32),  # [env]
     comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
-    body_pixel: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
-    body_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     local_step: wp.array(dtype=wp.int32),  # [env]
     track: wp.array3d(dtype=wp.int32),  # [env, robot, step]
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
+    body_pixel: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    body_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Out:
     picture: wp.array4d(dtype=wp.uint8),  # [env, robot, channel, pixel]
 ):
@@ -214,11 +226,12 @@ def _record_track(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
+    ahead: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     local_step: wp.array(dtype=wp.int32),  # [env]
-    ahead: int,
     # State out:
     track: wp.array3d(dtype=wp.int32),  # [env, robot, step]
 ):
@@ -266,3 +279,38 @@ def _observe_pose(
         grid[e, i, 1, r] = (y - at[1]) / side
         grid[e, i, 2, r] = (x - last[0]) / side
         grid[e, i, 3, r] = (y - last[1]) / side
+
+
+def record_track(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+    """Note where the robots are, where ``running`` [env] is set: in the step being finished (1) or at its start (0)."""
+    shard.call(launch, _record_track, "track", active=running, ahead=ahead)
+
+
+def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: torch.Tensor) -> None:
+    """Pictures of the envs of ``mask``.
+
+    Args:
+        picture, team: zeros, uint8 [env, robot, channel, 125, 125] and [env, channel, 125, 125], of this shard's envs.
+    """
+    s, settings = shard.view, shard.settings
+    drawn = "known" if settings.draw_known and settings.limited else "seen"
+    given = {
+        "picture": wp.from_torch(picture.flatten(3), dtype=wp.uint8),
+        "team": wp.from_torch(team.flatten(2), dtype=wp.uint8),
+        "draw_free": getattr(s, f"{drawn}_free"), "draw_boundary": getattr(s, f"{drawn}_boundary"),
+        "num_robots": shard.shape[1], "team_bits": int(settings.draw_known and not settings.limited),
+        "lanes": lanes_on(shard.device, 1024),
+    }  # fmt: skip
+    shard.call(launch, _draw_points, "picture team", (shard.shape[0], given["lanes"]), **given)
+    shard.call(launch, _list_bodies, "error body_pixel body_count")
+    shard.call(launch, _draw_robots, "picture", picture=given["picture"])
+
+
+def observe_pose(launch: Launch, shard: "Shard", pose: torch.Tensor, grid: torch.Tensor) -> None:
+    """Poses and region offsets.
+
+    Args:
+        pose, grid: float32 [env, robot, 4] and [env, robot, 4, 8, 8], of this shard's envs.
+    """
+    given = {"scaled_pose": wp.from_torch(pose, dtype=wp.vec4), "grid": wp.from_torch(grid.flatten(3))}
+    shard.call(launch, _observe_pose, "scaled_pose grid", **given)

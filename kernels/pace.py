@@ -5,11 +5,18 @@ than twice its clearance. So the waypoint is drawn nearer until DWA drives no fa
 clearance shrinks where the path itself is narrower.
 """
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import Robots, point_xy
 from maexp.kernels.ways import path_slot, wp_path_cells
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
+    from maexp.kernels.wavefront import Wavefront
 
 CREEP = 0.25  # least distance of a waypoint that is not the end, in clearances of the robot
 HEADROOM = 4.0  # speed is held to what brakes within so many times the gap to the nearest obstacle
@@ -116,14 +123,16 @@ def _fit_clearance(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    walls: wp.array2d(dtype=wp.int32),  # [row, word]
-    rows_per_env: int,
     # Robots:
     robots: Robots,
+    # Settings:
+    rows_per_env: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # In:
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
     path_total: wp.array(dtype=wp.int32),  # [item]
     path_used: wp.array(dtype=wp.int32),  # [item]
@@ -154,10 +163,10 @@ def _hold_back(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    walls: wp.array2d(dtype=wp.int32),  # [row, word]
-    rows_per_env: int,
     # Robots:
     robots: Robots,
+    # Settings:
+    rows_per_env: int,
     lead_time: float,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
@@ -166,7 +175,9 @@ def _hold_back(
     slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    # State out:
+    # In:
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
+    # State in and out:
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Draws waypoints nearer, so that robots drive no faster than they can brake: before other robots, before what
@@ -201,3 +212,24 @@ def _hold_back(
     length = wp.max(lead_time * wp.sqrt(2.0 * accel * room) + slack, wp_creep * clearance)
     if full > length:
         target[e, i] = at + way * (length / full)
+
+
+def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
+    """Fit the clearance that DWA is to keep to the paths."""
+    known, paths = wavefront.known, wavefront.paths
+    shard.call(
+        launch, _fit_clearance, "clearance",
+        grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
+        path=paths.path, path_total=paths.path_total, path_used=paths.path_used,
+        clearance=wavefront.narrowed.clearance,
+    )  # fmt: skip
+
+
+def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
+    """Draw waypoints nearer, so that robots can brake."""
+    known, settings = wavefront.known, shard.settings
+    shard.call(
+        launch, _hold_back, "target",
+        grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
+        lead_time=settings.horizon * settings.dt,
+    )  # fmt: skip

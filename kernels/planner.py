@@ -1,8 +1,12 @@
-"""Local planners: how to go (design 4.4). DWA, and direct controls from the policy."""
+"""Local planners: how to go. DWA, and direct controls from the policy."""
+
+from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.dynamics import box_distance, curvature, heading_change, rectangle_distance, rectangles_gap
+from maexp.kernels.dynamics import curvature, heading_change
+from maexp.kernels.geometry import box_distance, rectangle_distance, rectangles_gap
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import (
     HALF,
     OMNIDIRECTIONAL,
@@ -14,6 +18,9 @@ from maexp.kernels.types import (
     row_span,
     within,
 )
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -167,10 +174,11 @@ def _plan_dwa(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
-    num_accels: int,
-    num_turns: int,
+    # Settings:
+    num_accel: int,
+    num_steering: int,
     horizon: int,
-    weight: float,
+    clearance_weight: float,
     footprint: int,
     limited: int,
     dt: float,
@@ -180,24 +188,25 @@ def _plan_dwa(
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
     slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
-    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
     known_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
     # Scratch in:
+    facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
     near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # Scratch:
+    # State in and out:
+    error: wp.array(dtype=wp.int32),  # [env]
+    # State out:
+    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # Scratch out:
     nearby: wp.array3d(dtype=wp.vec2),  # [env, robot, slot]
     mates: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
-    # Out:
-    control: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Dynamic window: the candidate with the best score after ``horizon`` steps.
 
     Candidates are numbered with accelerations outside and turns inside; the first maximum wins.
 
-    score = -distance(target) + weight * log(d / clearance) where d < clearance, d the distance of the
+    score = -distance(target) + clearance_weight * log(d / clearance) where d < clearance, d the distance of the
     predicted body to what is known to be in the way.
     """
     e, i = wp.tid()
@@ -237,14 +246,14 @@ def _plan_dwa(
     mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, near, near_count, mates)
     best = float(-1.0e30)
     best_k = int(0)
-    for b in range(num_turns):
-        u = spread(b, num_turns, reach_turn)
+    for b in range(num_steering):
+        u = spread(b, num_steering, reach_turn)
         curve = curvature(kind, u, robots.wheelbase[e, i])
         theta1 = start[3] + heading_change(kind, v0, u, curve, dt)
         c1 = wp.cos(theta1)
         s1 = wp.sin(theta1)
-        for a in range(num_accels):
-            push = spread(a, num_accels, accel)
+        for a in range(num_accel):
+            push = spread(a, num_accel, accel)
             x = float(x0)
             y = float(y0)
             v = v0 + push * dt
@@ -268,8 +277,8 @@ def _plan_dwa(
                 d = wp.min(d, body_distance(
                     robots, mate_count, e, i, p, theta, clearance, footprint, pose, center, facing, mates))  # fmt: skip
                 if d < clearance:
-                    score += weight * wp.log(wp.max(d, NEAREST) / clearance)
-                k = a * num_turns + b
+                    score += clearance_weight * wp.log(wp.max(d, NEAREST) / clearance)
+                k = a * num_steering + b
                 if score > best or (score == best and k < best_k):
                     best = score
                     best_k = k
@@ -282,8 +291,9 @@ def _plan_direct(
     robots: Robots,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    # Scratch in:
     command: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    # Out:
+    # State out:
     control: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Take the controls from the policy: shares of the robot's limits in [-1, 1]."""
@@ -304,15 +314,16 @@ def _set_goal(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    # Action:
-    region: wp.array2d(dtype=wp.int64),  # [env, robot]
-    offset: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    # Scratch in:
+    region: wp.array2d(dtype=wp.int64),  # [env, robot]
+    offset: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # State in and out:
+    error: wp.array(dtype=wp.int32),  # [env]
     # State out:
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Goal = region centre + offset * half a region (region = ix * 8 + iy); out of bounds is clamped."""
     e, i = wp.tid()
@@ -329,3 +340,21 @@ def _set_goal(
     y = maps.lower[m][1] + half[1] * (float(2 * (r % 8) + 1) + wp.clamp(o[1], -1.0, 1.0))
     goal[e, i] = wp.vec2(x, y)
     target[e, i] = wp.vec2(x, y)
+
+
+def set_goals(launch: Launch, shard: "Shard") -> None:
+    """Turn the policy's regions and offsets into goals."""
+    if shard.settings.planner != "direct":
+        shard.call(launch, _set_goal, "error goal target")
+
+
+def plan(launch: Launch, shard: "Shard") -> None:
+    """How to go: controls of every robot. Under `wavefront` DWA drives to its waypoints with its clearances."""
+    if shard.settings.planner == "direct":
+        shard.call(launch, _plan_direct, "control")
+        return
+    robots = shard.robots if shard.wavefront is None else shard.wavefront.narrowed
+    shard.call(
+        launch, _plan_dwa, "error control nearby mates",
+        robots=robots, known_boundary=shard.known("boundary"),
+    )  # fmt: skip

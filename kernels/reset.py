@@ -1,11 +1,17 @@
-"""Masked reset: choose the map, clear the flags, place the team (design 2, 4.3).
+"""Masked reset: choose the map, clear the flags, place the team.
 
 Random numbers are keyed by (seed, env, episode), so env i plays the same episodes for any batch size.
 """
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import PI, Maps, Robots, point_xy
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -51,21 +57,24 @@ def put_robot(
 def _place_team(
     # Map:
     maps: Maps,
-    num_maps: int,
+    map_starts: wp.array2d(dtype=wp.vec3),  # [map, robot] the same; inf: drawn
     # Robots:
     robots: Robots,
+    # Settings:
+    num_maps: int,
     # State in:
     seed: wp.array(dtype=wp.int32),  # [1]
-    mask: wp.array(dtype=wp.int32),  # [env]
     env_id: wp.array(dtype=wp.int32),  # [env]
     episode: wp.array(dtype=wp.int32),  # [env]
     starts: wp.array2d(dtype=wp.vec3),  # [env, robot] x, y [m], heading [rad]; inf: those of the map
-    map_starts: wp.array2d(dtype=wp.vec3),  # [map, robot] the same; inf: drawn
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
+    # State in and out:
+    error: wp.array(dtype=wp.int32),  # [env]
     # State out:
     map_id: wp.array(dtype=wp.int32),  # [env]
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
-    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Draw the map of a new episode and, where none is given, a start for every robot: clear of walls and of the
     others, any heading."""
@@ -112,7 +121,7 @@ def _place_team(
 
 @wp.kernel
 def _clear_flags(
-    # State in:
+    # Scratch in:
     mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
     flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
@@ -124,7 +133,7 @@ def _clear_flags(
 
 @wp.kernel
 def _clear_env(
-    # State in:
+    # Scratch in:
     mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
     covered: wp.array(dtype=wp.int32),  # [env]
@@ -155,20 +164,22 @@ def _clear_env(
 @wp.kernel
 def _clear_robots(
     # State in:
-    mask: wp.array(dtype=wp.int32),  # [env]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
     slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     control: wp.array2d(dtype=wp.vec2),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
-    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
     path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
     milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
     terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
     raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
     episode_reward: wp.array2d(dtype=wp.float32),  # [env, robot]
+    # Scratch out:
+    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     e, i = wp.tid()
     if mask[e] == 0:
@@ -191,11 +202,13 @@ def _clear_robots(
 @wp.kernel
 def _start_env(
     # State in:
-    mask: wp.array(dtype=wp.int32),  # [env]
     covered: wp.array(dtype=wp.int32),  # [env]
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
     covered_before: wp.array(dtype=wp.int32),  # [env]
     active: wp.array(dtype=wp.int32),  # [env]
+    # Scratch out:
     fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
     overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
@@ -208,3 +221,30 @@ def _start_env(
     for i in range(fresh.shape[1]):
         fresh[e, i] = 0
         overlap[e, i] = 0
+
+
+def place_teams(launch: Launch, shard: "Shard") -> None:
+    """Clear the envs of ``mask``, choose their maps and place their robots."""
+    s = shard.view
+    flags = [s.seen_free, s.seen_boundary, s.viewers_free, s.viewers_boundary]
+    if shard.settings.limited:
+        flags += [s.known_free, s.known_boundary]
+    for one in flags:
+        shard.call(launch, _clear_flags, "flags", one.shape, flags=one)
+    shard.call(
+        launch, _clear_env,
+        "covered covered_before covered_sum shared "
+        "local_step macro_step terminated milestone_step milestone_overlap",
+        shard.shape[0],
+    )  # fmt: skip
+    shard.call(launch, _place_team, "error map_id pose center", shard.shape[0])
+    shard.call(
+        launch, _clear_robots,
+        "slip control goal target collided "
+        "path_length milestone_path terms raw episode_reward crashed",
+    )  # fmt: skip
+
+
+def start_episodes(launch: Launch, shard: "Shard") -> None:
+    """Let the envs of ``mask`` run, once their robots have taken the first scan."""
+    shard.call(launch, _start_env, "covered_before active fresh overlap", shard.shape[0])

@@ -1,8 +1,14 @@
 """Reward terms, milestones and the end of an episode (docs/concepts.md; paper, section III-D)."""
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
+from maexp.kernels.launches import Launch
 from maexp.kernels.types import Maps
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -28,7 +34,7 @@ class RewardWeights:
     points: float  # w = points / total weight scales explore and overlap
     events: float  # v = events scales time, success, collision; 0: points / |free| (the paper's way)
     time_sign: float  # 0: -(1 - coverage) as in the code, 1: -coverage as the paper prints
-    goal_coverage: float
+    success_coverage: float
     horizon: int  # local steps of an episode, charged to the last one when all have collided; 0: they are not
 
 
@@ -61,17 +67,19 @@ def _reward_robots(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
     weights: RewardWeights,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
-    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
-    overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
-    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
     covered: wp.array(dtype=wp.int32),  # [env]
     covered_before: wp.array(dtype=wp.int32),  # [env]
     local_step: wp.array(dtype=wp.int32),  # [env]
-    # Out:
+    # Scratch in:
+    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
+    crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
+    # State in and out:
     terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
     raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
 ):
@@ -92,7 +100,7 @@ def _reward_robots(
     before = float(covered_before[e]) / total
     after = float(covered[e]) / total
     left = float(0.0)
-    if collided[e, i] != 0 and after < weights.goal_coverage:
+    if collided[e, i] != 0 and after < weights.success_coverage:
         left = steps_charged(weights.horizon, local_step[e], e, collided)
     lapse = -(1.0 - before) - left * (1.0 - after)
     if weights.time_sign != 0.0:
@@ -101,7 +109,7 @@ def _reward_robots(
     add_term(terms, raw, e, i, EXPLORE, weights.explore * float(fresh[e, i]), w)
     add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
     add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
-    if before < weights.goal_coverage and after >= weights.goal_coverage:
+    if before < weights.success_coverage and after >= weights.success_coverage:
         add_term(terms, raw, e, i, SUCCESS, weights.success, v)
     if crashed[e, i] != 0:
         add_term(terms, raw, e, i, COLLISION, -weights.collision, v)
@@ -112,7 +120,8 @@ def _close_step(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    goal_coverage: float,
+    # Settings:
+    success_coverage: float,
     # State in:
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     covered: wp.array(dtype=wp.int32),  # [env]
@@ -120,10 +129,11 @@ def _close_step(
     path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
     # State in and out:
     active: wp.array(dtype=wp.int32),  # [env]
-    covered_before: wp.array(dtype=wp.int32),  # [env]
     covered_sum: wp.array(dtype=wp.int64),  # [env]
     local_step: wp.array(dtype=wp.int32),  # [env]
     milestone_step: wp.array2d(dtype=wp.int32),  # [env, mark]
+    # State out:
+    covered_before: wp.array(dtype=wp.int32),  # [env]
     milestone_overlap: wp.array2d(dtype=wp.float32),  # [env, mark]
     milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
     terminated: wp.array(dtype=wp.int32),  # [env]
@@ -151,6 +161,21 @@ def _close_step(
     for i in range(collided.shape[1]):
         if collided[e, i] == 0:
             alive += 1
-    if coverage >= goal_coverage or alive == 0:
+    if coverage >= success_coverage or alive == 0:
         terminated[e] = 1
         active[e] = 0
+
+
+def reward_robots(launch: Launch, shard: "Shard") -> None:
+    """Add this local step's reward."""
+    shard.call(launch, _reward_robots, "terms raw")
+
+
+def close_step(launch: Launch, shard: "Shard") -> None:
+    """Count the local step, note milestones, end episodes."""
+    shard.call(
+        launch, _close_step,
+        "active covered_sum local_step milestone_step "
+        "covered_before milestone_overlap milestone_path terminated",
+        shard.shape[0],
+    )  # fmt: skip

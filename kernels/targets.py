@@ -10,7 +10,8 @@ import warp as wp
 
 from maexp.kernels.frontier import OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
-from maexp.kernels.known_grid import NavGrids, nav_cell, near_wall
+from maexp.kernels.known_grid import NavGrids, nav_cell
+from maexp.kernels.passable import near_wall
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import nearest_passable, step_back
 
@@ -32,6 +33,7 @@ def _locate_robots(
     active: wp.array(dtype=wp.int32),  # [env]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # In:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     # Out:
@@ -67,7 +69,7 @@ def _sum_frontier(
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
-    # State in:
+    # In:
     frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
     # Out, zero before:
     size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
@@ -97,10 +99,11 @@ def _place_targets(
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
     search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
-    # State in:
+    # In:
     size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
     sums: wp.array3d(dtype=wp.int64),  # [row, block, 2]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
+    # Settings:
     rows_per_env: int,
     robots: int,
     # Out:
@@ -157,11 +160,12 @@ def _look_around(
     # Map:
     grids: NavGrids,
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
-    # State in:
+    # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     target: wp.array2d(dtype=wp.int32),  # [row, target], -1 = none
     ray_cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], as far as the radius in every grid
     ray_way: wp.array(dtype=wp.vec2),  # [ray]
+    # Settings:
     radius: float,  # [m]
     # Out:
     area: wp.array2d(dtype=wp.float32),  # [row, target], unknown cells in sight of the target
@@ -212,9 +216,11 @@ def _find_open_ground(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    # State in:
+    # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    # Settings:
     rows_per_env: int,
+    # In:
     cell: wp.array3d(dtype=wp.int32),  # [env, robot, sample]
     room: wp.array2d(dtype=wp.float32),  # [env, robot], distance from known obstacles [m]
     # Out:
@@ -238,11 +244,12 @@ def _first_cells(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    # State in:
+    # In:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     target: wp.array3d(dtype=wp.int32),  # [env, robot, block], -1 = none
+    # Settings:
     reach: int,  # length of the way to look ahead, 10 a cell
     # Out:
     cell: wp.array3d(dtype=wp.int32),  # [env, robot, block]; -1 = no way

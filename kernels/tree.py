@@ -55,8 +55,10 @@ def _grow_tree(
     env_id: wp.array(dtype=wp.int32),  # [env]
     episode: wp.array(dtype=wp.int32),  # [env]
     macro_step: wp.array(dtype=wp.int32),  # [env]
+    # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     sources: wp.array2d(dtype=wp.int32),  # [item, 1], the robot's cell; -1 = none
+    # Settings:
     rows_per_env: int,
     robots: int,
     samples: int,

@@ -1,4 +1,4 @@
-"""Radar: ray-masked point filtering (design 4.1; paper, section IV-A).
+"""Radar: ray-masked point filtering (paper, section IV-A).
 
 A free point P_f (seen from the robot's centre) is masked when some occluder P_o in range has
 
@@ -13,8 +13,11 @@ follows what is seen, not the square of the range. In a cloud that is not ``plan
 nothing is left out.
 """
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
+from maexp.kernels.launches import Launch
 from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.types import (
     HALF,
@@ -29,6 +32,9 @@ from maexp.kernels.types import (
     row_span,
     within,
 )
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
@@ -132,9 +138,10 @@ def _collect_occluders(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    planar: int,
     # Robots:
     robots: Robots,
+    # Settings:
+    planar: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
@@ -143,6 +150,8 @@ def _collect_occluders(
     facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
     near: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     near_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    # State in and out:
+    error: wp.array(dtype=wp.int32),  # [env]
     # Scratch out:
     bins: wp.array3d(dtype=wp.float32),  # [env, robot, bin]
     direction: wp.array3d(dtype=wp.vec3),  # [env, robot, occluder]
@@ -150,7 +159,6 @@ def _collect_occluders(
     occluder_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     wall_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    error: wp.array(dtype=wp.int32),  # [env]
 ):
     """Gather what can mask the radar of robot (e, i): static occluders, the nearest rows first, and other bodies."""
     e, i = wp.tid()
@@ -209,9 +217,10 @@ def _scan_free(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    planar: int,
     # Robots:
     robots: Robots,
+    # Settings:
+    planar: int,
     lanes: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
@@ -223,11 +232,13 @@ def _scan_free(
     limit: wp.array3d(dtype=wp.vec2),  # [env, robot, occluder]
     occluder_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     wall_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # Scratch out:
+    # State in and out:
     viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
-    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
-    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     error: wp.array(dtype=wp.int32),  # [env]
+    # Scratch in and out:
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    # Scratch out:
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
 ):
     """List the free points that robot (e, i) sees now and count its view at each of them."""
     e, i, lane = wp.tid()
@@ -275,13 +286,15 @@ def _scan_boundary(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Robots:
     robots: Robots,
+    # Settings:
     lanes: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # Scratch in:
     visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
-    # State out:
+    # State in and out:
     seen_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
     viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
 ):
@@ -303,3 +316,14 @@ def _scan_boundary(
             if (seen_boundary[e, word, j] & bit) == 0 and wp.length(maps.boundary[begin + j] - origin) <= radius:
                 if (wp.atomic_or(seen_boundary, e, word, j, bit) & bit) == 0:
                     wp.atomic_add(viewers_boundary, e, 0, j, 1)
+
+
+def scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
+    """What every robot sees now, in the envs where ``running`` [env] is set; maps of an env are planar."""
+    lanes = (*shard.shape, shard.lanes)
+    shard.call(
+        launch, _collect_occluders, "error bins direction limit occluder_count wall_count visible_count",
+        active=running, planar=1,
+    )  # fmt: skip
+    shard.call(launch, _scan_free, "viewers_free error visible_count visible", lanes, active=running, planar=1)
+    shard.call(launch, _scan_boundary, "seen_boundary viewers_boundary", lanes, active=running)

@@ -11,12 +11,16 @@ A path holds its first `PATH_CELLS` cells only; the search is repeated long befo
 held never outlives a macro step: a new goal always searches anew.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 
 from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
-from maexp.kernels.known_grid import KnownGrids, NavGrids, PassableGrids, nav_cell, nav_center
-from maexp.kernels.pace import _fit_clearance, _hold_back
+from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
+from maexp.kernels.launches import Launch, launch_named
+from maexp.kernels.pace import fit_clearance, hold_back
+from maexp.kernels.passable import PassableGrids
 from maexp.kernels.state import robots_struct
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import (
@@ -29,6 +33,10 @@ from maexp.kernels.ways import (
     step_back,
     wp_path_cells,
 )
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
+    from maexp.kernels.simulation import Simulation
 
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
 COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
@@ -48,6 +56,7 @@ def _start_search(
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # In:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
@@ -99,11 +108,12 @@ def _trace_path(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # State in:
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # In:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     stop: wp.array(dtype=wp.int32),  # [item]
-    # State out:
+    # Out:
     path: wp.array2d(dtype=wp.int32),  # [item, slot]
     path_total: wp.array(dtype=wp.int32),  # [item], cells of the whole path; 0 = none
     path_used: wp.array(dtype=wp.int32),  # [item], how far along it the waypoint is; -1 = out of sight
@@ -145,6 +155,7 @@ def _pick_waypoint(
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # In:
     reach: wp.array2d(dtype=wp.float32),  # [env, robot], how far a waypoint may be [m]
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
@@ -152,8 +163,9 @@ def _pick_waypoint(
     path_total: wp.array(dtype=wp.int32),  # [item]
     path_ends: wp.array(dtype=wp.int32),  # [item]
     # State out:
-    path_used: wp.array(dtype=wp.int32),  # [item]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # Out:
+    path_used: wp.array(dtype=wp.int32),  # [item]
 ):
     """The farthest cell of the path in reach and in sight; the nearest one where none is; the goal itself
     once its cell is in sight, and where there is no path at all."""
@@ -212,44 +224,38 @@ class PathSearch:
             wp.zeros(items, dtype=wp.int32, device=device) for _ in range(3)
         )
 
-    def find(self, launch, active, collided, center, goal, target) -> None:
-        """New paths for the robots that need one."""
+    def values(self) -> dict:
+        """The arrays of maps, masks and paths, by the names of the kernels' parameters."""
         masks, known = self.passable, self.passable.known
-        launch(
-            _start_search, self.shape,
-            [known.grids, known.map_id, active, collided, center, goal, target, masks.passable,
-             self.row_of_item, self.path, self.path_total, self.path_used, self.search.distance],
-            [self.search.sources, self.search.stop],
-        )  # fmt: skip
+        return vars(self) | vars(self.search) | {
+            "grids": known.grids, "map_id": known.map_id, "passable": masks.passable,
+        }  # fmt: skip
+
+    def find(self, launch: Launch, active, collided, center, goal, target) -> None:
+        """New paths for the robots that need one."""
+        given = {"active": active, "collided": collided, "center": center, "goal": goal, "target": target}
+        launch_named(launch, _start_search, self.shape, "sources stop", self.values() | given)
         self.flood(launch)
         self.trace(launch, goal)
 
-    def flood(self, launch) -> None:
+    def flood(self, launch: Launch) -> None:
         """Distances from `search.sources`, as far as `search.stop`."""
         masks, grids = self.passable, self.passable.known.grids
         self.search.search(
             launch, masks.passable, self.row_of_item, masks.grid_of_row, grids.width, grids.height
         )
 
-    def trace(self, launch, goal) -> None:
+    def trace(self, launch: Launch, goal) -> None:
         """Paths to the cells of `search.stop`; where that is -1, to the reached cell nearest to `goal`."""
-        known = self.passable.known
-        launch(
-            _trace_path, self.shape,
-            [known.grids, known.map_id, goal, self.passable.passable, self.row_of_item, self.search.distance,
-             self.search.stop],
-            [self.path, self.path_total, self.path_used, self.path_ends],
-        )  # fmt: skip
+        writes = "path path_total path_used path_ends"
+        launch_named(launch, _trace_path, self.shape, writes, self.values() | {"goal": goal})
 
-    def pick(self, launch, active, collided, center, goal, reach, target) -> None:
+    def pick(self, launch: Launch, active, collided, center, goal, reach, target) -> None:
         """Waypoints into `target`."""
-        masks, known = self.passable, self.passable.known
-        launch(
-            _pick_waypoint, self.shape,
-            [known.grids, known.map_id, active, collided, center, goal, reach, masks.passable,
-             self.row_of_item, self.path, self.path_total, self.path_ends],
-            [self.path_used, target],
-        )  # fmt: skip
+        given = {"active": active, "collided": collided, "center": center, "goal": goal, "reach": reach}
+        launch_named(
+            launch, _pick_waypoint, self.shape, "target path_used", self.values() | given | {"target": target}
+        )
 
 
 def distinct_masks(
@@ -266,50 +272,41 @@ def distinct_masks(
 
 
 class Wavefront:
-    """The planner over one shard of a simulation: recorded launches.
+    """What the planner keeps for a shard of a simulation.
 
     Attributes:
+        known, passable, paths: what robots know, where they fit, their ways.
         narrowed: the robots with the clearance that DWA is to keep now.
-        field_launches: bring maps and paths up to date; every `replan_steps` local steps.
-        waypoint_launches: bring `target` up to date; every local step.
     """
 
-    def __init__(self, sim, shard):
-        limited = sim.settings.comm_limited
-        self.lead_time = sim.settings.horizon * sim.settings.dt
-        self.view, self.robots = shard.view, shard.robots
-        threshold, clearance = self.robots.threshold.numpy(), self.robots.clearance.numpy()
+    def __init__(self, sim: "Simulation", shard: "Shard"):
+        limited = shard.settings.limited
+        threshold, clearance = shard.robots.threshold.numpy(), shard.robots.clearance.numpy()
         robots = threshold.shape[1]
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.known = KnownGrids(
-            sim.maps, sim.nav_grids, self.view.map_id, shard.known("free"), shard.known("boundary"),
+            sim.maps, sim.nav_grids, shard.view.map_id, shard.known("free"), shard.known("boundary"),
             robots if limited else 1, sim.nav_cells,
         )  # fmt: skip
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)
         self.narrowed = robots_struct(sim.robot_tensors, shard.first, shard.last)
-        self.narrowed.clearance = wp.clone(self.robots.clearance)
-        self.field_launches = shard.record(self.find_paths)
-        self.waypoint_launches = shard.record(self.pick_waypoints)
+        self.narrowed.clearance = wp.clone(shard.robots.clearance)
 
-    def find_paths(self, launch) -> None:
-        s = self.view
-        self.known.paint(launch)
-        self.passable.paint(launch)
-        self.paths.find(launch, s.active, s.collided, s.center, s.goal, s.target)
 
-    def pick_waypoints(self, launch) -> None:
-        s = self.view
-        self.paths.pick(launch, s.active, s.collided, s.center, s.goal, self.robots.radar_range, s.target)
-        known = [self.known.grids, s.map_id, self.known.walls, self.known.rows_per_env]
-        launch(
-            _fit_clearance, self.paths.shape,
-            [*known, self.robots, s.active, s.collided, s.center, self.paths.path, self.paths.path_total,
-             self.paths.path_used],
-            [self.narrowed.clearance],
-        )  # fmt: skip
-        launch(
-            _hold_back, self.paths.shape,
-            [*known, self.robots, self.lead_time, s.active, s.collided, s.pose, s.slip, s.center, s.goal],
-            [s.target],
-        )  # fmt: skip
+def find_paths(launch: Launch, shard: "Shard") -> None:
+    """Bring maps and paths up to date, if the planner is `wavefront`: every `replan_steps` local steps."""
+    if shard.wavefront is not None:
+        s, own = shard.view, shard.wavefront
+        own.known.paint(launch)
+        own.passable.paint(launch)
+        own.paths.find(launch, s.active, s.collided, s.center, s.goal, s.target)
+
+
+def pick_waypoints(launch: Launch, shard: "Shard") -> None:
+    """Bring `target` and the clearances up to date, if the planner is `wavefront`: every local step."""
+    if shard.wavefront is not None:
+        s, own = shard.view, shard.wavefront
+        own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.target)
+        fit_clearance(launch, shard, own)
+        hold_back(launch, shard, own)

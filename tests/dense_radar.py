@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from maexp.envs import ExplorationEnv, make_map
+from maexp.kernels.step import local_step
 
 LAPS = 15
 ENVS = 8
@@ -51,7 +52,7 @@ class Scene:
 
     def _radar_launches(self) -> list[wp.Launch]:
         wanted = ("_collect_occluders", "_scan_free")
-        return [one for one in self.env.simulation.shards[0].step_launches if one.kernel.key in wanted]
+        return [one for one in self.env.simulation.shards[0].record(local_step) if one.kernel.key in wanted]
 
 
 def measure_ratio() -> float:

@@ -19,7 +19,7 @@ from maexp.envs import (
     make_map,
 )
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
-from maexp.kernels import step as stepping
+from maexp.kernels import shards as stepping
 
 
 @pytest.fixture(scope="module")

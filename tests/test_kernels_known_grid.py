@@ -9,7 +9,8 @@ from test_kernels_wavefront import Scene, array, flag_words
 
 from maexp.kernels.frontier import OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
-from maexp.kernels.known_grid import KnownGrids, PassableGrids
+from maexp.kernels.known_grid import KnownGrids
+from maexp.kernels.passable import PassableGrids
 from maexp.kernels.ways import nearest_cell
 
 pytestmark = pytest.mark.kernels

@@ -100,9 +100,9 @@ def test_waypoints_leave_room_to_brake():
         goal = np.where((world.goal == world.target)[..., :1], target.numpy()[..., :2], world.metres(world.goal))
         launch(
             pace._hold_back, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.walls(), 1, world.robots(), LEAD,
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.robots(), 1, LEAD,
              active, collided, array(pose, wp.vec4), array(world.slip * world.cell, wp.float32), center,
-             array(goal, wp.vec2)],
+             array(goal, wp.vec2), world.walls()],
             [target],
         )  # fmt: skip
         c, s = np.cos(world.heading), np.sin(world.heading)
@@ -138,8 +138,9 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
         clearance = array(np.full((3, ROBOTS), -1.0), wp.float32)
         launch(
             pace._fit_clearance, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.walls(), 1, world.robots(),
-             active, collided, center, array(path, wp.int32), array(total, wp.int32), array(used, wp.int32)],
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.robots(), 1,
+             active, collided, center, world.walls(),
+             array(path, wp.int32), array(total, wp.int32), array(used, wp.int32)],
             [clearance],
         )  # fmt: skip
         for e, i in np.ndindex(3, ROBOTS):

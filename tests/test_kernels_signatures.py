@@ -1,9 +1,14 @@
-"""The signatures of the kernels are true: every array says its axes."""
+"""The signatures of the kernels are true: what each array's axes are, what is only read, what is written."""
 
 import pytest
-from kernel_source import arguments, kernels
+from kernel_source import arguments, functions, kernels, parse, uses
 
 KERNELS = kernels()
+FUNCTIONS = functions()
+IN = ("Map", "State in", "Scratch in", "In")
+BOTH = ("State in and out", "Scratch in and out", "In and out", "Scratch")
+OUT = ("State out", "Scratch out", "Out")
+"""Headings of arrays: only read; read and written, so that what was there before counts; written."""
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -11,3 +16,30 @@ def test_every_array_says_its_axes(name):
     for one in arguments(KERNELS[name]):
         if one.dims:
             assert one.shape is not None and len(one.shape) == one.dims, f"{name}: {one.name} {one.shape}"
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_headings_are_true(name):
+    """An array stands under a heading that says whether the kernel reads it, writes it, or both."""
+    found = uses(KERNELS[name].func)
+    for one in arguments(KERNELS[name]):
+        if one.dims == 0:
+            assert one.heading in ("Map", "Robots", "Settings"), f"{name}: {one.name} under {one.heading!r}"
+            continue
+        assert one.heading in IN + BOTH + OUT, f"{name}: {one.name} under {one.heading!r}"
+        assert (one.name in found.written) == (one.heading not in IN), f"{name}: {one.name} under {one.heading!r}"
+        assert one.name in found.read or one.heading in OUT, f"{name}: {one.name} under {one.heading!r} is never read"
+
+
+def test_what_is_written_stands_last():
+    for name, kernel in KERNELS.items():
+        headings = [one.heading for one in arguments(kernel)]
+        written = [heading in BOTH + OUT for heading in headings]
+        assert written == sorted(written), f"{name}: {headings}"
+
+
+def test_no_argument_is_there_for_nothing():
+    assert len(KERNELS) > 40 and len(FUNCTIONS) > 40
+    for name, function in {**KERNELS, **FUNCTIONS}.items():
+        taken = [one.arg for one in parse(function.func).args.args]
+        assert not set(taken) - uses(function.func).named, name

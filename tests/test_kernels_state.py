@@ -2,11 +2,14 @@
 
 import pytest
 import torch
-from kernel_source import arguments, uses
+from kernel_source import arguments, kernels, uses
 from worlds import act, room
 
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.kernels import step
+from maexp.kernels.planner import set_goals
 from maexp.kernels.state import AXES, SCRATCH, STATE
+from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 FIELDS = STATE | SCRATCH
 PLANNERS = ("dwa", "wavefront", "direct")
@@ -30,14 +33,10 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
         def launch(kernel, dim, inputs, outputs, fields=fields):
             found.append((kernel, [fields.get(id(one)) for one in (*inputs, *outputs)], len(inputs)))
 
-        shard.set_goals(launch)
-        shard.local_step(launch)
-        shard.place(launch)
-        if shard.wavefront is not None:
-            shard.wavefront.find_paths(launch)
-            shard.wavefront.pick_waypoints(launch)
         pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in ((e, n, 4, 125, 125), (e, 3, 125, 125))]
-        shard.draw(launch, *pictures, torch.zeros(e, n, 4), torch.zeros(e, n, 4, 8, 8))
+        for stage in (set_goals, find_paths, pick_waypoints, step.local_step, step.reset):
+            stage(launch, shard)
+        step.observe(launch, shard, *pictures, torch.zeros(e, n, 4), torch.zeros(e, n, 4, 8, 8))
     return found
 
 
@@ -84,6 +83,25 @@ def test_who_writes_each_array(met):
     for name in host_writes():
         writers[name].add("host")
     assert writers == {name: set(field.written.split()) for name, field in FIELDS.items()}
+
+
+def test_headings_name_the_table_that_an_array_is_of(met):
+    """`State in:` and the like for the fields of `STATE`, `Scratch` ones for those of `SCRATCH`, neither for others."""
+    given = {}
+    for kernel, fields, inputs in met:
+        for place, (argument, name) in enumerate(zip(arguments(kernel), fields, strict=True)):
+            assert argument.dims == 0 or (place >= inputs) == (argument.name in uses(kernel.func).written), kernel.key
+            given.setdefault((kernel.key, argument.name), (argument, set()))[1].add(name)
+    for kernel in kernels().values():  # those of `Navigation` are met by their names only
+        for argument in arguments(kernel):
+            name = argument.name if argument.heading.startswith("State") else None
+            given.setdefault((kernel.key, argument.name), (argument, {name}))
+    for (kernel, _), (argument, names) in given.items():
+        own = names & {argument.name} or names  # `active` stands for `mask` where a reset scans
+        table = {"State" if name in STATE else "Scratch" if name in SCRATCH else "" for name in own}
+        heading = argument.heading
+        kind = heading.split()[0] if heading.startswith("State") or heading.startswith("Scratch ") else ""
+        assert table == {kind} or own == {"map_id"}, f"{kernel}: {argument.name} ({own}) under {heading!r}"
 
 
 def test_signatures_name_the_axes_of_the_table(met):

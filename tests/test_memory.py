@@ -10,7 +10,8 @@ from maexp.agents.memory import check_batch_memory
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, make_map
 from maexp.envs.simulation import bytes_per_env
 from maexp.kernels.geodesic import DistanceSearch
-from maexp.kernels.known_grid import KnownGrids, PassableGrids
+from maexp.kernels.known_grid import KnownGrids
+from maexp.kernels.passable import PassableGrids
 from maexp.kernels.wavefront import PathSearch
 
 

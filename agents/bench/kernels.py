@@ -34,7 +34,10 @@ from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
+from maexp.kernels.planner import set_goals
+from maexp.kernels.step import local_step, observe, reset
 from maexp.kernels.types import PIXELS, REGIONS
+from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 TEAM_SIZES = [4]
 WARM = 3  # macro steps before the moment that is measured
@@ -47,8 +50,8 @@ STAGES = ("goal", "plan path", "local step", "observe", "reset")
 COPY_BYTES = 2**28
 MATRIX = 1536
 MODULES = (
-    "collision", "dynamics", "geodesic", "known_grid", "merge", "observe", "planner", "reset", "reward", "visibility",
-    "wavefront",
+    "collision", "dynamics", "geodesic", "known_grid", "merge", "neighbours", "observe", "pace", "passable", "planner",
+    "reset", "reward", "visibility", "wavefront",
 )  # fmt: skip
 KEY = ("scenario", "planner", "num_envs", "num_robots", "radar_range", "stage", "kernel")
 
@@ -161,20 +164,20 @@ def record_steps(env: ExplorationEnv, shard: Any) -> list[Step]:
     def launch(kernel, dim, inputs, outputs):
         steps.append(Step(stage, kernel.key, RecordedLaunch(kernel, dim, inputs, outputs, shard.device), outputs))
 
-    shard.set_goals(launch)
-    if shard.wavefront is not None:
-        stage = STAGES[1]
-        shard.wavefront.find_paths(launch)
-        shard.wavefront.pick_waypoints(launch)
+    set_goals(launch, shard)
+    stage = STAGES[1]
+    find_paths(launch, shard)
+    pick_waypoints(launch, shard)
     stage = STAGES[2]
-    shard.local_step(launch)
+    local_step(launch, shard)
     stage = STAGES[3]
     e, n, p, r = env.num_envs, env.num_robots, int(PIXELS), int(REGIONS)
     pictures = [torch.zeros(s, dtype=torch.uint8, device=env.device) for s in ((e, n, 4, p, p), (e, 3, p, p))]
-    shard.draw(launch, *pictures, *(torch.empty(s, device=env.device) for s in ((e, n, 4), (e, n, 4, r, r))))
+    poses = [torch.empty(s, device=env.device) for s in ((e, n, 4), (e, n, 4, r, r))]
+    observe(launch, shard, *pictures, *poses)
     stage = STAGES[4]
     env.simulation.tensors["mask"].fill_(1)
-    shard.place(launch)
+    reset(launch, shard)
     return steps
 
 

@@ -1,0 +1,206 @@
+"""Where robots fit on what is known: masks of navigation grids, one per env and distinct distance to keep.
+
+Masks follow the list of cells that the last painting of `KnownGrids` changed; where that is too long, or a row was
+cleared, they are drawn anew.
+"""
+
+import numpy as np
+import warp as wp
+
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
+from maexp.kernels.known_grid import KnownGrids, NavGrids
+from maexp.kernels.launches import Launch, launch_named
+
+wp_unknown = wp.constant(wp.uint8(UNKNOWN))
+wp_free = wp.constant(wp.uint8(FREE))
+wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
+
+
+@wp.kernel(enable_backward=False)
+def _assign_grids(
+    # Map:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
+    rows_per_env: int,
+    # Out:
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+):
+    row = wp.tid()
+    grid_of_row[row] = map_id[row / rows_per_env]
+
+
+@wp.kernel(enable_backward=False)
+def _open_cells(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # Settings:
+    through_unknown: int,
+    lanes: int,
+    # In:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # Out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    """Masks to be drawn anew: open but for obstacles."""
+    row, lane = wp.tid()
+    m = grid_of_row[row]
+    source = known_of_row[row]
+    if news_count[source] >= 0:
+        return
+    for cell in range(lane, grids.width[m] * grids.height[m], lanes):
+        state = known[source, cell]
+        open = state == wp_free or (state == wp_unknown and through_unknown != 0)
+        passable[row, cell] = wp.where(open, wp.uint8(1), wp.uint8(0))
+
+
+@wp.func
+def near_wall(
+    known: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int, radius: float
+) -> bool:
+    """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
+    reach = int(wp.ceil(radius))
+    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+            if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
+                if known[row, v * w + u] == wp_obstacle:
+                    return True
+    return False
+
+
+@wp.kernel(enable_backward=False)
+def _open_news(
+    # Settings:
+    lanes: int,
+    # In:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
+    news_count: wp.array(dtype=wp.int32),  # [known row]
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # Out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    """Opens cells that have become known to be free; the next launches close those near obstacles."""
+    row, lane = wp.tid()
+    source = known_of_row[row]
+    for k in range(lane, news_count[source], lanes):
+        if known[source, news[source, k]] == wp_free:
+            passable[row, news[source, k]] = wp.uint8(1)
+
+
+@wp.func
+def close_around(
+    cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)
+):
+    """Gives `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
+    x = cell % w
+    y = cell / w
+    reach = int(wp.ceil(r))
+    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
+        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
+            if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
+                if passable[row, v * w + u] != wp_blocked:
+                    passable[row, v * w + u] = value
+
+
+@wp.kernel(enable_backward=False)
+def _close_cells(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    # Settings:
+    margin: float,  # the same, on top, in cells
+    value: wp.uint8,
+    through_unknown: int,
+    lanes: int,
+    # In:
+    known: wp.array2d(dtype=wp.uint8),  # [known row, cell]
+    news: wp.array2d(dtype=wp.int32),  # [known row, slot]
+    news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
+    known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    radius: wp.array(dtype=wp.float32),  # [mask row], distance from known obstacle cells [m]
+    # In and out:
+    passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
+):
+    """Closes the surroundings of obstacles (those that are news), and cells that have opened near older ones.
+
+    Threads that write the same cell write the same.
+    """
+    row, lane = wp.tid()
+    m = grid_of_row[row]
+    w = grids.width[m]
+    h = grids.height[m]
+    source = known_of_row[row]
+    r = radius[row] / grids.cell[m] + margin
+    if news_count[source] < 0:
+        for cell in range(lane, w * h, lanes):
+            if known[source, cell] == wp_obstacle:
+                close_around(cell, w, h, row, r, value, passable)
+    for k in range(lane, news_count[source], lanes):
+        cell = news[source, k]
+        if known[source, cell] == wp_obstacle:
+            if value == wp_blocked:
+                passable[row, cell] = wp_blocked
+            close_around(cell, w, h, row, r, value, passable)
+        elif through_unknown == 0:
+            if near_wall(known, source, cell % w, cell / w, w, h, r):
+                passable[row, cell] = value
+
+
+class PassableGrids:
+    """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep. Paint after every painting
+    of those.
+
+    Args:
+        known: the grids to read.
+        radius: float32 [E, K], distance to keep from known obstacles [m]; K masks per env. Where every robot
+            has a known row of its own, K must be the number of robots.
+        comfort: float32 [E, K], distance below which a cell is tight [m]; None: no cell is.
+        margin: the same on top of both, in cells, for what the grid rounds away.
+        through_unknown: whether unknown cells count as passable.
+
+    Attributes:
+        passable: uint8 [E * K, cells]: `BLOCKED`, `OPEN` or `TIGHT`.
+        grid_of_row: int32 [E * K], the map of each row; set by `paint`.
+    """
+
+    def __init__(
+        self,
+        known: KnownGrids,
+        radius: np.ndarray,
+        comfort: np.ndarray | None,
+        margin: float,
+        through_unknown: bool,
+    ):
+        envs, masks = radius.shape
+        if known.rows_per_env not in (1, masks):
+            raise ValueError(f"{known.rows_per_env} known rows per env need as many masks, got {masks}")
+        device = known.known.device
+        self.known, self.masks = known, masks
+        self.margin, self.through_unknown = float(margin), int(through_unknown)
+        rings = [(comfort, TIGHT), (radius, BLOCKED)] if comfort is not None else [(radius, BLOCKED)]
+        self.rings = [(wp.array(r.reshape(-1), dtype=wp.float32, device=device), value) for r, value in rings]
+        rows = range(envs * masks)
+        source = [row if known.rows_per_env == masks else row // masks for row in rows]
+        self.known_of_row = wp.array(source, dtype=wp.int32, device=device)
+        self.grid_of_row = wp.zeros(len(rows), dtype=wp.int32, device=device)
+        self.passable = wp.zeros((len(rows), known.known.shape[1]), dtype=wp.uint8, device=device)
+
+    def paint(self, launch: Launch) -> None:
+        """Bring `passable` up to date with `known`."""
+        known, lanes = self.known, self.known.lanes
+        dim = (self.passable.shape[0], lanes)
+        values = vars(self) | {
+            "grids": known.grids, "map_id": known.map_id, "known": known.known, "news": known.news,
+            "news_count": known.news_count, "rows_per_env": self.masks, "lanes": lanes,
+        }  # fmt: skip
+        launch_named(launch, _assign_grids, self.grid_of_row.shape, "grid_of_row", values)
+        launch_named(launch, _open_cells, dim, "passable", values)
+        if not self.through_unknown:
+            launch_named(launch, _open_news, dim, "passable", values)
+        for radius, value in self.rings:
+            ring = {"radius": radius, "value": wp.uint8(value)}
+            launch_named(launch, _close_cells, dim, "passable", values | ring)
