@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from lonely import PLAN_WITH_A_POLICY, share_packages
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("kernels", "envs", "agents", "conf")
@@ -45,8 +46,9 @@ def test_constraints_name_exact_versions():
     assert wanted <= pinned
 
 
-@pytest.mark.slow
-def test_the_wheel_holds_code_and_settings(tmp_path):
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    tmp_path = tmp_path_factory.mktemp("wheel")
     source = tmp_path / "source"  # a copy: building leaves folders behind, and picks up those of last time
     for room in ROOMS:
         shutil.copytree(ROOT / room, source / room)
@@ -55,7 +57,29 @@ def test_the_wheel_holds_code_and_settings(tmp_path):
     command = [sys.executable, "-m", "build", "--wheel", "--outdir", tmp_path, source]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    names = set(zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist())
+    return next(tmp_path.glob("*.whl"))
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_code_settings_and_policies(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {f"maexp/{path.relative_to(ROOT)}" for room in ROOMS for path in (ROOT / room).rglob("*.py")}
     wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
-    assert wanted <= names, wanted - names
+    shipped = [path for path in (ROOT / "agents" / "shipped").rglob("*") if path.is_file()]
+    wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in shipped}
+    assert len(shipped) >= 8 and wanted <= names, wanted - names
+
+
+@pytest.mark.slow
+def test_the_wheel_plans_with_a_policy_that_ships_where_torch_is_not(wheel, tmp_path):
+    """As docs/deploy.md says: `pip install --no-deps` and three packages."""
+    share_packages(tmp_path / "shared", "numpy", "scipy", "onnxruntime")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv"], check=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    command = [sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", "-q", wheel]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (site,) = (tmp_path / "venv").rglob("site-packages")
+    (site / "shared.pth").write_text(f"{tmp_path / 'shared'}\n")
+    done = subprocess.run([python, "-c", PLAN_WITH_A_POLICY], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout.startswith(str(site)), done.stdout + done.stderr

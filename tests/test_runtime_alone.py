@@ -1,6 +1,6 @@
-"""The runtime where nothing but NumPy and SciPy is installed; its page and its measurement work there, too."""
+"""The runtime where nothing but NumPy and SciPy is installed; its page and its measurement work there, too. Policies
+need onnxruntime besides."""
 
-import importlib.util
 import os
 import re
 import subprocess
@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from lonely import PLAN_WITH_A_POLICY, share_packages
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -16,11 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def alone(tmp_path_factory):
     """Runs Python where only NumPy, SciPy and this package can be imported."""
     site = tmp_path_factory.mktemp("site")
-    for name in ("numpy", "scipy"):
-        home = Path(importlib.util.find_spec(name).origin).parent
-        for part in (home, home.parent / f"{name}.libs"):
-            if part.exists():
-                (site / part.name).symlink_to(part)
+    share_packages(site, "numpy", "scipy")
     (site / "maexp").mkdir()
     for room in ("agents", "conf", "envs", "kernels"):
         (site / "maexp" / room).symlink_to(ROOT / room)
@@ -41,6 +38,11 @@ def test_the_page(alone):
     (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "deploy.md").read_text(), re.MULTILINE | re.DOTALL)
     done = alone("-c", code + "\nassert plan.active.all() and not plan.notes, plan")
     assert done.returncode == 0 and done.stdout.startswith("left [") and "right [" in done.stdout, done.stderr
+
+
+def test_a_policy_that_ships(alone):
+    done = alone("-c", PLAN_WITH_A_POLICY)
+    assert "and needs onnxruntime: pip install onnxruntime" in done.stderr  # it is not there
 
 
 def test_the_measurement(alone):

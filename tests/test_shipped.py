@@ -1,10 +1,13 @@
 """Policies that ship: listed, shown, found by name everywhere, and refused in a sentence where they are damaged."""
 
+import json
 import shutil
 
 import pytest
 
+from maexp.agents.card import describe_results
 from maexp.agents.cli import main
+from maexp.agents.errors import UserError
 from maexp.agents.runtime.shipped import SHIPPED, shipped_names
 
 
@@ -65,3 +68,57 @@ def test_a_foreign_folder_and_two_of_one_name_are_sentences(tmp_path, monkeypatc
         assert main(["evaluate", f"policy={policy}"]) == 2
         told = capsys.readouterr().err
         assert part in told and told.count("\n") == 1
+
+
+SMALL = ("scenario.macro_steps=2", "scenario.local_steps=5", "num_envs=2", "device=cpu", "num_threads=1")
+
+
+def test_trained_and_classical_policies_play_the_same_episodes(tmp_path, monkeypatch, capsys):
+    """By name and by folder; the classical one plays as it would alone, and the card of an export tells the results."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(SHIPPED / "small_mazes", "mine")
+    words = ["evaluate", *SMALL, "episodes=2", "num_robots=2"]
+    assert main([*words, "policy=universal,mine,nearest_frontier", "hydra.run.dir=all"]) == 0
+    assert "nearest_frontier, the best classical planner" in capsys.readouterr().out
+    assert main([*words, "policy=nearest_frontier", "hydra.run.dir=alone"]) == 0
+    results, alone = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("all", "alone"))
+    assert set(results) == {"universal", "mine", "nearest_frontier", "difference", "run"}
+    assert results["nearest_frontier"] == alone["nearest_frontier"] and results["universal"] != results["mine"]
+    assert set(results["difference"]["universal"]) == {"mine", "nearest_frontier"}
+    told = "\n".join(describe_results(tmp_path / "all" / "results.json"))
+    assert "`maze_small`, 16 held-out maps, 2 episodes, teams of 2" in told
+    assert f"| universal | {results['universal']['exploration_ratio']['mean']:.3g} (" in told
+    assert "mine less nearest_frontier, the best classical planner on the validation maps" in told
+    (tmp_path / "all" / "results.json").write_text("{}")
+    with pytest.raises(UserError, match="is not the results of an evaluation"):
+        describe_results(tmp_path / "all" / "results.json")
+
+
+def test_a_team_is_viewed_and_imitated(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    view = ("renderer=painter", "size=200", "num_envs=1", *SMALL[:2], "hydra.run.dir=seen")
+    assert main(["view", "policy=universal", *view]) == 0
+    assert "universal, 3 robots" in capsys.readouterr().out and (tmp_path / "seen" / "episodes").is_dir()
+    train = ("total_frames=8", "warm_start_frames=16", "episodes=0", "model.target_width=8", "hydra.run.dir=pupil")
+    assert main(["train", "warm_start=universal", *SMALL, *train]) == 0
+    log = (tmp_path / "pupil" / "warm_start.csv").read_text().splitlines()
+    assert "nll_target" in log[0] and len(log) == 5
+
+
+def test_what_does_not_fit_is_a_sentence(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(SHIPPED / "universal", "wide")
+    contract = tmp_path / "wide" / "contract.json"
+    whole = json.loads(contract.read_text())
+    for words, change, part in (
+        (["train", "warm_start=universal", "action=regions"], {}, "universal chooses targets, which a policy with"),
+        (["train", "warm_start=universal", "observation.targets=9"], {}, "different numbers of targets"),
+        (["evaluate", "policy=universal", "planner=direct"], {}, "planner=direct takes controls, and universal pick"),
+        (["evaluate", "policy=wide", *SMALL], {"model": {"target_width": 24}}, "holds another network"),
+        (["evaluate", "policy=wide", *SMALL], {"model": {"target_width": "a"}}, "holds no network that"),
+        (["evaluate", "policy=universal,wide", *SMALL], {"candidates": 9}, "different numbers of targets"),
+    ):
+        contract.write_text(json.dumps(whole | change))
+        assert main(words) == 2
+        told = capsys.readouterr().err
+        assert part in told and told.count("\n") == 1, told
