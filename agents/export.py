@@ -20,6 +20,7 @@ from maexp.agents.target_networks import TargetChooser
 from maexp.envs import ExplorationEnv
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.target_view import FEATURES
+from maexp.kernels.types import DT
 
 OPSET = 18
 MOST = {"batch": 4096, "robots": 64, "candidates": 1024}
@@ -125,7 +126,7 @@ def numbers_of_env(env: ExplorationEnv) -> dict[str, float]:
         "robot_radius": float(robots["threshold"].max()),
         "max_speed": float(robots["max_speed"].max()),
         "max_accel": float(robots["max_accel"].max()),
-        "seconds": 0.1 * env.local_steps,
+        "seconds": DT * env.local_steps,
         "resolution": float(env.maps[0].resolution),
     }
 

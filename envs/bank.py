@@ -11,12 +11,11 @@ import torch
 from scipy.spatial import cKDTree
 
 from maexp.envs.config import RadarConfig
-from maexp.envs.map import PointCloudMap
+from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
 from maexp.kernels.types import PIXELS
 
 CELLS_PER_RANGE = 5
 FRAME_MARGIN = 0.05
-ADJACENT = 1.5
 _PIXELS = int(PIXELS)
 
 
@@ -206,7 +205,7 @@ def _neighbours(m: PointCloudMap, free, boundary, boundary_order) -> tuple[np.nd
     """Boundary points that lie within 1.5 of their spacings of every free point, as counts and one run."""
     if not len(boundary):
         return np.zeros(len(free), np.int64), np.zeros(0, np.int32)
-    reach = ADJACENT * np.maximum(m.resolution, m.boundary_spacing[boundary_order]) * (1.0 + 1e-5)
+    reach = BOUNDARY_REACH * np.maximum(m.resolution, m.boundary_spacing[boundary_order]) * (1.0 + 1e-5)
     lists = cKDTree(free).query_ball_point(boundary, reach)
     walls = np.repeat(np.arange(len(boundary), dtype=np.int32), [len(x) for x in lists])
     points = np.concatenate([np.asarray(x, dtype=np.int64) for x in lists])

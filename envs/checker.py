@@ -19,12 +19,12 @@ from maexp.envs.reach import (
     visible_free,
 )
 from maexp.envs.scenarios import find_scenario
+from maexp.kernels.state import axis_sizes, memory_per_env
+from maexp.kernels.types import PICTURE_CHANNELS, PIXELS, START_CLEARANCE, TEAM_CHANNELS
 
-START_CLEARANCE = 3.0  # starts keep this many collision thresholds from walls and each other (design 4.3)
 SEAL_ROUNDS = 4
 VISIBLE_SHARE = 0.95  # below it no episode can reach the coverage that ends it
 BOUNDARY_SHARE = 0.95  # of the obstacle points that touch free space must be boundary points
-PICTURE_PIXELS = 125 * 125  # of the observation (design 4.2)
 
 
 @dataclass
@@ -161,13 +161,11 @@ def estimate_memory(world: PointCloudMap, num_robots: int, radar_range: float, t
 
     `track`: poses of a robot's trajectory that are kept.
     """
-    from maexp.kernels.state import axis_sizes, memory_per_env  # late: it loads Warp
-
     in_range = [_count_in_range(points, world.free, radar_range) for points in (world.free, world.boundary)]
     sizes = axis_sizes(
         1, num_robots, len(world.free), len(world.boundary), *in_range, in_range[1], track, limited=False
     )
-    pictures = 2 * (4 * num_robots + 3) * PICTURE_PIXELS
+    pictures = 2 * (PICTURE_CHANNELS * num_robots + TEAM_CHANNELS) * int(PIXELS) ** 2
     return sum(memory_per_env(sizes).values()) + pictures
 
 

@@ -33,9 +33,10 @@ from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, do
 from maexp.envs.starts import STARTS, check_room, check_starts, fixed_starts
 from maexp.envs.target_view import TargetView
 from maexp.kernels import unpack_flags
+from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
-from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, PIXELS, REGIONS
+from maexp.kernels.types import DT, ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, PIXELS, REGIONS
 
 DEFAULT_MACRO_STEPS_MIN = 10
 LATER = {"starts": math.inf, "covered_sum": 0}
@@ -234,9 +235,9 @@ class ExplorationEnv(EnvBase):
         Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures of these
         envs only, the others' are black.
         """
-        e, n, p, r = self.num_envs, self.num_robots, int(PIXELS), int(REGIONS)
+        e, n, r = self.num_envs, self.num_robots, int(REGIONS)
         pictures = self.observation_config.pictures
-        picture, team = (blank((e, *one, p, p), self.device) if pictures else None for one in ((n, 4), (3,)))
+        picture, team = (blank(shape, self.device) if pictures else None for shape in picture_shapes(e, n))
         pose = torch.empty((e, n, 4), device=self.device)
         grid = torch.empty((e, n, 4, r, r), device=self.device)
         self.simulation.observe(picture, team, pose, grid, mask)
@@ -288,7 +289,7 @@ class ExplorationEnv(EnvBase):
         error = self.simulation.tensors["error"]
         if not bool(error.any()):
             return
-        code = int(torch.bitwise_and(error, 7).max())
+        code = int(torch.bitwise_and(error, ERRORS).max())
         env = int(error.argmax())
         error.zero_()
         if code & int(ERROR_CAPACITY):
@@ -436,7 +437,7 @@ def blank(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
 def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
     """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
     area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
-    swept = 3 * scenario.max_speed * 0.1 * scenario.local_steps * scenario.radar_range
+    swept = 3 * scenario.max_speed * DT * scenario.local_steps * scenario.radar_range
     return max(DEFAULT_MACRO_STEPS_MIN, math.ceil(SWEEPS * area / swept))
 
 

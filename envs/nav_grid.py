@@ -10,7 +10,7 @@ import warp as wp
 from scipy.ndimage import distance_transform_edt
 
 from maexp.envs.bank import MapBank
-from maexp.envs.map import PointCloudMap
+from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
 from maexp.kernels.known_grid import NavGrids
 
 
@@ -68,8 +68,7 @@ def build_nav_grid(map: PointCloudMap) -> NavGrid:
     empty = (spacing == 0).reshape(height, width)
     gap, nearest = distance_transform_edt(empty, return_indices=True)
     nearest = (nearest[0] * width + nearest[1]).reshape(-1)
-    # 1.5 spacings: the distance at which an obstacle point still bounds a free one (design 4.1).
-    in_reach = gap.reshape(-1) * cell <= 1.5 * spacing[nearest]
+    in_reach = gap.reshape(-1) * cell <= BOUNDARY_REACH * spacing[nearest]
     return NavGrid(
         origin=(float(origin[0]), float(origin[1])),
         cell=cell,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-DT = 0.1  # seconds in a local step (design 1)
+from maexp.kernels.types import DT
 
 
 class CoverageRecorder:

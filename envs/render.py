@@ -17,10 +17,10 @@ from torchrl.envs.utils import step_mdp
 
 from maexp.envs.film import write_gif, write_mp4
 from maexp.envs.raster import MapRaster, map_raster
+from maexp.kernels.types import DT
 
 __all__ = ["draw_frame", "draw_grid", "draw_teams", "record_episode", "watch_episode", "write_gif", "write_mp4"]
 
-DT = 0.1  # seconds in a local step (design 1)
 
 # Lightness falls from unexplored to overlap, so that the classes differ without colour, too.
 NOTHING = (255, 255, 255)

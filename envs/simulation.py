@@ -9,8 +9,9 @@ from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
-from maexp.kernels.state import axis_sizes, grid_memory_per_env, memory_per_env
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PIXELS
+from maexp.kernels.state import axis_sizes, memory_per_env
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
+from maexp.kernels.wavefront import grid_memory_per_env
 
 KINDS = {
     "ackermann": int(ACKERMANN),
@@ -148,8 +149,8 @@ def check_memory(env) -> None:
         ValueError: says how much is needed and free, and what to lower.
     """
     # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
-    pictures = 4 * (4 * env.num_robots + 3) * int(PIXELS) ** 2 * env.observation_config.pictures
-    per_env = bytes_per_env(env) + pictures
+    channels = (PICTURE_CHANNELS * env.num_robots + TEAM_CHANNELS) * env.observation_config.pictures
+    per_env = bytes_per_env(env) + 4 * channels * int(PIXELS) ** 2
     if env.device.type == "cuda":
         free = torch.cuda.mem_get_info(env.device)[0]
     else:

@@ -4,7 +4,8 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from maexp.envs.target_view import FEATURES
-from maexp.kernels.types import PIXELS, REGIONS
+from maexp.kernels.observe import picture_shapes
+from maexp.kernels.types import REGIONS
 
 INFO_ENV = {
     "coverage": torch.float32,
@@ -37,17 +38,17 @@ def observation_spec(
     envs: int, robots: int, device: torch.device, pictures: bool = True, targets: int = 0
 ) -> Composite:
     """Observation of every robot, with so many frontier targets to choose from, the team's map, and info."""
-    pixels, regions = int(PIXELS), int(REGIONS)
+    (pictured, merged), regions = picture_shapes(envs, robots), int(REGIONS)
 
-    def picture(*shape):
+    def picture(shape):
         # Unbounded is all of uint8, 0 to 255; `Bounded` would compare its bounds in float64, pixel by pixel.
-        return Unbounded(shape=(*shape, pixels, pixels), dtype=torch.uint8, device=device)
+        return Unbounded(shape=shape, dtype=torch.uint8, device=device)
 
     def real(*shape):
         return Unbounded(shape=shape, dtype=torch.float32, device=device)
 
-    own = {"map": picture(envs, robots, 4)} if pictures else {}
-    team = {"team": Composite(map=picture(envs, 3), shape=(envs,), device=device)} if pictures else {}
+    own = {"map": picture(pictured)} if pictures else {}
+    team = {"team": Composite(map=picture(merged), shape=(envs,), device=device)} if pictures else {}
     observation = Composite(
         **own,
         pose=real(envs, robots, 4),

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.kernels.reset import START_CLEARANCE
+from maexp.kernels.types import START_CLEARANCE
 
 STARTS = ("drawn", "fixed")
 NO_ROOM = "use fewer robots, a smaller robot.collision_threshold or a larger map"
@@ -17,7 +17,7 @@ NO_ROOM = "use fewer robots, a smaller robot.collision_threshold or a larger map
 
 def check_room(m: PointCloudMap, thresholds: list[float]) -> None:
     """MapError unless the team fits: every start ``3 * threshold`` from the boundary and from the others."""
-    need = float(START_CLEARANCE) * max(thresholds)
+    need = START_CLEARANCE * max(thresholds)
     far = cKDTree(m.boundary).query(m.free)[0] if len(m.boundary) else np.full(len(m.free), np.inf)
     candidates = m.free[far >= need]
     room = 0
@@ -46,7 +46,7 @@ def fixed_starts(env, seed: int) -> np.ndarray:
 def _fix_map(m: PointCloudMap, thresholds: np.ndarray, seed: int) -> np.ndarray:
     key = zlib.crc32(m.free.tobytes(), zlib.crc32(m.boundary.tobytes()))
     rng, turn = (np.random.default_rng([seed, key, k]) for k in range(2))
-    need = float(START_CLEARANCE) * thresholds
+    need = START_CLEARANCE * thresholds
     points = m.free[rng.permutation(len(m.free)), :2].astype(np.float64)
     far = cKDTree(m.boundary[:, :2]).query(points)[0] if len(m.boundary) else np.full(len(points), np.inf)
     starts = np.empty((len(need), 2))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.navigation import Navigation
+from maexp.kernels.types import DT
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
@@ -131,7 +132,7 @@ class TargetTracker:
 
     def __init__(self, env: ExplorationEnv):
         self.env, self.nav = env, Navigation(env)
-        self.seconds = 0.1 * env.local_steps
+        self.seconds = DT * env.local_steps
         shape, device = (env.num_envs, env.num_robots), env.device
         self.state = {
             "dwell": torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=device),

@@ -11,7 +11,23 @@ import warp as wp
 
 from maexp.kernels.geometry import rectangle_distance
 from maexp.kernels.launches import Launch, lanes_on
-from maexp.kernels.types import PI, PIXELS, REGIONS, ROBOTS_PER_WORD, Maps, Robots, point_xy
+from maexp.kernels.types import (
+    CHANNEL_EXPLORED,
+    CHANNEL_OBSTACLE,
+    CHANNEL_POSITION,
+    CHANNEL_TRAJECTORY,
+    CHANNEL_VIEWERS,
+    ERROR_CAPACITY,
+    PI,
+    PICTURE_CHANNELS,
+    PIXELS,
+    REGIONS,
+    ROBOTS_PER_WORD,
+    TEAM_CHANNELS,
+    Maps,
+    Robots,
+    point_xy,
+)
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
@@ -22,6 +38,12 @@ ON = wp.constant(wp.uint8(255))
 OFF = wp.constant(wp.uint8(0))
 OTHER = wp.constant(wp.uint8(128))
 FADE = wp.constant(0.99)
+
+
+def picture_shapes(envs: int, robots: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Shapes of the pictures of every robot and of every team: [E, N, 4, 125, 125] and [E, 3, 125, 125]."""
+    side = int(PIXELS)
+    return (envs, robots, PICTURE_CHANNELS, side, side), (envs, TEAM_CHANNELS, side, side)
 
 
 @wp.func
@@ -94,9 +116,9 @@ def _draw_points(
     free_count = maps.free_begin[m + 1] - maps.free_begin[m]
     count = free_count + maps.boundary_begin[m + 1] - maps.boundary_begin[m]
     for j in range(lane, count, lanes):
-        channel = wp.where(j < free_count, 0, 1)
+        channel = wp.where(j < free_count, CHANNEL_EXPLORED, CHANNEL_OBSTACLE)
         viewers = int(0)
-        if channel == 0:
+        if channel == CHANNEL_EXPLORED:
             viewers = viewers_free[e, 0, j]
         else:
             viewers = viewers_boundary[e, 0, j - free_count]
@@ -106,16 +128,16 @@ def _draw_points(
             for k in range(start, stop):
                 p = maps.point_pixel[k]
                 team[e, channel, p] = ON
-                if channel == 0:
+                if channel == CHANNEL_EXPLORED:
                     shown = count_viewers(maps, m, e, p, free_count, seen_free, viewers_free)
-                    team[e, 2, p] = wp.uint8(wp.min(shown, 255))
+                    team[e, CHANNEL_VIEWERS, p] = wp.uint8(wp.min(shown, 255))
                 if team_bits != 0:
                     for i in range(num_robots):
                         picture[e, i, channel, p] = ON
             if team_bits == 0:
                 for w in range(draw_free.shape[1]):
                     word = int(0)
-                    if channel == 0:
+                    if channel == CHANNEL_EXPLORED:
                         word = draw_free[e, w, j]
                     else:
                         word = draw_boundary[e, w, j - free_count]
@@ -168,7 +190,7 @@ def _list_bodies(
                     body_pixel[e, i, count] = ix * PIXELS + iy
                 count += 1
     if count > body_pixel.shape[2]:
-        wp.atomic_or(error, e, 4)
+        wp.atomic_or(error, e, ERROR_CAPACITY)
         count = body_pixel.shape[2]
     body_count[e, i] = count
 
@@ -183,7 +205,7 @@ def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.ar
         t = float(k) / float(steps)
         ix = p / PIXELS + int(wp.floor(float(dx) * t + 0.5))
         iy = p % PIXELS + int(wp.floor(float(dy) * t + 0.5))
-        picture[e, i, 3, ix * PIXELS + iy] = value
+        picture[e, i, CHANNEL_TRAJECTORY, ix * PIXELS + iy] = value
 
 
 @wp.kernel
@@ -206,9 +228,9 @@ def _draw_robots(
     for other in range(body_count.shape[1]):
         if other != i and comm[e, i, other]:
             for k in range(body_count[e, other]):
-                picture[e, i, 2, body_pixel[e, other, k]] = OTHER
+                picture[e, i, CHANNEL_POSITION, body_pixel[e, other, k]] = OTHER
     for k in range(body_count[e, i]):
-        picture[e, i, 2, body_pixel[e, i, k]] = ON
+        picture[e, i, CHANNEL_POSITION, body_pixel[e, i, k]] = ON
     last = local_step[e]
     depth = track.shape[2]
     oldest = wp.max(0, last - depth + 1)

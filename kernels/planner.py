@@ -8,8 +8,11 @@ from maexp.kernels.dynamics import curvature, heading_change
 from maexp.kernels.geometry import box_distance, rectangle_distance, rectangles_gap
 from maexp.kernels.launches import Launch
 from maexp.kernels.types import (
+    ERROR_ACTION,
+    ERROR_CAPACITY,
     HALF,
     OMNIDIRECTIONAL,
+    REGIONS,
     ROBOTS_PER_WORD,
     Maps,
     Robots,
@@ -241,7 +244,7 @@ def _plan_dwa(
     in_range = robots.radar_range[e, i]
     count = gather_obstacles(maps, m, e, i, at, in_range, middle, reach, limited, known_boundary, nearby)
     if count > nearby.shape[2]:
-        wp.atomic_or(error, e, 4)
+        wp.atomic_or(error, e, ERROR_CAPACITY)
         count = nearby.shape[2]
     mate_count = gather_mates(robots, e, i, in_range, middle, reach, center, near, near_count, mates)
     best = float(-1.0e30)
@@ -325,19 +328,19 @@ def _set_goal(
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
-    """Goal = region centre + offset * half a region (region = ix * 8 + iy); out of bounds is clamped."""
+    """Goal = region centre + offset * half a region (region = ix * REGIONS + iy); out of bounds is clamped."""
     e, i = wp.tid()
     if active[e] == 0:
         return
     m = map_id[e]
     o = offset[e, i]
     if not (wp.isfinite(o[0]) and wp.isfinite(o[1])):
-        wp.atomic_or(error, e, 1)
+        wp.atomic_or(error, e, ERROR_ACTION)
         return
-    r = int(wp.clamp(region[e, i], wp.int64(0), wp.int64(63)))
-    half = (maps.upper[m] - maps.lower[m]) / 16.0
-    x = maps.lower[m][0] + half[0] * (float(2 * (r / 8) + 1) + wp.clamp(o[0], -1.0, 1.0))
-    y = maps.lower[m][1] + half[1] * (float(2 * (r % 8) + 1) + wp.clamp(o[1], -1.0, 1.0))
+    r = int(wp.clamp(region[e, i], wp.int64(0), wp.int64(REGIONS * REGIONS - 1)))
+    half = (maps.upper[m] - maps.lower[m]) / (2.0 * float(REGIONS))
+    x = maps.lower[m][0] + half[0] * (float(2 * (r / REGIONS) + 1) + wp.clamp(o[0], -1.0, 1.0))
+    y = maps.lower[m][1] + half[1] * (float(2 * (r % REGIONS) + 1) + wp.clamp(o[1], -1.0, 1.0))
     goal[e, i] = wp.vec2(x, y)
     target[e, i] = wp.vec2(x, y)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch
-from maexp.kernels.types import PI, Maps, Robots, point_xy
+from maexp.kernels.types import ERROR_START, PI, START_CLEARANCE, Maps, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
 TRIES = wp.constant(64)
-START_CLEARANCE = wp.constant(3.0)
-"""Drawn starts keep this many collision thresholds from the boundary and from other robots."""
 EVALUATION = wp.constant(2**30)
 """Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
 
@@ -114,7 +112,7 @@ def _place_team(
                     break
         theta = PI * (2.0 * wp.randf(rng) - 1.0)
         if point < 0:
-            wp.atomic_or(error, e, 2)
+            wp.atomic_or(error, e, ERROR_START)
             point = first
         put_robot(e, i, point_xy(maps.free[point]), theta, robots, pose, center)
 

@@ -12,7 +12,7 @@ from maexp.kernels.planner import set_goals
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.shards import Threads, blocks_per_thread, split
 from maexp.kernels.state import SCRATCH, STATE, allocate
-from maexp.kernels.types import Maps
+from maexp.kernels.types import DT, Maps
 from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 
@@ -32,7 +32,7 @@ class Settings:
     line_of_sight: bool  # whether walls block communication
     draw_known: bool  # pictures show what robots know, not what they have seen
     success_coverage: float  # share at which an episode ends
-    dt: float = 0.1  # of a local step [s]
+    dt: float = DT  # of a local step [s]
 
 
 class Simulation:

@@ -226,27 +226,6 @@ def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
     return {name: math.prod(field.shape(one)) * field.dtype.itemsize for name, field in (STATE | SCRATCH).items()}
 
 
-def grid_memory_per_env(
-    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int
-) -> int:
-    """Bytes of the `wavefront` planner's grids and paths for one env (`kernels.wavefront`, `known_grid`, `geodesic`).
-
-    Args:
-        cells: of the largest navigation grid.
-        robots: N.
-        known_rows: grids of what is known, 1 for the team or one per robot.
-        masks: grids of where robots fit.
-        points: free and boundary points of the largest maps.
-        wall_words: words of the bitmap of walls of the largest grid.
-        news: capacity of the list of cells that changed.
-    """
-    known = known_rows * (cells + points + 4 * (wall_words + news) + 5 * 4)  # bytes, flags, words; counters of a row
-    passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
-    search = robots * (3 * 4 * cells + 4 * 64 + 4 * 4)  # distances and lists of buckets, int32; BUCKETS, ends
-    paths = robots * (4 * 64 + 4 * 4)  # PATH_CELLS cells; length, place, end, mask of each
-    return known + passable + search + paths
-
-
 def warp_views(tensors: dict[str, torch.Tensor], first: int, last: int) -> SimpleNamespace:
     """Warp arrays over envs ``first`` to ``last`` of all state and scratch tensors."""
     views = {}

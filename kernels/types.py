@@ -26,6 +26,23 @@ REGIONS = wp.constant(8)
 PIXELS = wp.constant(125)
 """Pixels along one side of the picture of a map."""
 
+PICTURE_CHANNELS = 4
+"""Of a robot's picture: what it has seen, walls, bodies, its way."""
+CHANNEL_EXPLORED = wp.constant(0)
+CHANNEL_OBSTACLE = wp.constant(1)
+CHANNEL_POSITION = wp.constant(2)
+CHANNEL_TRAJECTORY = wp.constant(3)
+
+TEAM_CHANNELS = 3
+"""Of the team's picture: the first two of a robot's, and how many robots have explored it."""
+CHANNEL_VIEWERS = wp.constant(2)
+
+DT = 0.1
+"""Length of a local step [s]."""
+
+START_CLEARANCE = 3.0
+"""Starts keep this many collision thresholds from the boundary and from other robots."""
+
 PI = wp.constant(3.14159265358979)
 
 ERROR_ACTION = wp.constant(1)
@@ -34,6 +51,7 @@ ERROR_START = wp.constant(2)
 """Bit of the error word: no free start was found for a robot."""
 ERROR_CAPACITY = wp.constant(4)
 """Bit of the error word: a scratch buffer overflowed."""
+ERRORS = ERROR_ACTION | ERROR_START | ERROR_CAPACITY
 
 
 @wp.struct

@@ -20,6 +20,7 @@ import warp as wp
 from maexp.kernels.launches import Launch
 from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.types import (
+    ERROR_CAPACITY,
     HALF,
     ROBOTS_PER_WORD,
     VIEWER_NOW,
@@ -206,7 +207,7 @@ def _collect_occluders(
                 radius, cos_beam, spread, planar, e, i, count, bins, direction, limit,
             )  # fmt: skip
     if count > direction.shape[2]:
-        wp.atomic_or(error, e, 4)
+        wp.atomic_or(error, e, ERROR_CAPACITY)
         count = direction.shape[2]
     occluder_count[e, i] = count
     wall_count[e, i] = wp.where(count > walls, walls, 0)
@@ -276,7 +277,7 @@ def _scan_free(
                             if slot < visible.shape[2]:
                                 visible[e, i, slot] = j
                             else:
-                                wp.atomic_or(error, e, 4)
+                                wp.atomic_or(error, e, ERROR_CAPACITY)
 
 
 @wp.kernel

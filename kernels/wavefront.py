@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
+from maexp.kernels.geodesic import BUCKETS, SKIP, UNREACHED, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.pace import fit_clearance, hold_back
@@ -310,3 +310,24 @@ def pick_waypoints(launch: Launch, shard: "Shard") -> None:
         own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.target)
         fit_clearance(launch, shard, own)
         hold_back(launch, shard, own)
+
+
+def grid_memory_per_env(
+    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int
+) -> int:
+    """Bytes of the `wavefront` planner's grids and paths for one env (`known_grid`, `passable`, `geodesic`, here).
+
+    Args:
+        cells: of the largest navigation grid.
+        robots: N.
+        known_rows: grids of what is known, 1 for the team or one per robot.
+        masks: grids of where robots fit.
+        points: free and boundary points of the largest maps.
+        wall_words: words of the bitmap of walls of the largest grid.
+        news: capacity of the list of cells that changed.
+    """
+    known = known_rows * (cells + points + 4 * (wall_words + news) + 5 * 4)  # bytes, flags, words; counters of a row
+    passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
+    search = robots * (3 * 4 * cells + 4 * BUCKETS + 4 * 4)  # distances and lists of buckets, int32; ends
+    paths = robots * (4 * PATH_CELLS + 4 * 4)  # cells; length, place, end, mask of each
+    return known + passable + search + paths

@@ -34,9 +34,10 @@ from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
+from maexp.kernels.observe import picture_shapes
 from maexp.kernels.planner import set_goals
 from maexp.kernels.step import local_step, observe, reset
-from maexp.kernels.types import PIXELS, REGIONS
+from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 TEAM_SIZES = [4]
@@ -171,8 +172,8 @@ def record_steps(env: ExplorationEnv, shard: Any) -> list[Step]:
     stage = STAGES[2]
     local_step(launch, shard)
     stage = STAGES[3]
-    e, n, p, r = env.num_envs, env.num_robots, int(PIXELS), int(REGIONS)
-    pictures = [torch.zeros(s, dtype=torch.uint8, device=env.device) for s in ((e, n, 4, p, p), (e, 3, p, p))]
+    e, n, r = env.num_envs, env.num_robots, int(REGIONS)
+    pictures = [torch.zeros(s, dtype=torch.uint8, device=env.device) for s in picture_shapes(e, n)]
     poses = [torch.empty(s, device=env.device) for s in ((e, n, 4), (e, n, 4, r, r))]
     observe(launch, shard, *pictures, *poses)
     stage = STAGES[4]

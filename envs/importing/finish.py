@@ -7,11 +7,11 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maexp.envs.checker import START_CLEARANCE
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.reach import count_room
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.scenarios.lattice import wall_points
+from maexp.kernels.types import START_CLEARANCE
 
 from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, seal, thin_walls
 from .options import ImportOptions

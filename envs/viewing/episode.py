@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from maexp.envs.map import MapError, PointCloudMap, read_npz, write_npz
+from maexp.kernels.types import DT
 
-DT = 0.1  # seconds in a local step (design 1)
 _FORMAT = "maexp-episode-1"
 _KINDS = {
     "step": "iu", "pose": "f", "center": "f", "goal": "f", "target": "f", "collided": "b", "coverage": "f", "body": "f",

@@ -14,6 +14,7 @@ from maexp.envs.render import EXPLORED, OVERLAP, UNEXPLORED, WALL_SEEN, WALL_UNS
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at
 from maexp.envs.viewing.scene import Scene, Stage
+from maexp.kernels.types import DT
 
 HOST = "127.0.0.1"  # this machine only: the page has no password
 RATE = 20.0  # pictures per second, at most
@@ -307,7 +308,7 @@ def describe(snapshot: dict, chosen: int | None = None) -> str:
     lines = [
         f"**{snapshot['map'].name}**, {snapshot['policy']}, {len(snapshot['pose'])} robots"
         + (f", {crashed} collided" if crashed else ""),
-        f"explored **{percent(snapshot['coverage']):.1f} %** after **{0.1 * snapshot['local_step']:.1f} s**",
+        f"explored **{percent(snapshot['coverage']):.1f} %** after **{DT * snapshot['local_step']:.1f} s**",
     ]
     if chosen is not None:
         weight = snapshot["map"].free_spacing.astype(np.float64) ** 2
