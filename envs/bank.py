@@ -16,7 +16,6 @@ from maexp.kernels.types import PIXELS
 
 CELLS_PER_RANGE = 5
 FRAME_MARGIN = 0.05
-_PIXELS = int(PIXELS)
 
 
 @dataclass
@@ -121,7 +120,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "pixel_size": np.float32(pixel),
         },
         "neighbour_count": neighbour_count,
-        "pixel_count": np.bincount(pixel_of, minlength=_PIXELS * _PIXELS),
+        "pixel_count": np.bincount(pixel_of, minlength=PIXELS * PIXELS),
         "shown_count": np.bincount(point_of, minlength=len(free) + len(boundary)),
         "order_free": free_order,
         "order_boundary": boundary_order,
@@ -216,7 +215,7 @@ def _frame(extent) -> tuple[np.ndarray, float]:
     """Centre of pixel (0, 0) and pixel size [m] of the square frame with a margin around the extent."""
     low, high = np.array(extent[0], dtype=np.float64), np.array(extent[1], dtype=np.float64)
     side = max(float((high - low).max()), 1e-6) * (1.0 + 2.0 * FRAME_MARGIN)
-    pixel = side / _PIXELS
+    pixel = side / PIXELS
     return 0.5 * (low + high) - 0.5 * side + 0.5 * pixel, pixel
 
 
@@ -228,10 +227,10 @@ def _pixels(m, free, boundary, free_order, boundary_order, origin, pixel) -> tup
     points = np.concatenate([free[:, :2], boundary[:, :2]]).astype(np.float64)
     code = np.arange(len(points), dtype=np.int32)
     spacing = np.concatenate([m.free_spacing[free_order], m.boundary_spacing[boundary_order]])
-    at = np.clip(np.floor((points - origin) / pixel + 0.5).astype(int), 0, _PIXELS - 1)
-    index = at[:, 0] * _PIXELS + at[:, 1]
-    empty = np.setdiff1d(np.arange(_PIXELS * _PIXELS), index)
-    centres = origin + pixel * np.stack([empty // _PIXELS, empty % _PIXELS], axis=1)
+    at = np.clip(np.floor((points - origin) / pixel + 0.5).astype(int), 0, PIXELS - 1)
+    index = at[:, 0] * PIXELS + at[:, 1]
+    empty = np.setdiff1d(np.arange(PIXELS * PIXELS), index)
+    centres = origin + pixel * np.stack([empty // PIXELS, empty % PIXELS], axis=1)
     distance, nearest = cKDTree(points).query(centres)
     # Within half a spacing's diagonal of a point, a pixel lies between points rather than outside the map.
     between = distance <= spacing[nearest] / math.sqrt(2.0) * (1.0 + 1e-6)

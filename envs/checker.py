@@ -165,7 +165,7 @@ def estimate_memory(world: PointCloudMap, num_robots: int, radar_range: float, t
     sizes = axis_sizes(
         1, num_robots, len(world.free), len(world.boundary), *in_range, in_range[1], track, limited=False
     )
-    pictures = 2 * (PICTURE_CHANNELS * num_robots + TEAM_CHANNELS) * int(PIXELS) ** 2
+    pictures = 2 * (PICTURE_CHANNELS * num_robots + TEAM_CHANNELS) * PIXELS**2
     return sum(memory_per_env(sizes).values()) + pictures
 
 

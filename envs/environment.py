@@ -206,7 +206,7 @@ class ExplorationEnv(EnvBase):
         if self.planner_config.name == "direct":
             control = action["control"]
             bad = ~torch.isfinite(control).flatten(1).all(1)
-            state["error"] |= bad.to(torch.int32) * int(ERROR_ACTION)
+            state["error"] |= bad.to(torch.int32) * ERROR_ACTION
             state["command"].copy_(torch.nan_to_num(control))
         else:
             region, offset = self._find_goals(action)
@@ -235,7 +235,7 @@ class ExplorationEnv(EnvBase):
         Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures of these
         envs only, the others' are black.
         """
-        e, n, r = self.num_envs, self.num_robots, int(REGIONS)
+        e, n, r = self.num_envs, self.num_robots, REGIONS
         pictures = self.observation_config.pictures
         picture, team = (blank(shape, self.device) if pictures else None for shape in picture_shapes(e, n))
         pose = torch.empty((e, n, 4), device=self.device)
@@ -292,9 +292,9 @@ class ExplorationEnv(EnvBase):
         code = int(torch.bitwise_and(error, ERRORS).max())
         env = int(error.argmax())
         error.zero_()
-        if code & int(ERROR_CAPACITY):
+        if code & ERROR_CAPACITY:
             raise RuntimeError(f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/bank.py")
-        if code & int(ERROR_START):
+        if code & ERROR_START:
             raise MapError(
                 f"no free start was left for num_robots={self.num_robots} robots (env {env}): use fewer robots, "
                 "a smaller robot.collision_threshold or a larger map"
@@ -332,7 +332,7 @@ class ExplorationEnv(EnvBase):
         """Let env i play evaluation episode ``ids[i]`` at the next reset: map (they take turns) and starts from
         (seed, id) alone."""
         self.simulation.tensors["env_id"].copy_(ids)
-        self.simulation.tensors["episode"].fill_(int(EVALUATION) - 1)
+        self.simulation.tensors["episode"].fill_(EVALUATION - 1)
 
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""
@@ -407,7 +407,7 @@ class ExplorationEnv(EnvBase):
         pixels = track[:, np.arange(max(0, step - depth + 1), step + 1) % depth].T
         origin = self.bank.arrays["frame_origin"][m]
         size = self.bank.arrays["pixel_size"][m]
-        side = int(PIXELS)
+        side = PIXELS
         return origin + size * np.stack([pixels // side, pixels % side], axis=-1)
 
     def render(self, index: int | Sequence[int] = 0, size: int = 512, mode: str = "rgb_array") -> np.ndarray:

@@ -313,7 +313,7 @@ class Navigation:
         """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
         m = self.state["map_id"].long()
         lower, side = self.lower[m].unsqueeze(1), (self.upper[m] - self.lower[m]).unsqueeze(1)
-        count = int(REGIONS)
+        count = REGIONS
         share = (points - lower) / side.clamp_min(1e-9) * count
         index = share.floor().clamp(0, count - 1)
         offset = ((share - index) * 2.0 - 1.0).clamp(-1.0, 1.0)

@@ -14,9 +14,9 @@ from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PICTUR
 from maexp.kernels.wavefront import grid_memory_per_env
 
 KINDS = {
-    "ackermann": int(ACKERMANN),
-    "differential": int(DIFFERENTIAL),
-    "omnidirectional": int(OMNIDIRECTIONAL),
+    "ackermann": ACKERMANN,
+    "differential": DIFFERENTIAL,
+    "omnidirectional": OMNIDIRECTIONAL,
 }
 TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""
@@ -124,7 +124,7 @@ def body_pixels(length: float, width: float) -> int:
 
     One more is the pixel next to its centre, one is for rounding.
     """
-    return min(math.ceil(length * width + length + width + 3.0), int(PIXELS) ** 2 + 1)
+    return min(math.ceil(length * width + length + width + 3.0), PIXELS**2 + 1)
 
 
 def bytes_per_env(env) -> int:
@@ -150,7 +150,7 @@ def check_memory(env) -> None:
     """
     # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
     channels = (PICTURE_CHANNELS * env.num_robots + TEAM_CHANNELS) * env.observation_config.pictures
-    per_env = bytes_per_env(env) + 4 * channels * int(PIXELS) ** 2
+    per_env = bytes_per_env(env) + 4 * channels * PIXELS**2
     if env.device.type == "cuda":
         free = torch.cuda.mem_get_info(env.device)[0]
     else:

@@ -38,7 +38,7 @@ def observation_spec(
     envs: int, robots: int, device: torch.device, pictures: bool = True, targets: int = 0
 ) -> Composite:
     """Observation of every robot, with so many frontier targets to choose from, the team's map, and info."""
-    (pictured, merged), regions = picture_shapes(envs, robots), int(REGIONS)
+    (pictured, merged), regions = picture_shapes(envs, robots), REGIONS
 
     def picture(shape):
         # Unbounded is all of uint8, 0 to 255; `Bounded` would compare its bounds in float64, pixel by pixel.
@@ -86,7 +86,7 @@ def action_spec(envs: int, robots: int, direct: bool, device: torch.device) -> C
         action = {"control": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device)}
     else:
         action = {
-            "region": Categorical(int(REGIONS) ** 2, shape=(envs, robots), dtype=torch.int64, device=device),
+            "region": Categorical(REGIONS**2, shape=(envs, robots), dtype=torch.int64, device=device),
             "offset": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device),
         }
     inner = Composite(action, shape=(envs, robots), device=device)

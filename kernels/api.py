@@ -124,7 +124,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
         "pose": wp.from_torch(pose, dtype=wp.vec4), "center": wp.from_torch(center, dtype=wp.vec3),
         "near": wp.from_torch(zeros(1, 1, 1)), "near_count": wp.from_torch(zeros(1, 1)),  # nobody else is there
         "facing": wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2),  # only other robots' are read
-        "bins": wp.from_torch(zeros(1, 1, 3 * int(BINS), dtype=torch.float32)),
+        "bins": wp.from_torch(zeros(1, 1, 3 * BINS, dtype=torch.float32)),
         "direction": wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3),
         "limit": wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2),
         "occluder_count": wp.from_torch(zeros(1, 1)), "wall_count": wp.from_torch(zeros(1, 1)),

@@ -11,15 +11,15 @@ import warp as wp
 
 from maexp.kernels.launches import finish_filling, launch_on
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 UNKNOWN = 0
 FREE = 1
 OBSTACLE = 2
 
-wp_unknown = wp.constant(wp.uint8(UNKNOWN))
-wp_free = wp.constant(wp.uint8(FREE))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _mark_frontier(
     # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
@@ -39,18 +39,18 @@ def _mark_frontier(
     line = known[row]
     for cell in range(y * w, (y + 1) * w):
         found = wp.uint8(0)
-        if line[cell] == wp_free:
+        if line[cell] == wp.uint8(FREE):
             if cell > y * w:
-                if line[cell - 1] == wp_unknown:
+                if line[cell - 1] == wp.uint8(UNKNOWN):
                     found = wp.uint8(1)
             if cell + 1 < (y + 1) * w:
-                if line[cell + 1] == wp_unknown:
+                if line[cell + 1] == wp.uint8(UNKNOWN):
                     found = wp.uint8(1)
             if y > 0:
-                if line[cell - w] == wp_unknown:
+                if line[cell - w] == wp.uint8(UNKNOWN):
                     found = wp.uint8(1)
             if y + 1 < h:
-                if line[cell + w] == wp_unknown:
+                if line[cell + w] == wp.uint8(UNKNOWN):
                     found = wp.uint8(1)
         frontier[row, cell] = found
     if y == h - 1:
@@ -67,7 +67,7 @@ def mark_frontier(
     tallest: int,
     launch: Callable | None = None,
 ):
-    """Marks the frontier cells of a batch of grids of different sizes.
+    """Mark the frontier cells of a batch of grids of different sizes.
 
     Args:
         known: uint8 [rows, cells], `UNKNOWN`, `FREE` or `OBSTACLE`; cell = iy * width + ix, own width.

@@ -20,28 +20,22 @@ import warp as wp
 
 from maexp.kernels.launches import finish_filling, launch_on
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
 DIAGONAL = 14  # weight of a step to a diagonal neighbour
 UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them still fit in int32
 
-wp_straight = wp.constant(wp.int32(STRAIGHT))
-wp_diagonal = wp.constant(wp.int32(DIAGONAL))
-wp_unreached = wp.constant(wp.int32(UNREACHED))
 
 BLOCKED, OPEN, TIGHT = 0, 1, 2  # states of a cell
 TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken where the way around is long
-wp_blocked = wp.constant(wp.uint8(BLOCKED))
-wp_tight = wp.constant(wp.uint8(TIGHT))
-wp_tight_factor = wp.constant(wp.int32(TIGHT_FACTOR))
-wp_tight_straight = wp.constant(wp.int32(TIGHT_FACTOR * STRAIGHT))
-wp_tight_diagonal = wp.constant(wp.int32(TIGHT_FACTOR * DIAGONAL))
+TIGHT_STRAIGHT = TIGHT_FACTOR * STRAIGHT
+TIGHT_DIAGONAL = TIGHT_FACTOR * DIAGONAL
 
 BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
-wp_buckets = wp.constant(wp.int32(BUCKETS))
-wp_last_bucket = wp.constant(wp.int32(BUCKETS - 1))
+LAST_BUCKET = BUCKETS - 1
 
 SKIP = -2  # as the stop of a search: leave its distances as they are
-wp_skip = wp.constant(wp.int32(SKIP))
 
 
 @wp.func
@@ -51,7 +45,7 @@ def least_distance(x: int, y: int, end_x: int, end_y: int) -> int:
         return 0
     dx = wp.abs(x - end_x)
     dy = wp.abs(y - end_y)
-    return wp_straight * wp.max(dx, dy) + (wp_diagonal - wp_straight) * wp.min(dx, dy)
+    return STRAIGHT * wp.max(dx, dy) + (DIAGONAL - STRAIGHT) * wp.min(dx, dy)
 
 
 @wp.func
@@ -66,32 +60,32 @@ def _lower_label(
     before: wp.array(dtype=wp.int32),
     bucket: wp.array(dtype=wp.int32),
 ) -> int:
-    """Lowers a cell's label, if `value` is lower, and moves it to the bucket of its key; returns how many joined."""
+    """Lower a cell's label, if `value` is lower, and move it to the bucket of its key; return how many joined."""
     old = distance[cell]
     if value >= old:
         return 0
     distance[cell] = value
     left = least_distance(x, y, end[0], end[1])
-    if old < wp_unreached:  # it waits in the bucket of its old key
+    if old < UNREACHED:  # it waits in the bucket of its old key
         ahead = after[cell]
         behind = before[cell]
         if behind < 0:
-            bucket[((old + left) >> 1) & wp_last_bucket] = ahead
+            bucket[((old + left) >> 1) & LAST_BUCKET] = ahead
         else:
             after[behind] = ahead
         if ahead >= 0:
             before[ahead] = behind
-    slot = ((value + left) >> 1) & wp_last_bucket
+    slot = ((value + left) >> 1) & LAST_BUCKET
     head = bucket[slot]
     after[cell] = head
     before[cell] = -1
     if head >= 0:
         before[head] = cell
     bucket[slot] = cell
-    return wp.where(old < wp_unreached, 0, 1)
+    return wp.where(old < UNREACHED, 0, 1)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _search_distance(
     # In:
     passable: wp.array2d(dtype=wp.uint8),  # [row, cell], 0 blocked, 1 open, 2 tight
@@ -114,7 +108,7 @@ def _search_distance(
 ):
     item = wp.tid()
     goal = stop[item]
-    if goal == wp_skip:
+    if goal == SKIP:
         return
     row = row_of_item[item]
     w = width[grid_of_row[row]]
@@ -125,8 +119,8 @@ def _search_distance(
     before = previous[item]
     bucket = buckets[item]
     for cell in range(touched[item, 0], touched[item, 1] + 1):
-        dist[cell] = wp_unreached
-    for k in range(wp_buckets):
+        dist[cell] = UNREACHED
+    for k in range(BUCKETS):
         bucket[k] = -1
     end = wp.vec2i(-1, -1)
     if goal >= 0:
@@ -134,18 +128,18 @@ def _search_distance(
     lowest = wp.int32(w * h)
     highest = wp.int32(-1)
     waiting = wp.int32(0)
-    key = wp.int32(wp_unreached)
+    key = wp.int32(UNREACHED)
     for i in range(sources.shape[1]):
         source = sources[item, i]
         if source >= 0 and source < w * h:
-            if ok[source] != wp_blocked:
+            if ok[source] != wp.uint8(BLOCKED):
                 waiting += _lower_label(source, source % w, source / w, 0, end, dist, after, before, bucket)
                 key = wp.min(key, least_distance(source % w, source / w, end[0], end[1]))
                 lowest = wp.min(lowest, source)
                 highest = wp.max(highest, source)
     limit = wp.int32(2147483646)
     while waiting > 0 and key <= limit:
-        slot = (key >> 1) & wp_last_bucket
+        slot = (key >> 1) & LAST_BUCKET
         cell = bucket[slot]
         if cell < 0:
             key += 2
@@ -165,29 +159,29 @@ def _search_distance(
             east = wp.bool(False)
             west = wp.bool(False)
             if x + 1 < w:
-                east = ok[cell + 1] != wp_blocked
+                east = ok[cell + 1] != wp.uint8(BLOCKED)
             if x > 0:
-                west = ok[cell - 1] != wp_blocked
+                west = ok[cell - 1] != wp.uint8(BLOCKED)
             if east:
-                value = d + wp.where(ok[cell + 1] == wp_tight, wp_tight_straight, wp_straight)
+                value = d + wp.where(ok[cell + 1] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
                 waiting += _lower_label(cell + 1, x + 1, y, value, end, dist, after, before, bucket)
             if west:
-                value = d + wp.where(ok[cell - 1] == wp_tight, wp_tight_straight, wp_straight)
+                value = d + wp.where(ok[cell - 1] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
                 waiting += _lower_label(cell - 1, x - 1, y, value, end, dist, after, before, bucket)
             for k in range(2):
                 v = y + 1 - 2 * k
                 if v >= 0 and v < h:
                     beside = v * w + x
-                    if ok[beside] != wp_blocked:
-                        value = d + wp.where(ok[beside] == wp_tight, wp_tight_straight, wp_straight)
+                    if ok[beside] != wp.uint8(BLOCKED):
+                        value = d + wp.where(ok[beside] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
                         waiting += _lower_label(beside, x, v, value, end, dist, after, before, bucket)
                         if east:
-                            if ok[beside + 1] != wp_blocked:
-                                value = d + wp.where(ok[beside + 1] == wp_tight, wp_tight_diagonal, wp_diagonal)
+                            if ok[beside + 1] != wp.uint8(BLOCKED):
+                                value = d + wp.where(ok[beside + 1] == wp.uint8(TIGHT), TIGHT_DIAGONAL, DIAGONAL)
                                 waiting += _lower_label(beside + 1, x + 1, v, value, end, dist, after, before, bucket)
                         if west:
-                            if ok[beside - 1] != wp_blocked:
-                                value = d + wp.where(ok[beside - 1] == wp_tight, wp_tight_diagonal, wp_diagonal)
+                            if ok[beside - 1] != wp.uint8(BLOCKED):
+                                value = d + wp.where(ok[beside - 1] == wp.uint8(TIGHT), TIGHT_DIAGONAL, DIAGONAL)
                                 waiting += _lower_label(beside - 1, x - 1, v, value, end, dist, after, before, bucket)
     # Labels lie at most one row and one column beyond the cells that were left.
     touched[item, 0] = wp.max(lowest - w - 1, 0)
@@ -230,7 +224,7 @@ class DistanceSearch:
         width: wp.array,
         height: wp.array,
     ) -> None:
-        """Fills `distance`.
+        """Fill `distance`.
 
         Args:
             launch: ``launch(kernel, dim, inputs, outputs)`` launches or records.

@@ -14,9 +14,8 @@ from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
-wp_unknown = wp.constant(wp.uint8(UNKNOWN))
-wp_free = wp.constant(wp.uint8(FREE))
-wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 
 
 @wp.struct
@@ -57,7 +56,7 @@ def wall_words(width: int) -> int:
     return (width + 31) / 32
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _begin_painting(
     # Out:
     met: wp.array(dtype=wp.int32),  # [row]
@@ -80,9 +79,9 @@ def enter_cell(
     news: wp.array2d(dtype=wp.int32),
     news_count: wp.array(dtype=wp.int32),
 ):
-    """Gives a cell a state and lists it."""
+    """Give a cell a state and list it."""
     known[row, cell] = value
-    if value == wp_obstacle:
+    if value == wp.uint8(OBSTACLE):
         x = cell % w
         wp.atomic_or(walls, row, cell / w * wall_words(w) + x / 32, 1 << (x % 32))
     if listed:
@@ -91,7 +90,7 @@ def enter_cell(
             news[row, slot] = cell
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _paint_points(
     # Map:
     grids: NavGrids,
@@ -119,7 +118,7 @@ def _paint_points(
     # Out:
     news: wp.array2d(dtype=wp.int32),  # [row, slot]
 ):
-    """Gives `value` to the cells of points known now and not yet painted, and to the voids that follow them.
+    """Give `value` to the cells of points known now and not yet painted, and to the voids that follow them.
 
     With one row an env, what any robot knows counts. Obstacles come first: a cell that holds one stays one.
     """
@@ -150,7 +149,7 @@ def _paint_points(
                 added += 1
                 cell = point_cell[first + point]
                 state = known[row, cell]
-                if state == wp_unknown or (value == wp_obstacle and state != value):
+                if state == wp.uint8(UNKNOWN) or (value == wp.uint8(OBSTACLE) and state != value):
                     listed = again == 0
                     enter_cell(row, cell, w, value, listed, known, walls, news, news_count)
                     for k in range(grids.void_begin[begin + cell], grids.void_begin[begin + cell + 1]):
@@ -160,7 +159,7 @@ def _paint_points(
     wp.atomic_add(total, row, added)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _find_stale(
     # Map:
     map_id: wp.array(dtype=wp.int32),  # [env]
@@ -187,7 +186,7 @@ def _find_stale(
         news_count[row] = -1
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _clear_stale(
     # Settings:
     lanes: int,
@@ -203,7 +202,7 @@ def _clear_stale(
         for point in range(lane, painted.shape[1], lanes):
             painted[row, point] = wp.uint8(0)
         for cell in range(lane, known.shape[1], lanes):
-            known[row, cell] = wp_unknown
+            known[row, cell] = wp.uint8(UNKNOWN)
         for word in range(lane, walls.shape[1], lanes):
             walls[row, word] = 0
 

@@ -34,15 +34,14 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
-ON = wp.constant(wp.uint8(255))
-OFF = wp.constant(wp.uint8(0))
-OTHER = wp.constant(wp.uint8(128))
-FADE = wp.constant(0.99)
+ON = 255  # grey levels: seen, a wall, the own body
+OTHER = 128  # the body of another
+FADE = 0.99  # of the trajectory, a local step
 
 
 def picture_shapes(envs: int, robots: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Shapes of the pictures of every robot and of every team: [E, N, 4, 125, 125] and [E, 3, 125, 125]."""
-    side = int(PIXELS)
+    side = PIXELS
     return (envs, robots, PICTURE_CHANNELS, side, side), (envs, TEAM_CHANNELS, side, side)
 
 
@@ -127,13 +126,13 @@ def _draw_points(
             stop = maps.point_pixel_begin[maps.shown_begin[m] + j + 1]
             for k in range(start, stop):
                 p = maps.point_pixel[k]
-                team[e, channel, p] = ON
+                team[e, channel, p] = wp.uint8(ON)
                 if channel == CHANNEL_EXPLORED:
                     shown = count_viewers(maps, m, e, p, free_count, seen_free, viewers_free)
                     team[e, CHANNEL_VIEWERS, p] = wp.uint8(wp.min(shown, 255))
                 if team_bits != 0:
                     for i in range(num_robots):
-                        picture[e, i, channel, p] = ON
+                        picture[e, i, channel, p] = wp.uint8(ON)
             if team_bits == 0:
                 for w in range(draw_free.shape[1]):
                     word = int(0)
@@ -146,7 +145,7 @@ def _draw_points(
                         below = bits - wp.uint32(1)
                         i = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~bits))
                         for k in range(start, stop):
-                            picture[e, i, channel, maps.point_pixel[k]] = ON
+                            picture[e, i, channel, maps.point_pixel[k]] = wp.uint8(ON)
                         bits = bits & below
 
 
@@ -228,13 +227,13 @@ def _draw_robots(
     for other in range(body_count.shape[1]):
         if other != i and comm[e, i, other]:
             for k in range(body_count[e, other]):
-                picture[e, i, CHANNEL_POSITION, body_pixel[e, other, k]] = OTHER
+                picture[e, i, CHANNEL_POSITION, body_pixel[e, other, k]] = wp.uint8(OTHER)
     for k in range(body_count[e, i]):
-        picture[e, i, CHANNEL_POSITION, body_pixel[e, i, k]] = ON
+        picture[e, i, CHANNEL_POSITION, body_pixel[e, i, k]] = wp.uint8(ON)
     last = local_step[e]
     depth = track.shape[2]
     oldest = wp.max(0, last - depth + 1)
-    value = 255.0 * wp.pow(FADE, float(last - oldest))
+    value = float(ON) * wp.pow(FADE, float(last - oldest))
     before = track[e, i, oldest % depth]
     for step in range(oldest, last + 1):
         here = track[e, i, step % depth]

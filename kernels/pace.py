@@ -12,11 +12,13 @@ import warp as wp
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.launches import Launch
 from maexp.kernels.types import Robots, point_xy
-from maexp.kernels.ways import path_slot, wp_path_cells
+from maexp.kernels.ways import PATH_CELLS, path_slot
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
     from maexp.kernels.wavefront import Wavefront
+
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
 CREEP = 0.25  # least distance of a waypoint that is not the end, in clearances of the robot
 HEADROOM = 4.0  # speed is held to what brakes within so many times the gap to the nearest obstacle
@@ -30,17 +32,6 @@ AHEAD = 2.0  # the part of the path that the clearance is fitted to, in clearanc
 FIT = 0.95  # share of its narrowest gap that DWA still keeps
 LEAST = 1.1  # the clearance never falls below so many collision thresholds
 
-wp_creep = wp.constant(CREEP)
-wp_headroom = wp.constant(HEADROOM)
-wp_brake = wp.constant(BRAKE)
-wp_slack = wp.constant(SLACK)
-wp_slack_gap = wp.constant(SLACK_GAP)
-wp_slack_time = wp.constant(SLACK_TIME)
-wp_samples = wp.constant(SAMPLES)
-wp_look_cells = wp.constant(LOOK_CELLS)
-wp_ahead = wp.constant(AHEAD)
-wp_fit = wp.constant(FIT)
-wp_least = wp.constant(LEAST)
 
 
 @wp.func
@@ -76,15 +67,15 @@ def nearest_obstacle(grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32),
     p = (at - grids.origin[m]) / grids.cell[m]
     x = int(wp.floor(p[0]))
     y = int(wp.floor(p[1]))
-    first = wp.max(x - wp_look_cells, 0)
-    last = wp.min(x + wp_look_cells, w - 1)
-    nearest = float(wp_look_cells)
+    first = wp.max(x - LOOK_CELLS, 0)
+    last = wp.min(x + LOOK_CELLS, w - 1)
+    nearest = float(LOOK_CELLS)
     if first <= last:
         across = wall_words(w)
         low = first / 32
         shift = first % 32
         window = (wp.uint32(1) << wp.uint32(last - first + 1)) - wp.uint32(1)
-        for v in range(wp.max(y - wp_look_cells, 0), wp.min(y + wp_look_cells, grids.height[m] - 1) + 1):
+        for v in range(wp.max(y - LOOK_CELLS, 0), wp.min(y + LOOK_CELLS, grids.height[m] - 1) + 1):
             bits = wp.uint32(walls[row, v * across + low]) >> wp.uint32(shift)
             if last / 32 > low:
                 bits = bits | (wp.uint32(walls[row, v * across + low + 1]) << wp.uint32(32 - shift))
@@ -111,14 +102,14 @@ def room_ahead(
     """Room to brake [m] among the obstacles along the first `span` [m] of the way that a robot is moving."""
     ahead = wp.normalize(velocity)
     room = float(1.0e30)
-    for k in range(wp_samples + 1):
-        s = span * float(k) / float(wp_samples)
+    for k in range(SAMPLES + 1):
+        s = span * float(k) / float(SAMPLES)
         gap = nearest_obstacle(grids, m, walls, row, at + ahead * s) - threshold
-        room = wp.min(room, wp_brake * s + wp_headroom * wp.max(gap, 0.0))
+        room = wp.min(room, BRAKE * s + HEADROOM * wp.max(gap, 0.0))
     return room
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _fit_clearance(
     # Map:
     grids: NavGrids,
@@ -139,7 +130,7 @@ def _fit_clearance(
     # Out:
     clearance: wp.array2d(dtype=wp.float32),  # [env, robot], what DWA keeps now [m]
 ):
-    """Lowers the clearance to what the path nearby has: DWA would not enter a door that it cannot keep clear of."""
+    """Lower the clearance to what the path nearby has: DWA would not enter a door that it cannot keep clear of."""
     e, i = wp.tid()
     if active[e] == 0 or collided[e, i] != 0:
         return
@@ -150,15 +141,15 @@ def _fit_clearance(
     full = robots.clearance[e, i]
     total = path_total[item]
     gap = float(1.0e30)
-    for j in range(wp.min(wp.min(total, wp_path_cells), path_used[item] + 1)):
+    for j in range(wp.min(wp.min(total, PATH_CELLS), path_used[item] + 1)):
         point = nav_center(grids, m, path[item, path_slot(j, total)])
-        if wp.length(point - at) <= wp_ahead * full:
+        if wp.length(point - at) <= AHEAD * full:
             gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, point))
-    least = wp.min(wp_least * robots.threshold[e, i], full)
-    clearance[e, i] = wp.clamp(wp_fit * gap, least, full)
+    least = wp.min(LEAST * robots.threshold[e, i], full)
+    clearance[e, i] = wp.clamp(FIT * gap, least, full)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _hold_back(
     # Map:
     grids: NavGrids,
@@ -180,7 +171,7 @@ def _hold_back(
     # State in and out:
     target: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
-    """Draws waypoints nearer, so that robots drive no faster than they can brake: before other robots, before what
+    """Draw waypoints nearer, so that robots drive no faster than they can brake: before other robots, before what
     stands where they are moving, and before the goal.
 
     DWA brakes only for a target that it would pass in its `lead_time` [s], three steps: a target at
@@ -206,10 +197,10 @@ def _hold_back(
     room = clear_ahead(e, i, way, 2.0 * clearance, stops, collided, center)
     room = wp.min(room, room_ahead(grids, m, walls, row, at, velocity, threshold, span))
     gap = nearest_obstacle(grids, m, walls, row, at)
-    gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, at + velocity * wp_slack_time))
+    gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, at + velocity * SLACK_TIME))
     spare = wp.max(gap - threshold, 0.0)
-    slack = wp_slack * spare * wp.min(spare / (wp_slack_gap * threshold), 1.0)
-    length = wp.max(lead_time * wp.sqrt(2.0 * accel * room) + slack, wp_creep * clearance)
+    slack = SLACK * spare * wp.min(spare / (SLACK_GAP * threshold), 1.0)
+    length = wp.max(lead_time * wp.sqrt(2.0 * accel * room) + slack, CREEP * clearance)
     if full > length:
         target[e, i] = at + way * (length / full)
 

@@ -8,16 +8,15 @@ import numpy as np
 import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import BLOCKED, TIGHT, wp_blocked
+from maexp.kernels.geodesic import BLOCKED, TIGHT
 from maexp.kernels.known_grid import KnownGrids, NavGrids
 from maexp.kernels.launches import Launch, launch_named
 
-wp_unknown = wp.constant(wp.uint8(UNKNOWN))
-wp_free = wp.constant(wp.uint8(FREE))
-wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
 
-@wp.kernel(enable_backward=False)
+
+@wp.kernel
 def _assign_grids(
     # Map:
     map_id: wp.array(dtype=wp.int32),  # [env]
@@ -30,7 +29,7 @@ def _assign_grids(
     grid_of_row[row] = map_id[row / rows_per_env]
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _open_cells(
     # Map:
     grids: NavGrids,
@@ -53,7 +52,7 @@ def _open_cells(
         return
     for cell in range(lane, grids.width[m] * grids.height[m], lanes):
         state = known[source, cell]
-        open = state == wp_free or (state == wp_unknown and through_unknown != 0)
+        open = state == wp.uint8(FREE) or (state == wp.uint8(UNKNOWN) and through_unknown != 0)
         passable[row, cell] = wp.where(open, wp.uint8(1), wp.uint8(0))
 
 
@@ -66,12 +65,12 @@ def near_wall(
     for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
         for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
             if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
-                if known[row, v * w + u] == wp_obstacle:
+                if known[row, v * w + u] == wp.uint8(OBSTACLE):
                     return True
     return False
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _open_news(
     # Settings:
     lanes: int,
@@ -83,11 +82,11 @@ def _open_news(
     # Out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
-    """Opens cells that have become known to be free; the next launches close those near obstacles."""
+    """Open cells that have become known to be free; the next launches close those near obstacles."""
     row, lane = wp.tid()
     source = known_of_row[row]
     for k in range(lane, news_count[source], lanes):
-        if known[source, news[source, k]] == wp_free:
+        if known[source, news[source, k]] == wp.uint8(FREE):
             passable[row, news[source, k]] = wp.uint8(1)
 
 
@@ -95,18 +94,18 @@ def _open_news(
 def close_around(
     cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)
 ):
-    """Gives `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
+    """Give `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
     x = cell % w
     y = cell / w
     reach = int(wp.ceil(r))
     for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
         for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
             if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
-                if passable[row, v * w + u] != wp_blocked:
+                if passable[row, v * w + u] != wp.uint8(BLOCKED):
                     passable[row, v * w + u] = value
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _close_cells(
     # Map:
     grids: NavGrids,
@@ -125,7 +124,7 @@ def _close_cells(
     # In and out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
 ):
-    """Closes the surroundings of obstacles (those that are news), and cells that have opened near older ones.
+    """Close the surroundings of obstacles (those that are news), and cells that have opened near older ones.
 
     Threads that write the same cell write the same.
     """
@@ -137,13 +136,13 @@ def _close_cells(
     r = radius[row] / grids.cell[m] + margin
     if news_count[source] < 0:
         for cell in range(lane, w * h, lanes):
-            if known[source, cell] == wp_obstacle:
+            if known[source, cell] == wp.uint8(OBSTACLE):
                 close_around(cell, w, h, row, r, value, passable)
     for k in range(lane, news_count[source], lanes):
         cell = news[source, k]
-        if known[source, cell] == wp_obstacle:
-            if value == wp_blocked:
-                passable[row, cell] = wp_blocked
+        if known[source, cell] == wp.uint8(OBSTACLE):
+            if value == wp.uint8(BLOCKED):
+                passable[row, cell] = wp.uint8(BLOCKED)
             close_around(cell, w, h, row, r, value, passable)
         elif through_unknown == 0:
             if near_wall(known, source, cell % w, cell / w, w, h, r):

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
-NEAREST = wp.constant(1.0e-6)  # distances below count as this [m], so that the logarithm stays finite
+NEAREST = 1.0e-6  # distances below count as this [m], so that the logarithm stays finite
 
 
 @wp.func

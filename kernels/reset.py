@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
-TRIES = wp.constant(64)
-EVALUATION = wp.constant(2**30)
+TRIES = 64
+EVALUATION = 2**30
 """Number of the first episode in the keys of evaluation episodes, beyond those of any training run."""
 
 

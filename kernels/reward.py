@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
-EXPLORE = wp.constant(0)
-OVERLAP = wp.constant(1)
-TIME = wp.constant(2)
-SUCCESS = wp.constant(3)
-COLLISION = wp.constant(4)
-TERMS = wp.constant(5)
+EXPLORE = 0
+OVERLAP = 1
+TIME = 2
+SUCCESS = 3
+COLLISION = 4
+TERMS = 5
 """Number of reward terms; the names above index the last axis of ``terms`` and ``raw``."""
 
 

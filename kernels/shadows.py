@@ -12,11 +12,9 @@ that it could mask is masked.
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
-
-BINS = wp.constant(128)
-BIN_MARGIN = wp.constant(1.0e-4)  # in diamond angle; far above float32 error of the exact test
-LEAST_SINE = wp.constant(0.01)  # below it that of the angle whose cosine is tested differs by more than rounding
+BINS = 128
+BIN_MARGIN = 1.0e-4  # in diamond angle; far above float32 error of the exact test
+LEAST_SINE = 0.01  # below it that of the angle whose cosine is tested differs by more than rounding
 
 
 @wp.func

@@ -210,7 +210,7 @@ def axis_sizes(
         "E": num_envs, "N": num_robots, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
-        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": int(TERMS), "D": 3 * int(BINS),
+        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": TERMS, "D": 3 * BINS,
         "S": num_robots, "M": 2, "1": 1,
     }  # fmt: skip
 

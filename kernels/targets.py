@@ -15,16 +15,14 @@ from maexp.kernels.passable import near_wall
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import nearest_passable, step_back
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 RAYS = 48  # rays that look around from a target
 
-wp_rays = wp.constant(RAYS)
-wp_ray_angle = wp.constant(2.0 * math.pi / RAYS)
-wp_obstacle = wp.constant(wp.uint8(OBSTACLE))
-wp_unknown = wp.constant(wp.uint8(UNKNOWN))
-wp_unreached = wp.constant(wp.int32(UNREACHED))
+RAY_ANGLE = 2.0 * math.pi / RAYS
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _locate_robots(
     # Map:
     grids: NavGrids,
@@ -59,11 +57,11 @@ def is_reached(
     """Whether one of the robots `first` to `last` (not included) gets to a cell."""
     found = wp.bool(False)
     for i in range(first, last):
-        found = found or distance[e * robots + i, cell] < wp_unreached
+        found = found or distance[e * robots + i, cell] < UNREACHED
     return found
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _sum_frontier(
     # Map:
     grids: NavGrids,
@@ -75,7 +73,7 @@ def _sum_frontier(
     size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
     sums: wp.array3d(dtype=wp.int64),  # [row, block, 2], sums of their x and y, from the block's corner
 ):
-    """Gathers the frontier cells of a line of cells in their blocks."""
+    """Gather the frontier cells of a line of cells in their blocks."""
     row, y = wp.tid()
     m = grid_of_row[row]
     w = grids.width[m]
@@ -92,7 +90,7 @@ def _sum_frontier(
             wp.atomic_add(sums, row, k, 1, wp.int64(y % b))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _place_targets(
     # Map:
     grids: NavGrids,
@@ -139,7 +137,7 @@ def _place_targets(
                     target[row, k] = y * w + x
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _spread_rays(
     # Out:
     cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], from the middle
@@ -147,15 +145,15 @@ def _spread_rays(
 ):
     """The cells that each ray goes through."""
     ray, step = wp.tid()
-    ux = wp.cos((float(ray) + 0.5) * wp_ray_angle)
-    uy = wp.sin((float(ray) + 0.5) * wp_ray_angle)
+    ux = wp.cos((float(ray) + 0.5) * RAY_ANGLE)
+    uy = wp.sin((float(ray) + 0.5) * RAY_ANGLE)
     t = float(step)
     cell[ray, step] = wp.vec2i(int(wp.floor(t * ux + 0.5)), int(wp.floor(t * uy + 0.5)))
     if step == 0:
         way[ray] = wp.vec2(ux, uy)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _look_around(
     # Map:
     grids: NavGrids,
@@ -188,7 +186,7 @@ def _look_around(
         x = cell % w
         y = cell / w
         line = known[row]
-        for ray in range(wp_rays):
+        for ray in range(RAYS):
             u = x
             v = y
             for step in range(1, reach + 1):
@@ -196,13 +194,13 @@ def _look_around(
                 if at[0] < 0 or at[0] >= w or at[1] < 0 or at[1] >= h:
                     break
                 state = line[at[1] * w + at[0]]
-                if state == wp_obstacle:
+                if state == wp.uint8(OBSTACLE):
                     break
                 if at[0] != u and at[1] != v:  # not between two walls that touch at a corner either
-                    if line[at[1] * w + u] == wp_obstacle and line[v * w + at[0]] == wp_obstacle:
+                    if line[at[1] * w + u] == wp.uint8(OBSTACLE) and line[v * w + at[0]] == wp.uint8(OBSTACLE):
                         break
-                if state == wp_unknown:
-                    part = float(step) * wp_ray_angle
+                if state == wp.uint8(UNKNOWN):
+                    part = float(step) * RAY_ANGLE
                     total += part
                     moment += ray_way[ray] * (part * float(step))
                 u = at[0]
@@ -211,7 +209,7 @@ def _look_around(
     middle[row, k] = moment * (grids.cell[m] / wp.max(total, 1.0e-6))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _find_open_ground(
     # Map:
     grids: NavGrids,
@@ -234,12 +232,12 @@ def _find_open_ground(
     open = wp.bool(False)
     for k in range(cell.shape[2]):
         at = cell[e, i, k]
-        if not open and known[row, at] != wp_obstacle:
+        if not open and known[row, at] != wp.uint8(OBSTACLE):
             open = not near_wall(known, row, at % w, at / w, w, grids.height[m], room[e, i] / grids.cell[m])
     found[e, i] = open
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _first_cells(
     # Map:
     grids: NavGrids,
@@ -260,7 +258,7 @@ def _first_cells(
     m = map_id[e]
     here = target[e, i, k]
     if here >= 0:
-        if distance[item, here] >= wp_unreached:
+        if distance[item, here] >= UNREACHED:
             here = -1
     while here >= 0 and distance[item, wp.max(here, 0)] > reach:
         here = step_back(

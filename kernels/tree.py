@@ -8,8 +8,8 @@ import warp as wp
 from maexp.kernels.frontier import FREE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 
-wp_unknown = wp.constant(wp.uint8(UNKNOWN))
-wp_free = wp.constant(wp.uint8(FREE))
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 
 
 @wp.func
@@ -21,7 +21,7 @@ def walk_branch(
     w: int,
     h: int,
 ) -> int:
-    """Walks a segment in half cells: -1 = known and free all along, -2 = blocked, else the last free cell before
+    """Walk a segment in half cells: -1 = known and free all along, -2 = blocked, else the last free cell before
     the unknown."""
     steps = 1 + int(2.0 * wp.length(end - start))
     last = wp.int32(-2)
@@ -35,16 +35,16 @@ def walk_branch(
                 result = -2
             else:
                 state = known[row, y * w + x]
-                if state == wp_free:
+                if state == wp.uint8(FREE):
                     last = y * w + x
-                elif state == wp_unknown:
+                elif state == wp.uint8(UNKNOWN):
                     result = last
                 else:
                     result = -2
     return result
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _grow_tree(
     # Map:
     grids: NavGrids,

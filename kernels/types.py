@@ -13,29 +13,29 @@ import warp as wp
 ROBOTS_PER_WORD = 32
 """Robots that share one int32 of flags: robot ``i`` owns bit ``i % 32`` of word ``i // 32``."""
 
-VIEWER_NOW = wp.constant(1 << 16)
+VIEWER_NOW = 1 << 16
 """What a robot that sees a point now adds to its viewers during a scan; one that has ever seen it adds 1."""
 
-ACKERMANN = wp.constant(0)
-DIFFERENTIAL = wp.constant(1)
-OMNIDIRECTIONAL = wp.constant(2)
+ACKERMANN = 0
+DIFFERENTIAL = 1
+OMNIDIRECTIONAL = 2
 
-REGIONS = wp.constant(8)
+REGIONS = 8
 """Regions along one side of the map's extent (L in the paper)."""
 
-PIXELS = wp.constant(125)
+PIXELS = 125
 """Pixels along one side of the picture of a map."""
 
 PICTURE_CHANNELS = 4
 """Of a robot's picture: what it has seen, walls, bodies, its way."""
-CHANNEL_EXPLORED = wp.constant(0)
-CHANNEL_OBSTACLE = wp.constant(1)
-CHANNEL_POSITION = wp.constant(2)
-CHANNEL_TRAJECTORY = wp.constant(3)
+CHANNEL_EXPLORED = 0
+CHANNEL_OBSTACLE = 1
+CHANNEL_POSITION = 2
+CHANNEL_TRAJECTORY = 3
 
 TEAM_CHANNELS = 3
 """Of the team's picture: the first two of a robot's, and how many robots have explored it."""
-CHANNEL_VIEWERS = wp.constant(2)
+CHANNEL_VIEWERS = 2
 
 DT = 0.1
 """Length of a local step [s]."""
@@ -43,13 +43,13 @@ DT = 0.1
 START_CLEARANCE = 3.0
 """Starts keep this many collision thresholds from the boundary and from other robots."""
 
-PI = wp.constant(3.14159265358979)
+PI = 3.14159265358979
 
-ERROR_ACTION = wp.constant(1)
+ERROR_ACTION = 1
 """Bit of the error word: an action was NaN or infinite."""
-ERROR_START = wp.constant(2)
+ERROR_START = 2
 """Bit of the error word: no free start was found for a robot."""
-ERROR_CAPACITY = wp.constant(4)
+ERROR_CAPACITY = 4
 """Bit of the error word: a scratch buffer overflowed."""
 ERRORS = ERROR_ACTION | ERROR_START | ERROR_CAPACITY
 
@@ -124,7 +124,7 @@ class Robots:
     radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
 
 
-HALF = wp.constant(0.501)
+HALF = 0.501
 """Of length and width of a body: no part of it is farther from its centre."""
 
 

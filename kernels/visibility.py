@@ -39,10 +39,10 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
 
-FAR = wp.constant(1.0e30)
-CELL_HALF = wp.constant(0.709)  # half the diagonal of a cell in edges, with room for rounding
-WORTH_A_TEST = wp.constant(6)  # free points of a cell from which on it pays to ask first whether it is hidden
-WORTH_AN_OCCLUDER = wp.constant(2)  # occluders from which on it does
+FAR = 1.0e30
+CELL_HALF = 0.709  # half the diagonal of a cell in edges, with room for rounding
+WORTH_A_TEST = 6  # free points of a cell from which on it pays to ask first whether it is hidden
+WORTH_AN_OCCLUDER = 2  # occluders from which on it does
 
 
 @wp.func

@@ -23,29 +23,20 @@ from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.state import robots_struct
 from maexp.kernels.types import point_xy
-from maexp.kernels.ways import (
-    PATH_CELLS,
-    in_sight,
-    is_passable,
-    nearest_cell,
-    nearest_passable,
-    path_slot,
-    step_back,
-    wp_path_cells,
-)
+from maexp.kernels.ways import PATH_CELLS, in_sight, is_passable, nearest_cell, nearest_passable, path_slot, step_back
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
     from maexp.kernels.simulation import Simulation
 
+wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
 COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
 
-wp_unreached = wp.constant(wp.int32(UNREACHED))
-wp_skip = wp.constant(wp.int32(SKIP))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _start_search(
     # Map:
     grids: NavGrids,
@@ -74,7 +65,7 @@ def _start_search(
     """
     e, i = wp.tid()
     item = e * center.shape[1] + i
-    stop[item] = wp_skip
+    stop[item] = SKIP
     if active[e] == 0 or collided[e, i] != 0:
         return
     m = map_id[e]
@@ -86,7 +77,7 @@ def _start_search(
     fresh = moved[0] == 0.0 and moved[1] == 0.0
     total = path_total[item]
     used = path_used[item]
-    kept = wp.min(total, wp_path_cells)
+    kept = wp.min(total, PATH_CELLS)
     keep = not fresh and used >= 0 and (kept == total or 2 * used < kept)
     if keep:
         for j in range(used, kept):
@@ -101,7 +92,7 @@ def _start_search(
         stop[item] = end
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _trace_path(
     # Map:
     grids: NavGrids,
@@ -119,10 +110,10 @@ def _trace_path(
     path_used: wp.array(dtype=wp.int32),  # [item], how far along it the waypoint is; -1 = out of sight
     path_ends: wp.array(dtype=wp.int32),  # [item], 1 = at the goal, 0 = at the nearest reached cell
 ):
-    """Follows the distances back from the goal, or from the reached cell nearest to it."""
+    """Follow the distances back from the goal, or from the reached cell nearest to it."""
     e, i = wp.tid()
     item = e * goal.shape[1] + i
-    if stop[item] == wp_skip:
+    if stop[item] == SKIP:
         return
     m = map_id[e]
     w = grids.width[m]
@@ -130,7 +121,7 @@ def _trace_path(
     end = stop[item]
     wanted = nav_cell(grids, m, goal[e, i])
     if end >= 0:
-        if distance[item, end] >= wp_unreached:
+        if distance[item, end] >= UNREACHED:
             end = -1
     if end < 0:
         end = nearest_cell(wanted, passable, row_of_item[item], distance, item, w, h)
@@ -138,14 +129,14 @@ def _trace_path(
     total = wp.int32(0)
     cell = end
     while cell >= 0:
-        path[item, total % wp_path_cells] = cell
+        path[item, total % PATH_CELLS] = cell
         total += 1
         cell = step_back(passable, row_of_item[item], distance, item, cell, w, h)
     path_total[item] = total
     path_used[item] = 0
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def _pick_waypoint(
     # Map:
     grids: NavGrids,
@@ -178,7 +169,7 @@ def _pick_waypoint(
     at = point_xy(center[e, i])
     here = nav_cell(grids, m, at)
     total = path_total[item]
-    kept = wp.min(total, wp_path_cells)
+    kept = wp.min(total, PATH_CELLS)
     chosen = wp.int32(-1)
     nearest = wp.int32(-1)
     nearest_gap = wp.float32(1.0e30)

@@ -2,20 +2,17 @@
 
 import warp as wp
 
-from maexp.kernels.geodesic import UNREACHED, wp_diagonal, wp_straight, wp_tight, wp_tight_factor
+from maexp.kernels.geodesic import DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
 
 PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
 SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells
 
-wp_path_cells = wp.constant(PATH_CELLS)
-wp_snap_cells = wp.constant(SNAP_CELLS)
-wp_unreached = wp.constant(wp.int32(UNREACHED))
 
 
 @wp.func
 def path_slot(j: int, total: int) -> int:
     """Where the j-th cell of a path, counted from the robot, is stored (the path is written from its end)."""
-    return (total - 1 - j) % wp_path_cells
+    return (total - 1 - j) % PATH_CELLS
 
 
 @wp.func
@@ -30,8 +27,8 @@ def nearest_passable(passable: wp.array2d(dtype=wp.uint8), row: int, cell: int, 
     best_gap = wp.int32(1 << 30)
     x = cell % w
     y = cell / w
-    for v in range(wp.max(y - wp_snap_cells, 0), wp.min(y + wp_snap_cells, h - 1) + 1):
-        for u in range(wp.max(x - wp_snap_cells, 0), wp.min(x + wp_snap_cells, w - 1) + 1):
+    for v in range(wp.max(y - SNAP_CELLS, 0), wp.min(y + SNAP_CELLS, h - 1) + 1):
+        for u in range(wp.max(x - SNAP_CELLS, 0), wp.min(x + SNAP_CELLS, w - 1) + 1):
             gap = (v - y) * (v - y) + (u - x) * (u - x)
             if gap < best_gap and is_passable(passable, row, v * w + u):
                 best = v * w + u
@@ -54,7 +51,7 @@ def nearer(
         if gap < found[0] or (gap == found[0] and cell < found[1]):
             counts = wp.bool(False)
             if item >= 0:
-                counts = distance[item, cell] < wp_unreached
+                counts = distance[item, cell] < UNREACHED
             else:
                 counts = is_passable(passable, row, cell)
             if counts:
@@ -131,7 +128,7 @@ def step_back(
     x = cell % w
     y = cell / w
     d = distance[item, cell]
-    factor = wp.where(passable[row, cell] == wp_tight, wp_tight_factor, 1)
+    factor = wp.where(passable[row, cell] == wp.uint8(TIGHT), TIGHT_FACTOR, 1)
     found = wp.int32(-1)
     for k in range(8):
         ux = wp.where(k == 0 or k == 4 or k == 7, 1, wp.where(k == 2 or k == 5 or k == 6, -1, 0))
@@ -139,11 +136,11 @@ def step_back(
         u = x + ux
         v = y + uy
         if found < 0 and u >= 0 and u < w and v >= 0 and v < h:
-            weight = wp.where(k < 4, wp_straight, wp_diagonal) * factor
+            weight = wp.where(k < 4, STRAIGHT, DIAGONAL) * factor
             if distance[item, v * w + u] == d - weight:
                 # A diagonal step cuts no corner: both cells beside it are reached (they touch reached cells).
                 if k < 4 or (
-                    distance[item, y * w + u] < wp_unreached and distance[item, v * w + x] < wp_unreached
+                    distance[item, y * w + u] < UNREACHED and distance[item, v * w + x] < UNREACHED
                 ):
                     found = v * w + u
     return found

@@ -14,7 +14,6 @@ from maexp.kernels.shadows import BINS
 from maexp.kernels.types import PIXELS
 
 SAMPLE = 64  # robots that are looked at one by one
-_BINS = int(BINS)
 
 
 def count_moment(env: ExplorationEnv, shard: Any, active: torch.Tensor) -> dict[str, float]:
@@ -145,12 +144,12 @@ def count_pairs(s: dict, e: int, i: int, delta: np.ndarray, alpha2: float) -> di
     total = np.abs(delta[:, 0]) + np.abs(delta[:, 1])
     p = delta[:, 1] / np.maximum(total, 1e-30)
     angle = np.where(delta[:, 0] < 0, 2.0 - p, np.where(delta[:, 1] < 0, 4.0 + p, p))
-    k = np.minimum((angle * (_BINS / 4.0)).astype(int), _BINS - 1)
-    open_points = (bins[k] - dist < alpha2) & ~(bins[_BINS + k] - dist < alpha2) & (dist > 0)
+    k = np.minimum((angle * (BINS / 4.0)).astype(int), BINS - 1)
+    open_points = (bins[k] - dist < alpha2) & ~(bins[BINS + k] - dist < alpha2) & (dist > 0)
     d, r = delta[open_points], dist[open_points]
     touched = {"undecided": float(len(d)), "bins_touched": 0.0, "pair_tests": 0.0}
     if count:
-        width = 4.0 / _BINS  # in diamond angle, whose rate is at most 1 per rad
+        width = 4.0 / BINS  # in diamond angle, whose rate is at most 1 per rad
         touched["bins_touched"] = float((2.0 + 2.0 * np.arccos(np.clip(limit[:, 0], -1, 1)) / width).sum())
     if count and len(d):
         hit = (limit[None, :, 1] - r[:, None] < alpha2) & (d @ direction.T > limit[None, :, 0] * r[:, None])

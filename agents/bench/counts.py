@@ -81,7 +81,7 @@ def detect_collisions(c: Counts) -> Cost:
 
 def collect_occluders(c: Counts) -> Cost:
     """Distances of the occluders near, directions and half-widths of those in range, and their bins."""
-    bins = 2 * int(BINS) * WORD
+    bins = 2 * BINS * WORD
     moved = c["rows"] * ROW + c["occluder_near"] * (VEC3 + WORD) + c["near"] * (VEC4 + VEC2 + 4 * WORD)
     moved += c["occluders"] * (VEC3 + VEC2) + bins
     work = 8 * c["occluder_near"] + 30 * c["outline_points"] + c["near"] * 10
@@ -92,7 +92,7 @@ def collect_occluders(c: Counts) -> Cost:
 def scan_free(c: Counts) -> Cost:
     """Distance and bin of the free points near; pairwise tests of those that the bins leave undecided."""
     tested = min(1.0, c["undecided"])
-    moved = c["rows"] * ROW + c["free_near"] * VEC3 + 2 * int(BINS) * WORD
+    moved = c["rows"] * ROW + c["free_near"] * VEC3 + 2 * BINS * WORD
     moved += tested * c["occluders"] * (VEC3 + VEC2) + c["visible"] * (2 * WORD + WORD)
     work = 8 * c["free_near"] + 18 * c["free_in"] + 9 * c["pair_tests"] + 4 * c["visible"]
     return Cost(c["active"] * moved, work)
@@ -152,7 +152,7 @@ def draw_robots(c: Counts) -> Cost:
 
 def observe_pose(c: Counts) -> Cost:
     """Offsets of all regions to the robot and to its goal."""
-    regions = int(REGIONS) ** 2
+    regions = REGIONS**2
     return Cost(VEC4 + VEC3 + VEC2 + 8 * WORD + VEC4 + regions * 4 * WORD, 20 + regions * 12)
 
 

@@ -172,7 +172,7 @@ def record_steps(env: ExplorationEnv, shard: Any) -> list[Step]:
     stage = STAGES[2]
     local_step(launch, shard)
     stage = STAGES[3]
-    e, n, r = env.num_envs, env.num_robots, int(REGIONS)
+    e, n, r = env.num_envs, env.num_robots, REGIONS
     pictures = [torch.zeros(s, dtype=torch.uint8, device=env.device) for s in picture_shapes(e, n)]
     poses = [torch.empty(s, device=env.device) for s in ((e, n, 4), (e, n, 4, r, r))]
     observe(launch, shard, *pictures, *poses)

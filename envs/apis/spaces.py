@@ -61,7 +61,7 @@ def action_space(kind: str, direct: bool, robots: tuple[int, ...] = ()) -> space
     box = spaces.Box(-1.0, 1.0, (*robots, 2), np.float32)
     if direct or kind == "goal":
         return box
-    count = int(REGIONS) ** 2
+    count = REGIONS**2
     region = spaces.MultiDiscrete(np.full(robots, count)) if robots else spaces.Discrete(count)
     return region if kind == "region" else spaces.Dict(region=region, offset=box)
 
@@ -85,7 +85,7 @@ def to_action(actions, kind: str, direct: bool, shape: tuple[int, int], device) 
 
 def _region_of(goal: np.ndarray) -> dict[str, np.ndarray]:
     """Region and offset of a goal in shares of half the extent; a goal outside counts as its border."""
-    side = int(REGIONS)
+    side = REGIONS
     cell = (np.nan_to_num(goal).clip(-1, 1) + 1) / 2 * side  # NaN is refused by the env, by the offset
     index = np.floor(cell).clip(0, side - 1)
     offset = np.where(np.isnan(goal), goal, 2 * (cell - index) - 1).astype(np.float32)
@@ -94,7 +94,7 @@ def _region_of(goal: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _region(values, shape) -> np.ndarray:
-    region, last = _shaped("region", values, shape), int(REGIONS) ** 2 - 1
+    region, last = _shaped("region", values, shape), REGIONS**2 - 1
     if region.dtype.kind not in "iu" or (region < 0).any() or (region > last).any():
         raise ValueError(f"region={region.tolist()} must hold whole numbers of 0 to {last}")
     return region.astype(np.int64)
