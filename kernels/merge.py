@@ -32,7 +32,7 @@ def _count_points(
     visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
     # Scratch out:
-    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    discovered: wp.array2d(dtype=wp.int32),  # [env, robot]
     overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Weigh the points robot (e, i) sees now: new to the team, seen by another now."""
@@ -40,17 +40,17 @@ def _count_points(
     if active[e] == 0:
         return
     first = maps.free_begin[map_id[e]]
-    fresh_sum = int(0)
+    discovered_sum = int(0)
     overlap_sum = int(0)
     for k in range(wp.min(visible_count[e, i], visible.shape[2])):
         j = visible[e, i, k]
         weight = maps.free_weight[first + j]
         viewers = viewers_free[e, 0, j]
         if viewers % VIEWER_NOW == 0:
-            fresh_sum += weight
+            discovered_sum += weight
         if viewers / VIEWER_NOW > 1:
             overlap_sum += weight
-    fresh[e, i] = fresh_sum
+    discovered[e, i] = discovered_sum
     overlap[e, i] = overlap_sum
 
 
@@ -185,7 +185,7 @@ def _copy_flags(
 
 def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
     """Count what is new and what overlaps, and add the scan to the team's map, where ``running`` [env] is set."""
-    shard.call(launch, _count_points, "fresh overlap", active=running)
+    shard.call(launch, _count_points, "discovered overlap", active=running)
     shard.call(launch, _merge_scan, "seen_free viewers_free covered shared", active=running)
 
 

@@ -207,7 +207,7 @@ def _start_env(
     covered_before: wp.array(dtype=wp.int32),  # [env]
     active: wp.array(dtype=wp.int32),  # [env]
     # Scratch out:
-    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    discovered: wp.array2d(dtype=wp.int32),  # [env, robot]
     overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """The scan at reset counts in coverage and earns nothing."""
@@ -216,8 +216,8 @@ def _start_env(
         return
     covered_before[e] = covered[e]
     active[e] = 1
-    for i in range(fresh.shape[1]):
-        fresh[e, i] = 0
+    for i in range(discovered.shape[1]):
+        discovered[e, i] = 0
         overlap[e, i] = 0
 
 
@@ -245,4 +245,4 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
 
 def start_episodes(launch: Launch, shard: "Shard") -> None:
     """Let the envs of ``mask`` run, once their robots have taken the first scan."""
-    shard.call(launch, _start_env, "covered_before active fresh overlap", shard.shape[0])
+    shard.call(launch, _start_env, "covered_before active discovered overlap", shard.shape[0])

@@ -76,7 +76,7 @@ def _reward_robots(
     covered_before: wp.array(dtype=wp.int32),  # [env]
     local_step: wp.array(dtype=wp.int32),  # [env]
     # Scratch in:
-    fresh: wp.array2d(dtype=wp.int32),  # [env, robot]
+    discovered: wp.array2d(dtype=wp.int32),  # [env, robot]
     overlap: wp.array2d(dtype=wp.int32),  # [env, robot]
     crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State in and out:
@@ -106,7 +106,7 @@ def _reward_robots(
     if weights.time_sign != 0.0:
         lapse = -before - left * after
     lapse = lapse - weights.unfinished * (1.0 + left)
-    add_term(terms, raw, e, i, EXPLORE, weights.explore * float(fresh[e, i]), w)
+    add_term(terms, raw, e, i, EXPLORE, weights.explore * float(discovered[e, i]), w)
     add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
     add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
     if before < weights.success_coverage and after >= weights.success_coverage:

@@ -176,7 +176,7 @@ SCRATCH = {
     "visible_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders _scan_free"),
 
     # Merging.
-    "fresh": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team",
+    "discovered": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team",
         "_count_points _start_env"),
     "overlap": Field(wp.int32, "E N", "weight", "of the visible points that another robot sees now",
         "_count_points _start_env"),

@@ -105,11 +105,11 @@ def _place_targets(
     rows_per_env: int,
     robots: int,
     # Out:
-    target: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
+    target_cell: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
 ):
     """The reached cell nearest to the middle of a block's frontier cells, in the block or close to it."""
     row, k = wp.tid()
-    target[row, k] = -1
+    target_cell[row, k] = -1
     count = size[row, k]
     if count == 0:
         return
@@ -134,7 +134,7 @@ def _place_targets(
             if gap < best_gap:
                 if is_reached(distance, e, first, last, robots, y * w + x):
                     best_gap = gap
-                    target[row, k] = y * w + x
+                    target_cell[row, k] = y * w + x
 
 
 @wp.kernel
@@ -160,7 +160,7 @@ def _look_around(
     grid_of_row: wp.array(dtype=wp.int32),  # [row]
     # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
-    target: wp.array2d(dtype=wp.int32),  # [row, target], -1 = none
+    target_cell: wp.array2d(dtype=wp.int32),  # [row, target], -1 = none
     ray_cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], as far as the radius in every grid
     ray_way: wp.array(dtype=wp.vec2),  # [ray]
     # Settings:
@@ -176,7 +176,7 @@ def _look_around(
     """
     row, k = wp.tid()
     m = grid_of_row[row]
-    cell = target[row, k]
+    cell = target_cell[row, k]
     total = wp.float32(0.0)
     moment = wp.vec2(0.0, 0.0)
     if cell >= 0:
@@ -246,7 +246,7 @@ def _first_cells(
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
-    target: wp.array3d(dtype=wp.int32),  # [env, robot, block], -1 = none
+    target_cell: wp.array3d(dtype=wp.int32),  # [env, robot, block], -1 = none
     # Settings:
     reach: int,  # length of the way to look ahead, 10 a cell
     # Out:
@@ -256,7 +256,7 @@ def _first_cells(
     e, i, k = wp.tid()
     item = e * (distance.shape[0] / map_id.shape[0]) + i
     m = map_id[e]
-    here = target[e, i, k]
+    here = target_cell[e, i, k]
     if here >= 0:
         if distance[item, here] >= UNREACHED:
             here = -1

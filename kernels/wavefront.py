@@ -74,11 +74,11 @@ def _start_search(
     row = row_of_item[item]
     # A goal just set is its own target: then nothing is kept.
     moved = target[e, i] - goal[e, i]
-    fresh = moved[0] == 0.0 and moved[1] == 0.0
+    just_set = moved[0] == 0.0 and moved[1] == 0.0
     total = path_total[item]
     used = path_used[item]
     kept = wp.min(total, PATH_CELLS)
-    keep = not fresh and used >= 0 and (kept == total or 2 * used < kept)
+    keep = not just_set and used >= 0 and (kept == total or 2 * used < kept)
     if keep:
         for j in range(used, kept):
             if not is_passable(passable, row, path[item, path_slot(j, total)]):

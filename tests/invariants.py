@@ -88,7 +88,7 @@ class Watch:
             life = self.lives[e]
             now = {name: state[name][e].copy() for name in (
                 "pose", "slip", "center", "collided", "crashed", "path_length", "local_step", "covered", "terms",
-                "fresh", "overlap",
+                "discovered", "overlap",
             )}  # fmt: skip
             if life is None or life.number != state["episode"][e]:
                 self._begin(e, now, state)

@@ -245,7 +245,7 @@ def test_counts_reward_and_end(episode):
         area = weights.sum()
         unit = area / float(env.simulation.map_tensors["total_weight"][int(after.map_id)])
         new, overlap = team.counts(before.seen_free, after.visible, weights)
-        np.testing.assert_allclose(after.fresh * unit, new, rtol=1e-6)
+        np.testing.assert_allclose(after.discovered * unit, new, rtol=1e-6)
         np.testing.assert_allclose(after.overlap * unit, overlap, rtol=1e-6)
         np.testing.assert_allclose(after.coverage, team.coverage(after.seen_free, weights), rtol=1e-6)
         shared = after.shared / max(int(after.covered), 1)

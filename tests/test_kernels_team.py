@@ -46,7 +46,7 @@ def place(env: ExplorationEnv, pose: torch.Tensor, target: torch.Tensor) -> None
     s["target"].copy_(target)
 
 
-PER_ROBOT = ("pose", "control", "collided", "crashed", "fresh", "overlap", "terms", "seen_free", "seen_boundary",
+PER_ROBOT = ("pose", "control", "collided", "crashed", "discovered", "overlap", "terms", "seen_free", "seen_boundary",
              "known_free", "known_boundary", "visible", "path_length")  # fmt: skip
 
 
