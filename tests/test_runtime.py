@@ -82,10 +82,10 @@ def test_targets_ways_and_gains_are_those_of_the_kernels(name):
         np.testing.assert_allclose(scene.middle, middle, atol=1e-4 * nav.radar_range)
         wanted = nav.target.expand(-1, len(alive), -1)
         first = nav.points_on_way(wanted, 3.0)[0, alive][:, there >= 0].numpy() - now.call["origin"]
-        for row in range(len(scene.robots)):
-            cells = ways.cells_ahead(scene.passable[row], scene.distance[row], scene.targets.cell, 3.0)
-            assert np.array_equal(cells >= 0, np.isfinite(travel[row]))
-            np.testing.assert_allclose(scene.grid.centers(cells)[cells >= 0], first[row, cells >= 0], atol=1e-4)
+        wanted = np.tile(scene.targets.cell, (len(scene.robots), 1))
+        cells = ways.cells_ahead(scene.passable, scene.distance, wanted, 3.0)
+        assert np.array_equal(cells >= 0, np.isfinite(travel))
+        np.testing.assert_allclose(scene.grid.centers(cells)[cells >= 0], first[cells >= 0], atol=1e-4)
         count += len(there[there >= 0])
     assert count > 20
 

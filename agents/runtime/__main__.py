@@ -1,11 +1,15 @@
-"""`python -m maexp.agents.runtime`: how long a plan takes on this computer, for every planner."""
+"""`python -m maexp.agents.runtime`: how long a plan takes on this computer, for every planner and shipped policy.
+
+Policies need onnxruntime and are left out where it is not installed.
+"""
 
 import argparse
+import importlib.util
 import time
 
 import numpy as np
 
-from maexp.agents.runtime import CHOICES, TeamPlanner
+from maexp.agents.runtime import CHOICES, TeamPlanner, shipped_names
 
 
 def make_floor(cells: int, room: int = 80, door: int = 10) -> np.ndarray:
@@ -32,8 +36,9 @@ def main() -> None:
     grid = make_floor(round(given.metres / given.resolution))
     poses = [(1.5 + 1.2 * (k % 5), 1.5 + 1.2 * (k // 5), 0.0) for k in range(given.robots)]
     print(f"{given.robots} robots, {grid.shape[1]} x {grid.shape[0]} cells of {given.resolution:g} m")
-    for name in CHOICES:
-        planner, spent = TeamPlanner(name), []
+    trained = shipped_names() if importlib.util.find_spec("onnxruntime") else []
+    for name in (*CHOICES, *trained):
+        planner, spent = TeamPlanner(name, radar_range=5.0, robot_radius=0.3), []
         for now in range(given.calls):
             begin = time.process_time()
             plan = planner.plan(grid, given.resolution, (0.0, 0.0), poses, now=0.1 * now)

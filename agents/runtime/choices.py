@@ -68,8 +68,9 @@ def choose_by_force(scene: Scene) -> np.ndarray:
     """
     scene = prefer(scene)
     reached = np.isfinite(scene.travel)
-    first = [cells_ahead(p, d, scene.targets.cell, 3.0) for p, d in zip(scene.passable, scene.distance, strict=True)]
-    ways = scene.grid.centers(np.maximum(np.stack(first), 0)) - scene.at[:, None]
+    cells = np.tile(scene.targets.cell, (len(scene.at), 1))
+    first = cells_ahead(scene.passable, scene.distance, cells, 3.0)
+    ways = scene.grid.centers(np.maximum(first, 0)) - scene.at[:, None]
     ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-6)
     with np.errstate(invalid="ignore"):
         pull = np.where(reached, scene.targets.size / np.maximum(scene.travel / scene.grid.cell, 1.0) ** DECAY, 0.0)

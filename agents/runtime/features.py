@@ -126,8 +126,7 @@ class _Near:
     def bearings(self, heading: np.ndarray) -> dict[str, np.ndarray]:
         scene = self.scene
         ahead = np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
-        ways = zip(scene.passable, scene.distance, scene.targets.cell[self.target], strict=True)
-        first = np.stack([cells_ahead(passable, distance, cells, WAY_AHEAD) for passable, distance, cells in ways])
+        first = cells_ahead(scene.passable, scene.distance, scene.targets.cell[self.target], WAY_AHEAD)
         way = scene.grid.centers(np.maximum(first, 0)) - scene.at[:, None]
         toward = scene.middle[self.target]
         columns = {"unknown_far": np.linalg.norm(toward, axis=-1) / self.reach}

@@ -102,47 +102,54 @@ def _neighbours(passable: np.ndarray) -> np.ndarray:
     return result
 
 
-def cells_ahead(passable: np.ndarray, distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
-    """The cell that lies `ahead` [cells] from the source on its way to each of `cells`, int64 [n]; -1 = no way.
+def cells_ahead(passable: list[np.ndarray], distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
+    """The cell that lies `ahead` [cells] from each robot on its way to each of its cells, int64 [n, k]; -1 = no way.
 
     Args:
-        distance: of one source, int32 [H, W].
-        cells: int64 [n].
+        passable: of `mark_passable`, one a robot.
+        distance: of `flood`, int32 [n, H, W].
+        cells: int64 [n, k].
     """
     ways = _WayBack(passable, distance)
-    result = np.where(distance.ravel()[cells] < UNREACHED, cells, -1)
+    robot = np.repeat(np.arange(len(cells)), cells.shape[1])
+    result = np.where(distance.reshape(len(distance), -1)[robot, cells.ravel()] < UNREACHED, cells.ravel(), -1)
     going = np.flatnonzero(result >= 0)
-    at = ways.enter(result[going])
-    while len(going):
+    at = ways.enter(result[going], robot[going])
+    while len(going):  # all robots at once: there are many short steps
         far = ways.distance[at] > int(STRAIGHT * ahead)
         result[going[~far]] = ways.leave(at[~far])
         going, at = going[far], ways.step(at[far])
-    return result
+    return result.reshape(cells.shape)
 
 
 def trace(passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     """The cells of a shortest way from the source to a reached cell, corners and both ends only, int64 [k]."""
-    ways = _WayBack(passable, distance)
-    way = ways.leave(ways.follow(int(ways.enter(np.array([end]))[0])))[::-1]
+    ways = _WayBack([passable], distance[None])
+    way = ways.leave(ways.follow(int(ways.enter(np.array([end]), 0)[0])))[::-1]
     turn = np.diff(way)
     return way[np.concatenate([[True], turn[1:] != turn[:-1], [True]])] if len(way) > 1 else way
 
 
 class _WayBack:
-    """Steps from reached cells towards the source, on cells numbered with a rim of one around the grid."""
+    """Steps from reached cells towards the source of each robot, on cells numbered with a rim of one around its grid,
+    robot after robot.
+    """
 
-    def __init__(self, passable: np.ndarray, distance: np.ndarray):
-        self.width = passable.shape[1]
-        self.distance = np.pad(distance, 1, constant_values=UNREACHED).ravel()
-        self.tight = np.pad(passable == TIGHT, 1).ravel()
+    def __init__(self, passable: list[np.ndarray], distance: np.ndarray):
+        self.height, self.width = distance.shape[1:]
+        self.area = (self.height + 2) * (self.width + 2)
+        rim = ((0, 0), (1, 1), (1, 1))
+        self.distance = np.pad(distance, rim, constant_values=UNREACHED).ravel()
+        self.tight = np.pad([one == TIGHT for one in passable], rim).ravel()
         self.steps = STEPS[:, 1] * (self.width + 2) + STEPS[:, 0]
 
-    def enter(self, cells: np.ndarray) -> np.ndarray:
-        """Cells of the grid in the numbers of the rimmed one."""
-        return (cells // self.width + 1) * (self.width + 2) + cells % self.width + 1
+    def enter(self, cells: np.ndarray, robot: np.ndarray | int) -> np.ndarray:
+        """Cells of the grids of robots in the numbers of the rimmed ones."""
+        return (cells // self.width + 1) * (self.width + 2) + cells % self.width + 1 + robot * self.area
 
     def leave(self, at: np.ndarray) -> np.ndarray:
-        """The way back of `enter`."""
+        """The way back of `enter`, without the robot."""
+        at = at % self.area
         return (at // (self.width + 2) - 1) * self.width + at % (self.width + 2) - 1
 
     def step(self, at: np.ndarray) -> np.ndarray:
