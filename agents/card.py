@@ -73,8 +73,8 @@ def describe_results(file: Path) -> list[str]:
         rows = {name: values for name, values in content.items() if next(iter(SHOWN)) in values}
         teams = f"teams of {run['num_robots'][0]}, " if len(run["num_robots"]) == 1 else ""
         lines = [
-            f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval, "
-            f"commit {run['commit']}:", "",
+            f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval:",
+            "",
             f"| policy | {' | '.join(SHOWN.values())} |",
             "| --- " * (len(SHOWN) + 1) + "|",
         ]  # fmt: skip
