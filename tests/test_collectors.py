@@ -226,7 +226,7 @@ def test_one_batch_ahead_the_policy_is_one_batch_old(make_experience):
         torch.testing.assert_close(params["region"], batch["agents", "params", "region"])
     for batch, params in zip(old, acting(old), strict=True):
         assert not torch.allclose(params["region"]["logits"], batch["agents", "params", "region", "logits"], atol=1e-3)
-    for _ in range(2):  # the second time batches are certainly in the making
+    for _ in range(2):  # the second time workers are certainly busy with a batch
         experience.load_state_dict(state)
     assert not differing(experience.next(), old)
 
