@@ -113,5 +113,10 @@ def _cell(value: Any) -> str:
     if not isinstance(value, dict) or value.get("mean") is None:
         return ""
     low, high = (value.get("ci95") or [None, None])[:2]
-    interval = "" if low is None or high is None else f" ({low:.3g} to {high:.3g})"
-    return f"{value['mean']:.3g}{interval}"
+    interval = "" if low is None or high is None else f" ({_short(low)} to {_short(high)})"
+    return f"{_short(value['mean'])}{interval}"
+
+
+def _short(value: float) -> str:
+    """Three digits, and 0 for what rounding left of it."""
+    return f"{round(value, 6) + 0.0:.3g}"
