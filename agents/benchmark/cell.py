@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder
+from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, lock, training_cell
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.commands.run_folder import short
@@ -78,13 +78,10 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
     """
     folder = cell_folder(where, cell)
     folder.mkdir(parents=True, exist_ok=True)
-    settings, words = cell_config(cfg, cell)
+    settings, _ = cell_config(cfg, cell)
     policy, trained = None, {}
     if cell.trains:
-        saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
-        run = TrainingRun.build(settings, folder, words, saved)
-        write_config(run.settings, folder, "train", words)
-        train(run)
+        run = train_cell(cfg, where, training_cell(cfg, cell))
         if run.stopped:
             return False
         policy, trained = run.learner.policy, {"training_seconds": round(run.seconds, 2)}
@@ -92,6 +89,19 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
         if not finished(where, cell, suite):
             play_suite(cfg, settings, cell, suite, policy, folder, shelf, trained)
     return True
+
+
+def train_cell(cfg: Any, where: Path, cell: Cell) -> TrainingRun:
+    """Train what a cell trains, from wherever it was left; another worker that is at it is waited for."""
+    folder = cell_folder(where, cell)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings, words = cell_config(cfg, cell)
+    with lock(folder, wait=True):
+        saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
+        run = TrainingRun.build(settings, folder, words, saved)
+        write_config(run.settings, folder, "train", words)
+        train(run)
+    return run
 
 
 def play_suite(

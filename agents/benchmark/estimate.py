@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.benchmark.plan import Cell, cell_config, length_of
+from maexp.agents.benchmark.plan import Cell, as_list, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner, set_steps
 from maexp.agents.errors import blame_input
 from maexp.agents.policies import POLICIES
@@ -89,6 +89,8 @@ def _frames(cfg: Any, cell: Cell, suites: int) -> tuple[int, int]:
     """(macro steps of teams trained, at most played)."""
     length = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or UNKNOWN_LENGTH
     frames = length_of(cfg, cell).get("total_frames", cfg.total_frames)
+    if cfg.together:  # each scenario has its share of the one training
+        frames //= len(as_list(cfg.scenarios))
     return (frames if cell.trains else 0), cfg.episodes * suites * length
 
 

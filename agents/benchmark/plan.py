@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 PLAN = "benchmark.json"
+TOGETHER = "together"
+"""In place of a scenario's name: all of them at once."""
 SUITES = {"held_out": "held-out maps", "trained": "training maps"}
 SECTIONS = (
     "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
@@ -62,6 +64,11 @@ class Cell:
     def trains(self) -> bool:
         """Whether the policy has to be trained."""
         return self.policy in ALGORITHMS
+
+
+def training_cell(cfg: Any, cell: Cell) -> Cell:
+    """The cell whose folder holds the training: one for all scenarios where they are trained on together."""
+    return replace(cell, scenario=TOGETHER) if cfg.together and cell.trains else cell
 
 
 def list_cells(cfg: Any) -> list[Cell]:
@@ -117,6 +124,20 @@ def check_lists(cfg: Any) -> None:
         check_seed(seed, "seeds")
     check_goals(as_list(cfg.policies), cfg.planner.name)
     _check_policy_per_map(cfg)
+    _check_together(cfg)
+
+
+def _check_together(cfg: Any) -> None:
+    if not cfg.together:
+        return
+    if cfg.iterations is not None:
+        raise UserError(f"iterations={cfg.iterations} and together=true: give total_frames, and iterations=null.")
+    for name in ("policy_per_map", "train_maps"):
+        if cfg[name] is not None:
+            raise UserError(f"{name} and together=true: one policy is trained on all maps of all scenarios.")
+    for scenario in as_list(cfg.scenarios):
+        if find_scenario(scenario).build is None:
+            raise UserError(f"scenarios={scenario} and together=true: only generated scenarios are trained on at once.")
 
 
 def _check_policy_per_map(cfg: Any) -> None:
@@ -136,7 +157,9 @@ def _check_policy_per_map(cfg: Any) -> None:
 
 def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
     """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
-    words = [f"scenario={cell.scenario}", f"seed={cell.seed}"]
+    first, *others = as_list(cfg.scenarios) if cell.scenario == TOGETHER else [cell.scenario]
+    words = [f"scenario={first}", f"seed={cell.seed}"]
+    words += [f"scenario.also={render(others)}"] if others else []
     words += [f"algorithm={cell.policy}"] if cell.trains else []
     usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), raw(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
@@ -162,7 +185,7 @@ def raw(cfg: Any) -> dict:
 
 def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     """Which maps the cell trains on and which are held out, where not all of them."""
-    if find_scenario(cell.scenario).build is None:
+    if cell.scenario == TOGETHER or find_scenario(cell.scenario).build is None:
         return {}
     chosen: dict[str, Any] = {}
     train, _ = cut_last_fifth(split(cell.scenario)[0])
@@ -267,15 +290,18 @@ def check_unchanged(where: Path, cfg: Any) -> None:
 
 
 @contextmanager
-def lock(where: Path) -> Iterator[None]:
+def lock(where: Path, wait: bool = False) -> Iterator[None]:
     """Hold the folder; the lock ends with this process, however it ends.
+
+    Args:
+        wait: until a process that is at it has ended
 
     Raises:
         UserError: another process is at it.
     """
     handle = os.open(where, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
     except BlockingIOError as error:
         raise UserError(f"Another maexp benchmark is running in {where}: wait for it or stop it.") from error

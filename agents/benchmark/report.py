@@ -10,7 +10,7 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.benchmark.cell import VALIDATION, CellResult, finished, read_result
 from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.agents.benchmark.plan import SUITES, Cell, as_list
+from maexp.agents.benchmark.plan import SUITES, Cell, as_list, training_cell
 from maexp.agents.benchmark.table import (
     Column,
     pool_column,
@@ -157,7 +157,8 @@ class Report:
         length = f"{cfg.total_frames:,} macro steps" if cfg.iterations is None else f"{cfg.iterations:,} iterations"
         seeds = ", ".join(str(one) for one in as_list(cfg.seeds))
         text = f"maexp benchmark, preset {cfg.preset}: {cfg.num_robots} robots, planner {cfg.planner.name}, "
-        text += f"{length} of training for each algorithm, seeds {seeds}, {cfg.episodes} episodes each, "
+        all_at_once = " on all scenarios at once" if cfg.together else ""
+        text += f"{length} of training for each algorithm{all_at_once}, seeds {seeds}, {cfg.episodes} episodes each, "
         text += f"commit {find_commit()}."
         return text + (f" {SMOKE}" if cfg.preset == "smoke" else "")
 
@@ -180,8 +181,12 @@ class Report:
             "commits_of_cells": sorted({str(one["commit"]) for one in runs}),
             "versions": {name: metadata.version(name) for name in PACKAGES},
             "seconds": round(sum(one["seconds"] for one in runs), 2),
-            "training_seconds": round(sum(one.get("training_seconds", 0.0) for one in known.values()), 2),
+            "training_seconds": round(sum(self._trainings(known).values()), 2),
         }
+
+    def _trainings(self, runs: dict[Cell, dict]) -> dict[Cell, float]:
+        """Seconds of every training, each once."""
+        return {training_cell(self.cfg, cell): one.get("training_seconds", 0.0) for cell, one in runs.items()}
 
     # Pictures
 

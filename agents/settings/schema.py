@@ -307,6 +307,7 @@ class BenchmarkSettings(LearnerSettings):
     train_maps: int | None = setting(None, "train on the first so many maps; default: all that may be trained on")
     test_maps: int | None = setting(None, "evaluate on so many held-out maps, new ones too; default: the last fifth")
     policy_per_map: Any = setting(None, "a policy for each of so many maps, as {maze: 4}; default: one for all")
+    together: bool = setting(False, "train one policy on all scenarios at once; default: one for each scenario")
     workers: int | None = setting(None, "cells at once; default: the cores, or the GPUs where there are some")
     resume: str | None = setting(None, "folder of a benchmark to go on with (its settings are kept)")
     report: bool = setting(False, "run nothing, only write the tables and pictures of the cells that are done")
