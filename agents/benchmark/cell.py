@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from maexp.agents.actor import make_policy
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, lock, training_cell
-from maexp.agents.build import load_maps, make_env
+from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.commands.run_folder import short
 from maexp.agents.comparison import CHOOSING
@@ -22,12 +23,14 @@ from maexp.agents.files import write_file, write_json
 from maexp.agents.policies import CHOICES, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run
-from maexp.agents.train import TrainingRun, train, write_config
+from maexp.agents.train import TrainingRun, load_matching, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 CURVE = ("curve_seconds", "curve_coverage")
+TRAINED = "trained.json"
+"""Written last where a training has come to its end."""
 VALIDATION = "validation"
 """Maps that a classical planner plays first: they say which one is the best."""
 
@@ -79,56 +82,72 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
     folder = cell_folder(where, cell)
     folder.mkdir(parents=True, exist_ok=True)
     settings, _ = cell_config(cfg, cell)
-    policy, trained = None, {}
-    if cell.trains:
-        run = train_cell(cfg, where, training_cell(cfg, cell))
-        if run.stopped:
-            return False
-        policy, trained = run.learner.policy, {"training_seconds": round(run.seconds, 2)}
+    team = train_cell(cfg, where, training_cell(cfg, cell)) if cell.trains else None
+    if cell.trains and team is None:
+        return False
     for suite in [VALIDATION] * (cell.policy in CHOICES) + suites:
         if not finished(where, cell, suite):
-            play_suite(cfg, settings, cell, suite, policy, folder, shelf, trained)
+            play_suite(cfg, settings, cell, suite, team, folder, shelf)
     return True
 
 
-def train_cell(cfg: Any, where: Path, cell: Cell) -> TrainingRun:
-    """Train what a cell trains, from wherever it was left; another worker that is at it is waited for."""
+def train_cell(cfg: Any, where: Path, cell: Cell) -> dict | None:
+    """The last checkpoint of what a cell trains, from wherever it was left; None if it was told to stop.
+
+    Another worker that is at the same training is waited for.
+    """
     folder = cell_folder(where, cell)
     folder.mkdir(parents=True, exist_ok=True)
-    settings, words = cell_config(cfg, cell)
     with lock(folder, wait=True):
-        saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
-        run = TrainingRun.build(settings, folder, words, saved)
-        write_config(run.settings, folder, "train", words)
-        train(run)
-    return run
+        if not (folder / TRAINED).is_file():
+            settings, words = cell_config(cfg, cell)
+            saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
+            run = TrainingRun.build(settings, folder, words, saved)
+            write_config(run.settings, folder, "train", words)
+            train(run)
+            if run.stopped:
+                return None
+            write_json(folder / TRAINED, {"training_seconds": round(run.seconds, 2)})
+        return find_checkpoint(folder)[1] | json.loads((folder / TRAINED).read_text())
 
 
 def play_suite(
-    cfg: Any, settings: Any, cell: Cell, suite: str, policy: Any, folder: Path, shelf: EnvShelf, trained: dict
+    cfg: Any, settings: Any, cell: Cell, suite: str, team: dict | None, folder: Path, shelf: EnvShelf
 ) -> None:
-    """Play the episodes of one set of maps; writes the arrays, then the summary that marks the end."""
+    """Play the episodes of one set of maps; writes the arrays, then the summary that marks the end.
+
+    Args:
+        team: checkpoint of a trained one
+    """
     with blame_input():
         maps = getattr(load_maps(settings.scenario, train=suite == "trained"), _ATTRIBUTE[suite])
         key = f"{cell.scenario} {cell.seed} {cell.map} {suite}"
         episodes = min(CHOOSING, cfg.episodes) if suite == VALIDATION else cfg.episodes
         size = min(cfg.num_envs, episodes)
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
-        bound = POLICIES[cell.policy](env) if policy is None else policy
+        policy = POLICIES[cell.policy](env) if team is None else load_policy(settings, env, team)
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:
         with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
             result = evaluate(
-                bound, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
+                policy, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
             )
     seconds, coverage = recorder.curves(episodes)
     arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
     arrays["maps"] = result.maps
-    described = describe_run(settings, maps, time.perf_counter() - begin) | trained
+    described = describe_run(settings, maps, time.perf_counter() - begin)
+    described |= {} if team is None else {"training_seconds": team["training_seconds"]}
     described |= {"algorithm": cell.policy if cell.trains else None, "episodes": episodes, "maps_are": suite}
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
+
+
+def load_policy(settings: Any, env: Any, saved: dict) -> Any:
+    """The policy of a checkpoint, for the teams of `env`."""
+    policy = make_policy(env, model_settings(settings))
+    load_matching(policy, saved["policy"])
+    return policy
 
 
 _ATTRIBUTE = {"held_out": "held_out", "trained": "train", VALIDATION: "validation"}
