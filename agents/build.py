@@ -29,8 +29,9 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
+from maexp.envs.config import STARTS
 from maexp.envs.scenarios import SCENARIOS, find_scenario
-from maexp.envs.starts import STARTS, read_starts
+from maexp.envs.starts import read_starts
 
 
 @dataclass

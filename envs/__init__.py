@@ -1,20 +1,28 @@
-"""Maps, scenarios and the TorchRL env."""
+"""Maps, scenarios and the TorchRL env.
 
-from maexp.envs.apis import parallel_env, vector_env
-from maexp.envs.checker import check_map
-from maexp.envs.config import (
-    CommConfig,
-    ObservationConfig,
-    PlannerConfig,
-    RadarConfig,
-    RewardConfig,
-    RobotConfig,
-)
-from maexp.envs.environment import ExplorationEnv
-from maexp.envs.importing import import_map
-from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.scenarios import SCENARIOS, make_map, split
+Names are looked up on first use, so that a command line or a robot's computer need not wait for TorchRL and Warp.
+"""
 
+import importlib
+
+_HOMES = {
+    "SCENARIOS": "scenarios",
+    "CommConfig": "config",
+    "ExplorationEnv": "environment",
+    "MapError": "map",
+    "ObservationConfig": "config",
+    "PlannerConfig": "config",
+    "PointCloudMap": "map",
+    "RadarConfig": "config",
+    "RewardConfig": "config",
+    "RobotConfig": "config",
+    "check_map": "checker",
+    "import_map": "importing",
+    "make_map": "scenarios",
+    "parallel_env": "apis",
+    "split": "scenarios",
+    "vector_env": "apis",
+}
 __all__ = [
     "SCENARIOS",
     "CommConfig",
@@ -33,3 +41,9 @@ __all__ = [
     "split",
     "vector_env",
 ]
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module 'maexp.envs' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"maexp.envs.{_HOMES[name]}"), name)

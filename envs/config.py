@@ -7,6 +7,8 @@ from typing import Literal
 
 from maexp.envs.scenarios import Scenario
 
+STARTS = ("drawn", "fixed")
+"""Where robots start, besides poses that are given: drawn at every reset, or drawn once for each map and kept."""
 
 @dataclass(frozen=True)
 class RobotConfig:

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from maexp.envs.bank import build_bank
 from maexp.envs.config import (
+    STARTS,
     CommConfig,
     ObservationConfig,
     PlannerConfig,
@@ -27,10 +28,10 @@ from maexp.envs.config import (
     per_robot,
 )
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.scenarios import default_macro_steps, find_scenario
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
-from maexp.envs.starts import STARTS, check_room, check_starts, fixed_starts
+from maexp.envs.starts import check_room, check_starts, fixed_starts
 from maexp.envs.target_view import TargetView
 from maexp.kernels import unpack_flags
 from maexp.kernels.observe import picture_shapes
@@ -38,11 +39,8 @@ from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
 from maexp.kernels.types import DT, ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, PIXELS, REGIONS
 
-DEFAULT_MACRO_STEPS_MIN = 10
 LATER = {"starts": math.inf, "covered_sum": 0}
 """State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
-SWEEPS = 2.0
-"""A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
 
 class ExplorationEnv(EnvBase):
@@ -432,13 +430,6 @@ def blank(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
     if device.type == "cpu":
         return torch.from_numpy(np.zeros(shape, dtype=np.uint8))
     return torch.zeros(shape, dtype=torch.uint8, device=device)
-
-
-def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
-    """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
-    area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
-    swept = 3 * scenario.max_speed * DT * scenario.local_steps * scenario.radar_range
-    return max(DEFAULT_MACRO_STEPS_MIN, math.ceil(SWEEPS * area / swept))
 
 
 def _device(device) -> torch.device:

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.kernels.types import START_CLEARANCE
 
-STARTS = ("drawn", "fixed")
 NO_ROOM = "use fewer robots, a smaller robot.collision_threshold or a larger map"
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from maexp.agents.cli import VERBS, main
 from maexp.agents.commands.run_folder import claim_folder
+from maexp.agents.policies import POLICIES
 from maexp.envs import make_map
 
 TINY = [
@@ -50,6 +51,21 @@ def test_help_names_settings_and_choices(verb, capsys):
     assert "num_robots=" in text or verb == "policies"
     if verb not in ("maps", "irsim", "export", "policies"):
         assert "maze_small" in text and "wavefront" in text and "camera" in text
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_waits_for_no_heavy_library(verb):
+    program = (
+        f"import sys; from maexp.agents.cli import main; main([{verb!r}, '--help']); "
+        "print([name for name in ('torch', 'torchrl', 'warp', 'open3d') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]" and verb in done.stdout
+
+
+def test_help_names_the_classical_policies_there_are(capsys):
+    assert main(["evaluate", "--help"]) == 0
+    assert f"{', '.join(POLICIES)}, or a trained one" in capsys.readouterr().out
 
 
 def test_the_installed_command_prints_no_noise():

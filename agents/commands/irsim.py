@@ -16,9 +16,8 @@ from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.schema import given
 from maexp.envs import PointCloudMap, import_map
-from maexp.envs.environment import default_macro_steps
 from maexp.envs.film import write_gif
-from maexp.envs.scenarios import find_scenario
+from maexp.envs.scenarios import default_macro_steps, find_scenario
 
 FILM_SPEED = 4.0  # frames a second; one a decision
 

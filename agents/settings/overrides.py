@@ -8,7 +8,7 @@ from hydra.errors import HydraException, OverrideParseException
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.schema import schema
-from maexp.envs.starts import STARTS
+from maexp.envs.config import STARTS
 
 PATHS = (
     "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results",

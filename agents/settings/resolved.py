@@ -6,8 +6,8 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
-from maexp.agents.algorithms import Settings, find_algorithm
 from maexp.agents.model import ModelConfig
+from maexp.agents.settings.algorithms import Settings, find_presets
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.schema import given
 from maexp.envs.config import (
@@ -21,9 +21,8 @@ from maexp.envs.config import (
     complete_radar,
     complete_robot,
 )
-from maexp.envs.environment import default_macro_steps
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
 
 FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig}
 """Groups with settings that the scenario supplies where they are null."""
@@ -103,7 +102,7 @@ def _resolve_planner(cfg: Any, row: Scenario) -> dict[str, Any]:
 
 def algorithm_settings(cfg: Any) -> Settings:
     """The settings of the algorithm."""
-    return find_algorithm(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
+    return find_presets(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
 
 
 def model_settings(cfg: Any) -> ModelConfig:

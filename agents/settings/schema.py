@@ -13,9 +13,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.model import ModelConfig
-from maexp.agents.policies import POLICIES
+from maexp.agents.runtime.choices import CHOICES
+from maexp.agents.settings.algorithms import PRESETS
 from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
 from maexp.envs.importing.options import ImportOptions
 
@@ -70,7 +70,7 @@ RewardSettings = optional_settings(RewardConfig)
 ObservationSettings = optional_settings(ObservationConfig)
 CommSettings = optional_settings(CommConfig)
 AlgorithmSettings = optional_settings(
-    *{type(row.settings): None for row in ALGORITHMS.values()}, name=str | None
+    *{type(row.default): None for row in PRESETS.values()}, name=str | None
 )
 ImportSettings = optional_settings(ImportOptions)
 
@@ -185,7 +185,7 @@ class EvaluateSettings(LearnerSettings):
     preset: str = MISSING
     action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
-    policy: Any = setting(None, f"{', '.join(POLICIES)}, or a trained one or its folder; several as a,b")
+    policy: Any = setting(None, f"random, {', '.join(CHOICES)}, oracle, or a trained one or its folder; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")

@@ -6,12 +6,18 @@ from dataclasses import dataclass
 from functools import partial
 from numbers import Integral
 
+import numpy as np
+
 from maexp.envs.map import PointCloudMap
 
 from .indoor import build_indoor
 from .maze import build_maze
 from .outdoor import build_outdoor
 from .random_obstacles import build_adaptive, build_random_obstacles
+
+LEAST_MACRO_STEPS = 10
+SWEEPS = 2.0
+"""A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
 
 @dataclass(frozen=True)
@@ -111,3 +117,10 @@ def cut_last_fifth(indices: range) -> tuple[range, range]:
     are trained on for validation."""
     first = len(indices) - max(1, round(0.2 * len(indices)))
     return indices[:first], indices[first:]
+
+
+def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
+    """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
+    area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
+    swept = 3 * scenario.max_speed * 0.1 * scenario.local_steps * scenario.radar_range
+    return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * area / swept))
