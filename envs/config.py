@@ -53,15 +53,20 @@ class PlannerConfig:
     replan_steps: int = 5
 
 
+TIME_ON = ("uncovered", "covered", "gained")  # numbered as in kernels/reward.py
+
+
 @dataclass(frozen=True)
 class RewardConfig:
     """Weights of the reward (docs/concepts.md).
 
     ``points`` / |free| scales explore and overlap, ``events`` the other terms; ``events`` 0 takes
-    ``points`` / |free| there too, as the paper does. ``time_on`` "uncovered" pays -(1 - coverage),
-    "covered" pays -coverage as the paper prints. ``charge_rest``: when the last robot of a team has collided,
-    the steps left in the episode are charged at once, as if it went on; else the team is spared them. ``unfinished``
-    adds to what is charged for time in every local step until the team is done: the last corners count then, too.
+    ``points`` / |free| there too, as the paper does. ``time_on`` "uncovered" pays -(1 - coverage), "covered" pays
+    -coverage as the paper prints. "gained" pays at once, for all the steps left, what is newly covered: over an
+    episode that is the sum of "uncovered" and a constant, and a critic has less to explain. ``charge_rest``: when the
+    last robot of a team has collided, the steps left in the episode are charged at once, as if it went on; else the
+    team is spared them. ``unfinished`` adds to what is charged for time in every local step until the team is done:
+    the last corners count then, too.
     """
 
     explore: float = 0.3
@@ -72,7 +77,7 @@ class RewardConfig:
     collision: float = 200.0
     points: float = 60.0
     events: float = 60.0 / 7000.0
-    time_on: Literal["uncovered", "covered"] = "uncovered"
+    time_on: Literal["uncovered", "covered", "gained"] = "uncovered"
     charge_rest: bool = True
 
 
@@ -159,9 +164,11 @@ def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig
 
 def check_reward(config: RewardConfig) -> RewardConfig:
     """Every weight must be a finite number; signs are fixed by the meaning of the terms."""
-    _check_choice("reward.time_on", config.time_on, ("uncovered", "covered"))
+    _check_choice("reward.time_on", config.time_on, TIME_ON)
     if not isinstance(config.charge_rest, bool):
         raise ValueError(f"reward.charge_rest={config.charge_rest!r} must be true or false")
+    if config.time_on == "gained" and not config.charge_rest:
+        raise ValueError("reward.charge_rest=False with reward.time_on='gained': nothing is charged, use true")
     for f in fields(config):
         value = getattr(config, f.name)
         number = isinstance(value, int | float) and 0.0 <= value < math.inf

@@ -5,6 +5,7 @@ import os
 
 import torch
 
+from maexp.envs.config import TIME_ON
 from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
@@ -72,9 +73,10 @@ def reward_weights(env) -> RewardWeights:
     weights = RewardWeights()
     for name in ("explore", "overlap", "time", "unfinished", "success", "collision", "points", "events"):
         setattr(weights, name, float(getattr(cfg, name)))
-    weights.time_sign = 1.0 if cfg.time_on == "covered" else 0.0
+    weights.time_on = TIME_ON.index(cfg.time_on)
     weights.success_coverage = env.success_coverage
-    weights.horizon = env.local_steps * env.macro_steps if cfg.charge_rest else 0
+    weights.length = env.local_steps * env.macro_steps
+    weights.charge_rest = int(cfg.charge_rest)
     return weights
 
 

@@ -19,6 +19,10 @@ SUCCESS = 3
 COLLISION = 4
 TERMS = 5
 """Number of reward terms; the names above index the last axis of ``terms`` and ``raw``."""
+UNCOVERED = wp.constant(0)
+COVERED = wp.constant(1)
+GAINED = wp.constant(2)
+"""What the time term counts: -(1 - coverage), -coverage as the paper prints, or what is gained for the rest."""
 
 
 @wp.struct
@@ -33,9 +37,10 @@ class RewardWeights:
     collision: float
     points: float  # w = points / total weight scales explore and overlap
     events: float  # v = events scales time, success, collision; 0: points / |free| (the paper's way)
-    time_sign: float  # 0: -(1 - coverage) as in the code, 1: -coverage as the paper prints
+    time_on: int  # UNCOVERED, COVERED or GAINED
     success_coverage: float
-    horizon: int  # local steps of an episode, charged to the last one when all have collided; 0: they are not
+    length: int  # local steps of an episode
+    charge_rest: int  # whether what is left of them is charged when all have collided
 
 
 @wp.func
@@ -53,13 +58,12 @@ def add_term(
 
 
 @wp.func
-def steps_charged(horizon: int, local_step: int, e: int, collided: wp.array2d(dtype=wp.int32)) -> float:
-    """Local steps that the episode would go on for after this one, if all robots have collided; else 0."""
-    left = wp.max(horizon - local_step - 1, 0)
+def all_collided(e: int, collided: wp.array2d(dtype=wp.int32)) -> bool:
+    """Whether nobody of the team moves any more."""
     for i in range(collided.shape[1]):
         if collided[e, i] == 0:
-            left = 0
-    return float(left)
+            return False
+    return True
 
 
 @wp.kernel
@@ -99,17 +103,22 @@ def _reward_robots(
         v = weights.points / float(maps.free_begin[m + 1] - maps.free_begin[m])
     before = float(covered_before[e]) / total
     after = float(covered[e]) / total
+    done = before < weights.success_coverage and after >= weights.success_coverage
+    rest = float(wp.max(weights.length - local_step[e] - 1, 0))
     left = float(0.0)
-    if collided[e, i] != 0 and after < weights.success_coverage:
-        left = steps_charged(weights.horizon, local_step[e], e, collided)
-    lapse = -(1.0 - before) - left * (1.0 - after)
-    if weights.time_sign != 0.0:
-        lapse = -before - left * after
-    lapse = lapse - weights.unfinished * (1.0 + left)
+    if weights.charge_rest != 0 and after < weights.success_coverage and all_collided(e, collided):
+        left = rest
+    lapse = -(1.0 - before) - left * (1.0 - after) - weights.unfinished * (1.0 + left)
+    if weights.time_on == COVERED:
+        lapse = -before - left * after - weights.unfinished * (1.0 + left)
+    if weights.time_on == GAINED:
+        lapse = (after - before) * rest
+        if done:
+            lapse = lapse + (1.0 - after + weights.unfinished) * rest
     add_term(terms, raw, e, i, EXPLORE, weights.explore * float(discovered[e, i]), w)
     add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
     add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
-    if before < weights.success_coverage and after >= weights.success_coverage:
+    if done:
         add_term(terms, raw, e, i, SUCCESS, weights.success, v)
     if crashed[e, i] != 0:
         add_term(terms, raw, e, i, COLLISION, -weights.collision, v)

@@ -223,6 +223,10 @@ class Watch:
             left = 0  # the rest is charged when the last robot has collided
         after = life.covered / total
         lapse = -(before + left * after) if cfg.time_on == "covered" else before - 1.0 + left * (after - 1.0)
+        if cfg.time_on == "gained":
+            rest = env.local_steps * env.macro_steps - now["local_step"]
+            over = life.coverage >= np.float32(env.success_coverage) > reached
+            lapse = rest * (after - before + over * (1.0 - after + cfg.unfinished))
         won = reached < np.float32(env.success_coverage) <= life.coverage
         life.terms += np.stack([
             w * cfg.explore * fresh, -w * cfg.overlap * overlap * (1 + left), np.full(len(fresh), v * cfg.time * lapse),

@@ -36,6 +36,7 @@ REWARDS = [
     RewardConfig(overlap=0.01, charge_rest=True),
     RewardConfig(overlap=0.0, charge_rest=True, time_on="covered"),
     RewardConfig(overlap=0.01, charge_rest=False, events=0.0),
+    RewardConfig(explore=0.0, unfinished=0.5, time_on="gained"),
 ]
 LONG = settings.get_current_profile_name() == "long"
 STEPS = 200 if LONG else 5

@@ -67,6 +67,63 @@ def test_a_team_that_is_done_pays_nothing_for_the_rest():
     torch.testing.assert_close(td["agents", "reward"][..., 0], want, rtol=1e-4, atol=0)
 
 
+@pytest.mark.parametrize("unfinished", [0.0, 0.5])
+def test_gains_pay_at_once_what_time_would_have_cost(unfinished):
+    """The same episodes, also those that end early, by success or by collisions: the sums differ by a constant."""
+    earned, starts, ends = {}, {}, {}
+    for kind in ("uncovered", "gained"):
+        env = ExplorationEnv(
+            [make_map("maze_small", 0), make_map("maze_small", 1)], 8, 2, planner=DIRECT, local_steps=10, macro_steps=9,
+            reward=RewardConfig(explore=0.0, unfinished=unfinished, time_on=kind), success_coverage=0.3, num_threads=1,
+            seed=5, robot=RobotConfig(collision_threshold=0.6),
+        )  # fmt: skip
+        time = REWARD_TERMS.index("time")
+        env.set_seed(3)
+        td, total = env.reset(), torch.zeros(8, 2)
+        starts[kind] = torch.tensor([[moment(env, e).coverage] for e in range(8)])
+        generator = torch.Generator().manual_seed(4)
+        for _ in range(9):
+            control = torch.rand(8, 2, 2, generator=generator) * torch.tensor([1.0, 0.6]) - torch.tensor([0.0, 0.3])
+            td = drive(env, td, control)
+            total += env.simulation.tensors["terms"][:, :, time]
+        earned[kind], ends[kind] = total, (td["info", "coverage"], td["info", "collided"], td["info", "local_steps"])
+    for one, other in zip(ends["uncovered"], ends["gained"], strict=True):
+        assert torch.equal(one, other)
+    coverage, collided, steps = ends["gained"]
+    assert (coverage >= 0.3).any() and (coverage < 0.3).any() and (steps < 90).any(), "some are done early, some never"
+    constant = V * 90 * (1.0 - starts["gained"] + unfinished)
+    torch.testing.assert_close(earned["gained"], earned["uncovered"] + constant, rtol=1e-4, atol=1e-4)
+
+
+def test_gains_by_the_oracle():
+    env = ExplorationEnv(
+        [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)], 4, 2, seed=2, planner=DIRECT, num_threads=1,
+        reward=RewardConfig(explore=0.0, unfinished=0.4, time_on="gained"), radar=RadarConfig(range=4.0),
+        local_steps=1, macro_steps=60, success_coverage=0.9,
+    )  # fmt: skip
+    td, time, paid = env.reset(), REWARD_TERMS.index("time"), 0
+    before = [moment(env, e) for e in range(4)]
+    for _ in range(50):
+        td = drive(env, td, torch.tensor([0.5, 0.1]).expand(4, 2, 2).clone())
+        after = [moment(env, e) for e in range(4)]
+        for old, now in zip(before, after, strict=True):
+            if old.active:
+                done = old.coverage < 0.9 <= now.coverage
+                want = team.reward_terms(
+                    np.zeros(2), np.zeros(2), old.coverage, done, np.zeros(2), 1.0, coverage_now=now.coverage,
+                    unfinished=0.4, gained_for=60 - now.step,
+                )["time"]  # fmt: skip
+                np.testing.assert_allclose(now.terms[:, time], want, rtol=2e-4, atol=1e-5)
+                paid += want[0] > 0
+        before = after
+    assert paid > 20
+
+
+def test_gains_need_the_rest_to_be_charged():
+    with pytest.raises(ValueError, match="reward.charge_rest=False with reward.time_on='gained'"):
+        ExplorationEnv(make_map("maze_small", 0), 1, 1, reward=RewardConfig(time_on="gained", charge_rest=False))
+
+
 def branch(env, state, plan, robot: int, crash: bool) -> torch.Tensor:
     """What `robot` of every env earns from `state` to the end, [macro steps, E]: it crashes here, or stands still.
 

@@ -84,12 +84,13 @@ def reward_terms(
     coverage_now: float = 1.0,
     charged: int = 0,
     unfinished: float = 0.0,
+    gained_for: int | None = None,
 ) -> dict[str, np.ndarray]:
     """The terms of one local step, each (N,), signed and weighted as they enter the reward (design 4.5).
 
     succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step;
     charged: steps left that are charged too, at `coverage_now` (`steps_charged`); unfinished: weight of the time
-    itself.
+    itself; gained_for: the steps after this one: what is gained pays for them at once, and nothing else is charged.
     """
     w = 60.0 / num_free
     v = w if paper else 60.0 / 7000.0
@@ -98,6 +99,10 @@ def reward_terms(
     shared = [-w * overlap_weight * overlap[i] for i in range(robots)]
     for _ in range(charged):  # nobody moves any more: each step costs the same
         time -= v * (1.0 - coverage_now + unfinished)
+    if gained_for is not None:
+        time = sum(v * (coverage_now - coverage_before) for _ in range(gained_for))
+        if succeeded:  # and so does what need not be waited for any more
+            time += sum(v * (1.0 - coverage_now + unfinished) for _ in range(gained_for))
     return {
         "explore": np.asarray([w * explore * new[i] for i in range(robots)]),
         "overlap": np.asarray([(1 + charged) * value for value in shared]),
