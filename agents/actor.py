@@ -98,17 +98,19 @@ def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Modu
     return TargetGenerator(config, shape.channels, shape.side, shape.regions), heads
 
 
-def make_policy(env, model: "str | ModelConfig" = "small", greedy: bool = False) -> ProbabilisticActor:
+def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
     """The trainable policy of a team, for the action that `env` takes.
 
     It reads ("agents", "observation", ...) and writes ("agents", "params", ...), ("agents", "action", ...)
     and one log-probability per robot and head, ("agents", "action", "<head>_log_prob") of shape [*, robots].
     Offsets are stored as drawn, so that their probability can be computed again; the environment clamps them.
 
+    Collectors draw actions. Elsewhere, where no `set_exploration_type` is in force, regions are drawn as well, and of
+    targets the likeliest is taken.
+
     Args:
         env: gives the specs and the device; not kept
         model: a preset's name or a ModelConfig
-        greedy: take the likeliest action, where nothing else is asked for; else it is drawn
     """
     config = model_config(model)
     shape = observation_shape(env, config)
@@ -123,6 +125,6 @@ def make_policy(env, model: "str | ModelConfig" = "small", greedy: bool = False)
         distribution_class=RegionHeads if joint else Heads,
         distribution_kwargs={"heads": heads},
         return_log_prob=True,
-        default_interaction_type=InteractionType.DETERMINISTIC if greedy else InteractionType.RANDOM,
+        default_interaction_type=InteractionType.DETERMINISTIC if heads is TARGET_HEADS else InteractionType.RANDOM,
     )
     return actor.to(env.device) if env.device is not None else actor

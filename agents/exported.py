@@ -82,7 +82,7 @@ def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") 
     except (KeyError, TypeError, ValueError, SafetensorError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{folder} holds no network that its contract tells of ({reason}): {AGAIN}.") from error
-    policy = make_policy(env, config, greedy=True)
+    policy = make_policy(env, config)
     chooser = find_chooser(policy)
     own = chooser.state_dict()
     wrong = [name for name in own if name not in weights or weights[name].shape != own[name].shape]

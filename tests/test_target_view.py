@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from oracle.targets import columns as oracle_columns
-from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type, step_mdp
+from torchrl.envs.utils import check_env_specs, step_mdp
 
 from maexp.agents.actor import make_policy
 from maexp.agents.algorithms import find_algorithm
@@ -197,7 +197,16 @@ def test_all_algorithms_learn_to_choose(name):
 def test_an_untrained_policy_is_the_classical_planner():
     env = make_env()
     policy = make_policy(env, ModelConfig(action="targets"))
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for td in play(env, 3):
-            some = td[MASK].any(-1)
-            assert torch.equal(policy(td.clone())[ACTION][some], choose(td)[some])
+    for td in play(env, 3):
+        some = td[MASK].any(-1)
+        assert torch.equal(policy(td.clone())[ACTION][some], choose(td)[some])
+
+
+def test_choices_are_drawn_in_a_collector_and_the_likeliest_elsewhere():
+    env = make_env()
+    policy = make_policy(env, ModelConfig(action="targets", score_weight=0.0))  # all alike
+    collector = make_collector(env, policy, 4)
+    batch = next(iter(collector))
+    collector.shutdown()
+    assert (batch[ACTION] > 0).any(), "drawn"
+    assert (policy(batch.select(TARGETS, MASK, *policy.in_keys))[ACTION] == 0).all(), "the first of equals"
