@@ -37,7 +37,7 @@ from maexp.kernels import unpack_flags
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
-from maexp.kernels.types import DT, ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, PIXELS, REGIONS
+from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, PIXELS, REGIONS
 
 LATER = {"starts": math.inf, "covered_sum": 0}
 """State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""

@@ -19,9 +19,9 @@ SUCCESS = 3
 COLLISION = 4
 TERMS = 5
 """Number of reward terms; the names above index the last axis of ``terms`` and ``raw``."""
-UNCOVERED = wp.constant(0)
-COVERED = wp.constant(1)
-GAINED = wp.constant(2)
+UNCOVERED = 0
+COVERED = 1
+GAINED = 2
 """What the time term counts: -(1 - coverage), -coverage as the paper prints, or what is gained for the rest."""
 
 
