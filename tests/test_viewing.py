@@ -214,7 +214,7 @@ def test_the_picture_shows_the_episode_that_is_asked_for(tmp_path, capsys, monke
     assert np.array_equal(picture("e", "episode=10"), alone["random_10"])
     assert np.array_equal(picture("e", "episode=11", "policy=voronoi"), alone["voronoi_11"])
     assert not np.array_equal(alone["random_10"], alone["random_9"])
-    for words, wanted in ((["episode=12"], "give 9 to 11"), (["policy=frontier"], "unknown"),
+    for words, wanted in ((["episode=12"], "give 9 to 11"), (["policy=frontier"], "those of random, voronoi"),
                           (["policy=nearest_frontier"], "those of random, voronoi")):  # fmt: skip
         assert main(["view", "e", *words, "out=b.png"]) == 2 and not Path("b.png").exists()
         err = capsys.readouterr().err
