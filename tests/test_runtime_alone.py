@@ -30,7 +30,7 @@ def alone(tmp_path_factory):
 
 
 def test_torch_is_not_there(alone):
-    done = alone("-c", "import maexp.envs")
+    done = alone("-c", "from maexp.envs import ExplorationEnv")
     assert "ModuleNotFoundError" in done.stderr  # else the tests below would prove nothing
 
 

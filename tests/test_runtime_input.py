@@ -55,7 +55,7 @@ def test_what_cannot_be_used_at_all_is_a_sentence(change, part):
 @pytest.mark.parametrize(
     "settings, part",
     [
-        ({"policy": "best"}, "policy='best' is unknown: choose one of"),
+        ({"policy": "best"}, "policy=best is unknown: choose one of"),
         ({"radar_range": -1}, "radar_range=-1 must be above 0"),
         ({"patience": float("inf")}, "patience=inf must be a finite number"),
         ({"least_area": -0.1}, "least_area=-0.1 must be 0 or more"),
