@@ -29,7 +29,7 @@ from maexp.envs.recorder import CoverageRecorder
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 CURVE = ("curve_seconds", "curve_coverage")
-TRAINED = "trained.json"
+TRAINED = "training.json"
 """Written last where a training has come to its end."""
 VALIDATION = "validation"
 """Maps that a classical planner plays first: they say which one is the best."""
