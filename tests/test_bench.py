@@ -99,7 +99,8 @@ def test_training_is_split_into_its_parts_for_every_network(capsys):
         assert sum(median.values()) == pytest.approx(whole, rel=0.3)
         assert row["macro_steps"] == 4 and row["iterations"] >= 3
         assert row["robot_macro_steps_per_second"] == pytest.approx(4 * 2 / whole)
-    assert paper["times_the_slowest"] == 1.0 and small["times_the_slowest"] > 1.0
+    rates = [row["robot_macro_steps_per_second"] for row in (small, paper)]  # which is slower, a busy machine decides
+    assert [row["times_the_slowest"] for row in (small, paper)] == pytest.approx([one / min(rates) for one in rates])
     assert "robot-steps/s" in capsys.readouterr().out
 
 
