@@ -39,6 +39,8 @@ def prepare(overrides: list[str]) -> Recipe:
     if place is not None and is_run(Path(place)):
         overrides = [*without(overrides, "place"), f"checkpoint={quote(place)}"]
     run = find_override(overrides, "checkpoint")
+    if run is None and place is not None and find_override(overrides, "scenario") is None and Path(place).is_file():
+        return Recipe(["scenario=pointcloud", f"scenario.path={quote(place)}", *overrides])  # robots fit its map
     if run is None:
         return Recipe(overrides)
     return continue_run(*find_checkpoint(run), without(overrides, "place"), "view", "num_envs")
