@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.actor import make_policy
+from maexp.agents.checkpoint import mismatched
 from maexp.agents.errors import UserError
 from maexp.agents.export import find_chooser
 from maexp.agents.model import ModelConfig
@@ -84,9 +85,7 @@ def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") 
         raise UserError(f"{folder} holds no network that its contract tells of ({reason}): {AGAIN}.") from error
     policy = make_policy(env, config)
     chooser = find_chooser(policy)
-    own = chooser.state_dict()
-    wrong = [name for name in own if name not in weights or weights[name].shape != own[name].shape]
-    wrong += [name for name in weights if name not in own]
+    wrong = mismatched(chooser.state_dict(), weights)
     if wrong:
         raise UserError(
             f"{folder / WEIGHTS} holds another network than its contract tells of ({len(wrong)} tensors differ, first "

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from maexp.agents.actor import ALIVE, make_policy
+from maexp.agents.actor import ALIVE
 from maexp.agents.build import choose_device, make_env
-from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checkpoint import find_checkpoint, restore_policy
 from maexp.agents.collect import batch_statistics, divide_teams
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.exported import is_exported, load_policy_folder, show_targets
@@ -29,7 +29,7 @@ from maexp.agents.runtime.shipped import advise, shipped_names
 from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.resolved import model_settings
-from maexp.agents.train import check_action, load_matching
+from maexp.agents.train import check_action
 from maexp.agents.updaters import Meter
 
 LEARNING_RATE = 2e-3
@@ -73,9 +73,7 @@ def load_teacher(cfg: Any, env: Any) -> Any:
     _, saved = find_checkpoint(cfg.warm_start)
     check_action(saved, cfg)
     _check_kind(cfg, model_of(saved).action)
-    policy = make_policy(env, model_of(saved))
-    load_matching(policy, saved["policy"])
-    return policy
+    return restore_policy(env, model_of(saved), saved)
 
 
 def model_of(saved: dict) -> ModelConfig:

@@ -22,7 +22,7 @@ from maexp.agents.build import (
     other_scenarios,
     set_steps,
 )
-from maexp.agents.checkpoint import random_state, save_checkpoint, seed_everything, set_random_state
+from maexp.agents.checkpoint import load_matching, random_state, save_checkpoint, seed_everything, set_random_state
 from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.errors import UserError, blame_input
@@ -54,7 +54,8 @@ def train(run: "TrainingRun") -> None:
     ):
         if run.iteration == 0:
             run.save()
-        while run.iteration < run.iterations and not stop:
+        last = run.iteration >= run.iterations
+        while not last:
             with name_iteration(run):
                 begin = time.perf_counter()
                 batches = experience.next()
@@ -65,7 +66,8 @@ def train(run: "TrainingRun") -> None:
                 row |= run.evaluate_if_due()
                 log.write(run.timed(row, begin))
                 average = run.smooth(row["coverage"])
-                run.keep(row, log, last=bool(stop) or run.iteration == run.iterations)
+                last = bool(stop) or run.iteration == run.iterations  # a signal after this waits: the last one is saved
+                run.keep(row, log, last)
             progress.show(min(run.frames, cfg.total_frames), f"coverage {average:.3f}")
     run.stopped = bool(stop)
 
@@ -318,23 +320,6 @@ def check_action(saved: dict, cfg: Any) -> None:
             f"The checkpoint was trained with planner={trained} and planner={cfg.planner.name} takes another action: "
             f"leave planner={cfg.planner.name} out, or train a policy with it."
         )
-
-
-def load_matching(policy: Any, state: dict) -> None:
-    """Load a policy's weights.
-
-    Raises:
-        UserError: they belong to another network.
-    """
-    own = policy.state_dict()
-    wrong = [name for name in own if name not in state or state[name].shape != own[name].shape]
-    wrong += [name for name in state if name not in own]
-    if wrong:
-        raise UserError(
-            f"The checkpoint holds another network ({len(wrong)} tensors differ, first {wrong[0]}): "
-            "use the model and planner settings it was trained with."
-        )
-    policy.load_state_dict(state)
 
 
 @contextmanager

@@ -281,6 +281,22 @@ def test_ctrl_c_ends_with_a_checkpoint():
     assert "Traceback" not in process.stderr.read()
 
 
+def test_a_signal_after_an_iteration_was_kept_loses_none(monkeypatch):
+    """Ctrl-C between the look at the signals and the end of the iteration: the next one ends the run, and is saved."""
+    shown = []
+
+    def show(self, done, note=""):
+        shown.append(done)
+        if len(shown) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("maexp.agents.train.Progress.show", show)
+    words = [*TINY, "hydra.run.dir=run", "total_frames=600000", "checkpoint_every=100000"]
+    assert main(["train", *words]) == 130
+    rows = [int(row["iteration"]) for row in read_metrics(Path("run/metrics.csv"))]
+    assert find_checkpoint("run")[1]["iteration"] == rows[-1] == 3
+
+
 @pytest.mark.slow
 def test_killed_at_random_moments_and_resumed(tmp_path):
     """kill -9 while the run trains, logs or saves; after each, resume; at the end the bits of one go."""

@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.actor import make_policy
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, lock, training_cell
 from maexp.agents.build import load_maps, make_env, model_settings
-from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
+from maexp.agents.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.commands.run_folder import short
 from maexp.agents.comparison import CHOOSING
 from maexp.agents.errors import UserError, blame_input
@@ -23,7 +22,7 @@ from maexp.agents.files import write_file, write_json
 from maexp.agents.policies import CHOICES, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.results import describe_run
-from maexp.agents.train import TrainingRun, load_matching, train, write_config
+from maexp.agents.train import TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
@@ -125,7 +124,7 @@ def play_suite(
         episodes = min(CHOOSING, cfg.episodes) if suite == VALIDATION else cfg.episodes
         size = min(cfg.num_envs, episodes)
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
-        policy = POLICIES[cell.policy](env) if team is None else load_policy(settings, env, team)
+        policy = POLICIES[cell.policy](env) if team is None else restore_policy(env, model_settings(settings), team)
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:
         with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
@@ -141,13 +140,6 @@ def play_suite(
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
-
-
-def load_policy(settings: Any, env: Any, saved: dict) -> Any:
-    """The policy of a checkpoint, for the teams of `env`."""
-    policy = make_policy(env, model_settings(settings))
-    load_matching(policy, saved["policy"])
-    return policy
 
 
 _ATTRIBUTE = {"held_out": "held_out", "trained": "train", VALIDATION: "validation"}

@@ -8,9 +8,8 @@ from typing import Any
 
 import torch
 
-from maexp.agents.actor import make_policy
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
-from maexp.agents.checkpoint import find_checkpoint
+from maexp.agents.checkpoint import find_checkpoint, restore_policy
 from maexp.agents.checksums import warn_of_changed_maps
 from maexp.agents.commands.run_folder import short
 from maexp.agents.comparison import choose_best, describe_differences
@@ -25,7 +24,7 @@ from maexp.agents.settings.checks import check_counts, check_goals, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.train import check_action, load_matching, write_config
+from maexp.agents.train import check_action, write_config
 
 PICTURES = 4
 
@@ -96,9 +95,7 @@ def load_policy(cfg: Any, env: Any, maps: list) -> Any:
     saved = find_checkpoint(cfg.checkpoint)[1]
     check_action(saved, cfg)
     warn_of_changed_maps(saved, maps)
-    policy = make_policy(env, model_settings(cfg))
-    load_matching(policy, saved["policy"])
-    return policy
+    return restore_policy(env, model_settings(cfg), saved)
 
 
 def open_player(word: str, env: Any) -> Any:
