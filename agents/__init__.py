@@ -3,7 +3,7 @@
 Names are looked up on first use, so that `maexp maps ...` need not wait for TorchRL.
 """
 
-import importlib
+from maexp.envs.lazy import lazy_names
 
 _HOMES = {
     "make_policy": "actor",
@@ -14,8 +14,4 @@ _HOMES = {
 }
 __all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_loss", "make_policy"]
 
-
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module 'maexp.agents' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"maexp.agents.{_HOMES[name]}"), name)
+__getattr__ = lazy_names(__name__, _HOMES)

@@ -3,7 +3,7 @@
 Names are looked up on first use, so that a command line or a robot's computer need not wait for TorchRL and Warp.
 """
 
-import importlib
+from maexp.envs.lazy import lazy_names
 
 _HOMES = {
     "SCENARIOS": "scenarios",
@@ -42,8 +42,4 @@ __all__ = [
     "vector_env",
 ]
 
-
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module 'maexp.envs' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"maexp.envs.{_HOMES[name]}"), name)
+__getattr__ = lazy_names(__name__, _HOMES)

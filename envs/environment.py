@@ -30,14 +30,14 @@ from maexp.envs.config import (
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.scenarios import default_macro_steps, find_scenario
 from maexp.envs.simulation import build_simulation, check_memory
+from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
 from maexp.envs.starts import check_room, check_starts, fixed_starts
 from maexp.envs.target_view import TargetView
-from maexp.kernels import unpack_flags
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.state import STATE
-from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, PIXELS, REGIONS
+from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, REGIONS
 
 LATER = {"starts": math.inf, "covered_sum": 0}
 """State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
@@ -364,49 +364,7 @@ class ExplorationEnv(EnvBase):
 
     def snapshot(self, index: int = 0) -> dict:
         """What env ``index`` looks like now, as NumPy arrays, points in the order of its map (for drawing)."""
-        s = self.simulation.tensors
-        m = int(s["map_id"][index])
-        step = int(s["local_step"][index])
-        place = self.maps[m]
-
-        def flags(name: str, order: np.ndarray) -> np.ndarray:
-            count = len(order)
-            sorted_flags = unpack_flags(s[name][index : index + 1, :, :count], self.num_robots)[0].cpu().numpy()
-            result = np.empty_like(sorted_flags)
-            result[:, order] = sorted_flags
-            return result
-
-        visible = np.zeros((self.num_robots, len(place.free)), dtype=bool)
-        for i in range(self.num_robots):
-            listed = s["visible"][index, i, : int(s["visible_count"][index, i])].cpu().numpy()
-            visible[i, self.bank.order_free[m][listed]] = True
-        total = int(self.simulation.map_tensors["total_weight"][m])
-        return {
-            "map": place,
-            "pose": s["pose"][index].cpu().numpy().copy(),
-            "center": s["center"][index, :, :2].cpu().numpy().copy(),
-            "body": np.array([[r.length, r.width] for r in self.robot_configs], dtype=np.float32),
-            "goal": s["goal"][index].cpu().numpy().copy(),
-            "target": s["target"][index].cpu().numpy().copy(),
-            "radar_range": np.array([r.range for r in self.radar_configs], dtype=np.float32),
-            "seen_free": flags("seen_free", self.bank.order_free[m]),
-            "seen_boundary": flags("seen_boundary", self.bank.order_boundary[m]),
-            "visible": visible,
-            "coverage": int(s["covered"][index]) / total,
-            "local_step": step,
-            "collided": (s["collided"][index] != 0).cpu().numpy(),
-            "trail": self._trail(index, m, step),
-        }
-
-    def _trail(self, index: int, m: int, step: int) -> np.ndarray:
-        """Past centres of the robots at the picture's resolution, oldest first, [T, N, 2] [m]."""
-        track = self.simulation.tensors["track"][index].cpu().numpy()
-        depth = track.shape[1]
-        pixels = track[:, np.arange(max(0, step - depth + 1), step + 1) % depth].T
-        origin = self.bank.arrays["frame_origin"][m]
-        size = self.bank.arrays["pixel_size"][m]
-        side = PIXELS
-        return origin + size * np.stack([pixels // side, pixels % side], axis=-1)
+        return take_snapshot(self, index)
 
     def render(self, index: int | Sequence[int] = 0, size: int = 512, mode: str = "rgb_array") -> np.ndarray:
         """A picture of env ``index``, or of several side by side: uint8 [height, width, 3], ``size`` wide each.

@@ -1,11 +1,10 @@
-"""The benchmark: its cells, its table, what a kill leaves, and the paper's numbers against the paper."""
+"""The benchmark: its cells, its table, what a kill leaves."""
 
 import contextlib
 import csv
 import fcntl
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -17,12 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
-from scipy.stats import mannwhitneyu
 
 from maexp.agents.benchmark.cell import CellResult, read_result
-from maexp.agents.benchmark.compare import compare_all, improvement, win_shares
 from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
-from maexp.agents.benchmark.paper_results import COLUMNS, PAPER
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, compose_settings, list_cells
 from maexp.agents.benchmark.pool import WorkerPool
 from maexp.agents.benchmark.table import (
@@ -431,111 +427,3 @@ def test_planners_play_validation_maps_and_the_report_says_who_is_best(whole):
 def test_what_knows_the_map_is_never_the_best():
     columns = [column("oracle", exploration_ratio=[0.99, 0.99]), column("ippo"), column("random")]
     assert best_columns(columns, ER) == {"ippo", "random"}
-
-
-# Who is better than whom
-
-
-def test_probability_of_improvement_is_mann_whitneys():
-    rng = np.random.default_rng(0)
-    x = {"a": rng.integers(0, 9, 40).astype(float), "b": rng.normal(size=30)}
-    y = {"a": rng.integers(0, 9, 30).astype(float), "b": rng.normal(size=50) - 1, "only": rng.normal(size=3)}
-    wanted = np.mean([mannwhitneyu(x[s], y[s]).statistic / (len(x[s]) * len(y[s])) for s in "ab"])
-    found = improvement(x, y)
-    assert found["mean"] == pytest.approx(wanted) and found["n"] == 2
-    assert found["ci95"][0] < wanted < found["ci95"][1]
-    turned = compare_all({"x": x, "y": y})["y", "x"]
-    assert turned["mean"] == pytest.approx(1 - wanted) and turned["ci95"][0] < turned["mean"] < turned["ci95"][1]
-
-
-def test_weights_of_a_resample_are_repetitions():
-    x, y = np.array([1.0, 2.0, 5.0]), np.array([2.0, 3.0])
-    share = win_shares(x, y, np.array([[2.0, 0.0, 1.0]]), np.array([[1.0, 3.0]]))[0]
-    drawn = [(a > b) + 0.5 * (a == b) for a in (1, 1, 5) for b in (2, 3, 3, 3)]
-    assert share == pytest.approx(np.mean(drawn))
-
-
-# The paper
-
-
-def paper_tex() -> str:
-    default = Path(__file__).resolve().parents[2] / "shared" / "paper" / "maexp.tex"
-    path = Path(os.environ.get("MAEXP_PAPER", default))
-    if not path.is_file():
-        pytest.skip(f"PAPER ABSENT: no {path}; set MAEXP_PAPER to the paper's LaTeX")
-    return path.read_text()
-
-
-SCENARIOS = ("random_obstacles", "maze", "indoor_small", "indoor_medium", "indoor_large", "outdoor")
-
-
-def printed_table() -> tuple[dict, dict]:
-    """(values, bold) of Table II as the .tex prints it: (scenario, algorithm, column) -> (mean, std) or None."""
-    values, bold = {}, {}
-    table = re.search(r"Performance results of six MARL.*?\\end\{tabular\}", paper_tex(), re.DOTALL)[0]
-    seen: dict[str, int] = {}
-    for row in re.split(r"\\\\", table):
-        found = re.search(r"&\s*(ITRPO|IPPO|MATRPO|MAPPO|VDPPO|VDA2C)\s*&(.*)", row, re.DOTALL)
-        if not found:
-            continue
-        name, block = found[1].lower(), seen.get(found[1], 0)
-        seen[found[1]] = block + 1
-        cells = found[2].split("&")
-        assert len(cells) == 18
-        for k, cell in enumerate(cells):
-            key = SCENARIOS[k // 3], name, COLUMNS[3 * block + k % 3]
-            numbers = [float(one) for one in re.findall(r"\d+(?:\.\d+)?", cell.replace("textbf", ""))]
-            values[key] = tuple(numbers) if numbers else None
-            bold[key] = "textbf" in cell
-    return values, bold
-
-
-def test_the_papers_numbers_are_the_papers():
-    values, _ = printed_table()
-    ours = {}
-    for scenario, rows in PAPER.items():
-        for name, row in rows.items():
-            ours |= {(scenario, name, metric): one for metric, one in zip(COLUMNS, row, strict=True)}
-    assert len(ours) == 6 * 6 * 6 and ours == values
-
-
-def paper_best(scenario: str, metric: str) -> set[str]:
-    k, better = COLUMNS.index(metric), 1 if metric == "exploration_ratio" else -1
-    means = {name: better * row[k][0] for name, row in PAPER[scenario].items() if row[k] is not None}
-    return {name for name, mean in means.items() if mean == max(means.values(), default=0)}
-
-
-def paper_page() -> str:
-    return (Path(__file__).resolve().parents[1] / "docs" / "paper.md").read_text()
-
-
-def test_the_slips_that_the_page_lists_are_the_papers_bold_against_its_numbers():
-    _, bold = printed_table()
-    wrong = set()
-    for scenario in SCENARIOS:
-        for metric in COLUMNS:
-            marked = {name for name in PAPER[scenario] if bold[scenario, name, metric]}
-            if marked != paper_best(scenario, metric):
-                wrong.add((scenario, metric))
-    page = paper_page()
-    slips = page[page.index("## Slips") :]
-    rows = re.findall(r"^\| ((?:maze|indoor|random)[^,|]*), ([^|]*) \|", slips, re.MULTILINE)
-    short = dict(zip(("ER", "85 % CS", "95 % CS", "85 % MO", "95 % MO", "RV"), COLUMNS, strict=True))
-    assert {(place.replace(" ", "_"), short[metric]) for place, metric in rows} == wrong
-
-
-def test_the_pages_tables_are_the_papers_numbers_with_computed_bold():
-    page = paper_page()
-    blocks = re.findall(r"^\| \| random.*?\n\n|^\| \| maze.*?\n\n", page, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == len(COLUMNS)
-    for metric, block in zip(COLUMNS, blocks, strict=True):
-        head, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in block.strip().splitlines()]
-        places = [name.replace(" ", "_") for name in head[1:]]
-        have = [one for one in SCENARIOS if any(row[COLUMNS.index(metric)] for row in PAPER[one].values())]
-        assert places == have and len(rows) == 6
-        for name, *cells in rows:
-            for place, cell in zip(places, cells, strict=True):
-                value = PAPER[place][name.lower()][COLUMNS.index(metric)]
-                assert (cell.startswith("**")) == (name.lower() in paper_best(place, metric)), (metric, place, name)
-                found = tuple(float(one) for one in re.findall(r"[\d.]+", cell)) or None
-                assert found == value, (metric, place, name)

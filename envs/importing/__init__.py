@@ -3,7 +3,7 @@
 Names are looked up on first use: the settings alone need neither torch nor Warp.
 """
 
-import importlib
+from maexp.envs.lazy import lazy_names
 
 _HOMES = {
     "ImportOptions": "options",
@@ -24,8 +24,4 @@ __all__ = [
     "import_map_with_report",
 ]
 
-
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module 'maexp.envs.importing' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"maexp.envs.importing.{_HOMES[name]}"), name)
+__getattr__ = lazy_names(__name__, _HOMES)
