@@ -133,7 +133,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
 
 
 def _occluders(m: PointCloudMap, radars: list[RadarConfig]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points that mask and their radii. Where the radius closes the gaps, the boundary suffices (design 4.1)."""
+    """Points that mask and their radii. Where the radius closes the gaps, the boundary suffices."""
     settings = {r.obstacle_radius for r in radars}
     if len(settings) > 1:
         raise ValueError("radar.obstacle_radius must be the same for all robots of a team: it belongs to the map")

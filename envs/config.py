@@ -31,7 +31,7 @@ class RobotConfig:
 
 @dataclass(frozen=True)
 class RadarConfig:
-    """A robot's range sensor (design 4.1). ``obstacle_radius`` "auto" is each obstacle's spacing / sqrt(2)."""
+    """A robot's range sensor. ``obstacle_radius`` "auto" is each obstacle's spacing / sqrt(2)."""
 
     range: float | None = None
     fov: float = 2.0 * math.pi
@@ -42,7 +42,7 @@ class RadarConfig:
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """How a robot drives to its goal (design 4.4)."""
+    """How a robot drives to its goal (docs/planners.md)."""
 
     name: Literal["dwa", "wavefront", "direct"] = "wavefront"
     num_accel: int = 3

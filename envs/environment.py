@@ -1,7 +1,6 @@
-"""The TorchRL env: a batch of teams that explore point-cloud maps (design 2)."""
+"""The TorchRL env: a batch of teams that explore point-cloud maps."""
 
 import math
-import os
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,17 +17,9 @@ from maexp.envs.config import (
     RadarConfig,
     RewardConfig,
     RobotConfig,
-    check_comm,
-    check_observation,
-    check_reward,
-    complete_planner,
-    complete_radar,
-    complete_robot,
-    one_config,
-    per_robot,
 )
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.scenarios import default_macro_steps, find_scenario
+from maexp.envs.settings import complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
@@ -41,6 +32,11 @@ from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERROR
 
 LATER = {"starts": math.inf, "covered_sum": 0}
 """State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
+
+
+def _setting(name: str, meaning: str) -> property:
+    """A read-only attribute of the env: a field of its `EnvSettings`."""
+    return property(lambda env: getattr(env.settings, name), doc=meaning)
 
 
 class ExplorationEnv(EnvBase):
@@ -72,6 +68,20 @@ class ExplorationEnv(EnvBase):
 
     batch_locked = True
 
+    scenario = _setting("scenario", "Row of the table of scenarios that filled in what was not given.")
+    num_envs = _setting("num_envs", "Teams in the batch, E.")
+    num_robots = _setting("num_robots", "Robots in a team, N.")
+    local_steps = _setting("local_steps", "Control steps of 0.1 s in a macro step.")
+    macro_steps = _setting("macro_steps", "Macro steps of an episode.")
+    collision = _setting("collision", '"centre" or "footprint".')
+    success_coverage = _setting("success_coverage", "Coverage that ends an episode.")
+    robot_configs = _setting("robots", "One `RobotConfig` per robot.")
+    radar_configs = _setting("radars", "One `RadarConfig` per robot.")
+    planner_config = _setting("planner", "The `PlannerConfig`.")
+    reward_config = _setting("reward", "The `RewardConfig`.")
+    observation_config = _setting("observation", "The `ObservationConfig`.")
+    comm_config = _setting("comm", "The `CommConfig`.")
+
     def __init__(
         self,
         maps: PointCloudMap | Sequence[PointCloudMap],
@@ -95,50 +105,19 @@ class ExplorationEnv(EnvBase):
         starts: str | np.ndarray | torch.Tensor = "drawn",
     ):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
-        if not maps:
-            raise ValueError("maps=[] is empty: give at least one map")
-        num_envs, num_robots = _count("num_envs", num_envs), _count("num_robots", num_robots)
+        settings = complete_settings(
+            maps, num_envs, num_robots, device, seed, robot=robot, radar=radar, planner=planner, reward=reward,
+            observation=observation, comm=comm, local_steps=local_steps, macro_steps=macro_steps, collision=collision,
+            success_coverage=success_coverage, num_threads=num_threads, first_env=first_env,
+        )  # fmt: skip
+        super().__init__(device=settings.device, batch_size=torch.Size([settings.num_envs]))
+        self.settings = settings
         for m in maps:
-            if not isinstance(m, PointCloudMap):
-                raise ValueError(f"maps holds {m!r}: give PointCloudMaps, from make_map or import_map")
-        if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
-            raise ValueError(f"seed={seed!r} must be a whole number")
-        if isinstance(first_env, bool) or not isinstance(first_env, int | np.integer) or first_env < 0:
-            raise ValueError(f"first_env={first_env!r} must be a whole number, 0 or more")
-        fewest = min(maps, key=lambda m: len(m.free))
-        if num_robots > len(fewest.free):
-            raise MapError(
-                f"map {fewest.name} has {len(fewest.free)} free points and no room for num_robots={num_robots}: "
-                "use fewer robots or a larger map"
-            )
-        scenario = find_scenario(maps[0].scenario)
-        super().__init__(device=_device(device), batch_size=torch.Size([num_envs]))
-        self.num_envs, self.num_robots = num_envs, num_robots
-        self.scenario = scenario
-        self.local_steps = _count("local_steps", scenario.local_steps if local_steps is None else local_steps)
-        if macro_steps is None:
-            macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario)
-        self.macro_steps = _count("macro_steps", macro_steps)
-        if collision not in ("centre", "footprint"):
-            raise ValueError(f"collision={collision!r} is unknown: choose centre or footprint")
-        if not 0.0 < success_coverage <= 1.0:
-            raise ValueError(f"success_coverage={success_coverage} must lie in (0, 1]")
-        self.collision, self.success_coverage = collision, float(success_coverage)
-        self.robot_configs = [complete_robot(r, scenario) for r in per_robot("robot", robot, RobotConfig, num_robots)]
-        self.radar_configs = [complete_radar(r, scenario) for r in per_robot("radar", radar, RadarConfig, num_robots)]
-        self.planner_config = complete_planner(one_config("planner", planner, PlannerConfig), scenario)
-        self.reward_config = check_reward(one_config("reward", reward, RewardConfig))
-        self.observation_config = one_config("observation", observation, ObservationConfig)
-        check_observation(self.observation_config, self.planner_config)
-        self.comm_config = check_comm(one_config("comm", comm, CommConfig))
-        for m in maps:
-            check_room(m, [r.collision_threshold for r in self.robot_configs])
-        self.bank = build_bank(maps, self.radar_configs)
+            check_room(m, [r.collision_threshold for r in settings.robots])
+        self.bank = build_bank(maps, settings.radars)
         self.maps = self.bank.maps
-        check_memory(self)
-        threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
-        self.simulation = build_simulation(self, seed, threads if self.device.type == "cpu" else 1)
-        self.simulation.tensors["env_id"] += int(first_env)
+        check_memory(settings, self.bank)
+        self.simulation = build_simulation(settings, self.bank)
         self._hook: tuple[Callable, int] | None = None
         self._fixed = isinstance(starts, str) and starts == "fixed"
         self._fix_starts()
@@ -146,15 +125,13 @@ class ExplorationEnv(EnvBase):
             self.set_starts(starts)
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
-        targets = self.observation_config.targets
+        targets = settings.observation.targets
         self.target_view = TargetView(self, targets) if targets else None
-        direct = self.planner_config.name == "direct"
-        self.observation_spec = observation_spec(
-            num_envs, num_robots, self.device, self.observation_config.pictures, targets
-        )
-        self.action_spec = action_spec(num_envs, num_robots, direct, self.device)
-        self.reward_spec = reward_spec(num_envs, num_robots, self.device)
-        self.done_spec = done_spec(num_envs, self.device)
+        e, n = settings.num_envs, settings.num_robots
+        self.observation_spec = observation_spec(e, n, self.device, settings.observation.pictures, targets)
+        self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device)
+        self.reward_spec = reward_spec(e, n, self.device)
+        self.done_spec = done_spec(e, self.device)
 
     # Reset and step
 
@@ -264,7 +241,7 @@ class ExplorationEnv(EnvBase):
     def _info(self) -> dict[str, torch.Tensor]:
         s = self.simulation.tensors
         total = self.simulation.map_tensors["total_weight"][s["map_id"].long()]
-        length = self.local_steps * self.macro_steps
+        length = self.settings.episode_steps
         area = s["covered_sum"] + (length - s["local_step"]) * s["covered"].long()
         info = {
             "coverage": (s["covered"] / total).unsqueeze(-1),
@@ -360,7 +337,7 @@ class ExplorationEnv(EnvBase):
 
     def set_step_hook(self, hook: Callable[["ExplorationEnv"], None] | None, every: int = 1) -> None:
         """Call ``hook(env)`` after every reset and every ``every``-th local step; None stops that."""
-        self._hook = None if hook is None else (hook, _count("every", every))
+        self._hook = None if hook is None else (hook, positive_count("every", every))
 
     def snapshot(self, index: int = 0) -> dict:
         """What env ``index`` looks like now, as NumPy arrays, points in the order of its map (for drawing)."""
@@ -388,23 +365,3 @@ def blank(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
     if device.type == "cpu":
         return torch.from_numpy(np.zeros(shape, dtype=np.uint8))
     return torch.zeros(shape, dtype=torch.uint8, device=device)
-
-
-def _device(device) -> torch.device:
-    """The device, if there is one of that name."""
-    try:
-        found = torch.device(device)
-    except (RuntimeError, TypeError):
-        found = None
-    if found is None or found.type not in ("cpu", "cuda"):
-        raise ValueError(f"device={str(device)!r} is unknown: choose cpu or cuda")
-    count = torch.cuda.device_count()
-    if found.type == "cuda" and (found.index or 0) >= count:
-        raise ValueError(f"device={str(device)!r} is not there: torch sees {count} CUDA devices; choose device=cpu")
-    return found
-
-
-def _count(name: str, value) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name}={value!r} must be a whole number, 1 or more")
-    return int(value)

@@ -39,7 +39,7 @@ class PointCloudMap:
         name: what tables and file names call the map.
         scenario: whose parameters (robot, radar, steps) fit the map; "pointcloud" for imports.
         boundary: obstacle points that touch free space [m], shape [boundary_count, 3]; default: the obstacle
-            points within 1.5 spacings of a free point (design 4.1).
+            points within 1.5 spacings of a free point.
         free_spacing, obstacle_spacing: spacing around each point [m], shape [count]; default: `resolution`.
         free_height, obstacle_height: heights of the scan [m], shape [count], for drawing; optional.
 

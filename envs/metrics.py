@@ -1,4 +1,4 @@
-"""Metrics of finished episodes and their summary (design 4.6; paper, section III-C)."""
+"""Metrics of finished episodes and their summary (docs/concepts.md, Metrics; paper, section III-C)."""
 
 from functools import lru_cache
 

@@ -190,7 +190,7 @@ def count_room(starts: np.ndarray, distance: float, limit: int = ROOM_LIMIT) -> 
 def visible_free(world: PointCloudMap, places: np.ndarray, radar_range: float) -> np.ndarray:
     """Which free points a radar of `radar_range` [m] sees from at least one of `places` [m]; bool [free_count].
 
-    The criterion of design 4.1 with obstacle radius = spacing / sqrt(2). Looks from places spread over the map,
+    The radar's criterion with obstacle radius = spacing / sqrt(2). Looks from places spread over the map,
     then, for the points still unseen, from places around them: a lower bound that is tight in practice.
     """
     seen = np.zeros(len(world.free), dtype=bool)

@@ -5,8 +5,10 @@ import os
 
 import torch
 
+from maexp.envs.bank import MapBank
 from maexp.envs.config import TIME_ON
 from maexp.envs.nav_grid import bank_nav_grids, grid_shape
+from maexp.envs.settings import EnvSettings
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
@@ -23,26 +25,28 @@ TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""
 
 
-def build_simulation(env, seed: int, num_threads: int) -> Simulation:
-    """The simulation of an `ExplorationEnv` whose settings are complete."""
-    return Simulation(
-        maps=env.bank.tensors(env.device),
-        num_maps=len(env.maps),
-        robots=robot_tensors(env),
-        weights=reward_weights(env),
-        settings=step_settings(env),
-        sizes=sizes(env),
-        device=env.device,
-        seed=seed,
-        num_shards=num_threads,
-        nav=bank_nav_grids(env.bank, env.device) if env.planner_config.name == "wavefront" else None,
+def build_simulation(settings: EnvSettings, bank: MapBank) -> Simulation:
+    """The simulation of an env with these settings on these maps."""
+    simulation = Simulation(
+        maps=bank.tensors(settings.device),
+        num_maps=len(bank.maps),
+        robots=robot_tensors(settings),
+        weights=reward_weights(settings),
+        settings=step_settings(settings),
+        sizes=sizes(settings, bank),
+        device=settings.device,
+        seed=settings.seed,
+        num_shards=settings.num_threads,
+        nav=bank_nav_grids(bank, settings.device) if settings.planner.name == "wavefront" else None,
     )
+    simulation.tensors["env_id"] += settings.first_env
+    return simulation
 
 
-def robot_tensors(env) -> dict[str, torch.Tensor]:
+def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
     """Parameters of every robot, [E, N] each (fields of `kernels.types.Robots`)."""
-    robots, radars = env.robot_configs, env.radar_configs
-    factor = env.planner_config.clearance_factor
+    robots, radars = settings.robots, settings.radars
+    factor = settings.planner.clearance_factor
     columns = {
         "kind": [KINDS[r.kind] for r in robots],
         "length": [r.length for r in robots],
@@ -62,27 +66,27 @@ def robot_tensors(env) -> dict[str, torch.Tensor]:
     result = {}
     for name, values in columns.items():
         kind = torch.int32 if name == "kind" else torch.float32
-        row = torch.tensor(values, dtype=kind, device=env.device)
-        result[name] = row.expand(env.num_envs, -1).contiguous()
+        row = torch.tensor(values, dtype=kind, device=settings.device)
+        result[name] = row.expand(settings.num_envs, -1).contiguous()
     return result
 
 
-def reward_weights(env) -> RewardWeights:
+def reward_weights(settings: EnvSettings) -> RewardWeights:
     """The reward's coefficients as the kernels read them."""
-    cfg = env.reward_config
+    reward = settings.reward
     weights = RewardWeights()
     for name in ("explore", "overlap", "time", "unfinished", "success", "collision", "points", "events"):
-        setattr(weights, name, float(getattr(cfg, name)))
-    weights.time_on = TIME_ON.index(cfg.time_on)
-    weights.success_coverage = env.success_coverage
-    weights.length = env.local_steps * env.macro_steps
-    weights.charge_rest = int(cfg.charge_rest)
+        setattr(weights, name, float(getattr(reward, name)))
+    weights.time_on = TIME_ON.index(reward.time_on)
+    weights.success_coverage = settings.success_coverage
+    weights.length = settings.episode_steps
+    weights.charge_rest = int(reward.charge_rest)
     return weights
 
 
-def step_settings(env) -> Settings:
+def step_settings(settings: EnvSettings) -> Settings:
     """What a local step does."""
-    planner, comm = env.planner_config, env.comm_config
+    planner, comm = settings.planner, settings.comm
     return Settings(
         planner=planner.name,
         num_accel=planner.num_accel,
@@ -90,34 +94,33 @@ def step_settings(env) -> Settings:
         horizon=planner.horizon,
         clearance_weight=planner.clearance_weight,
         replan_steps=planner.replan_steps,
-        footprint=env.collision == "footprint",
+        footprint=settings.collision == "footprint",
         limited=comm.limited,
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
-        draw_known=env.observation_config.map == "known",
-        success_coverage=env.success_coverage,
+        draw_known=settings.observation.map == "known",
+        success_coverage=settings.success_coverage,
     )
 
 
-def sizes(env) -> dict[str, int]:
+def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     """Lengths of the axes of state and scratch."""
-    finest = min(m.resolution for m in env.maps)
-    pixel = float(env.bank.arrays["pixel_size"].min())
+    finest = min(m.resolution for m in bank.maps)
+    pixel = float(bank.arrays["pixel_size"].min())
     outline = sum(
-        2 * (max(2, math.ceil(r.length / finest)) + max(2, math.ceil(r.width / finest))) + 4
-        for r in env.robot_configs
+        2 * (max(2, math.ceil(r.length / finest)) + max(2, math.ceil(r.width / finest))) + 4 for r in settings.robots
     )
     return axis_sizes(
-        env.num_envs,
-        env.num_robots,
-        free=env.bank.max_free,
-        boundary=env.bank.max_boundary,
-        visible=env.bank.free_in_range,
-        occluders=env.bank.occluders_in_range + (outline if env.num_robots > 1 else 0),
-        nearby=env.bank.boundary_in_range,
-        track=min(env.local_steps * env.macro_steps + 1, TRACK_LENGTH),
-        limited=env.comm_config.limited,
-        body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in env.robot_configs),
+        settings.num_envs,
+        settings.num_robots,
+        free=bank.max_free,
+        boundary=bank.max_boundary,
+        visible=bank.free_in_range,
+        occluders=bank.occluders_in_range + (outline if settings.num_robots > 1 else 0),
+        nearby=bank.boundary_in_range,
+        track=min(settings.episode_steps + 1, TRACK_LENGTH),
+        limited=settings.comm.limited,
+        body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robots),
     )
 
 
@@ -129,32 +132,32 @@ def body_pixels(length: float, width: float) -> int:
     return min(math.ceil(length * width + length + width + 3.0), PIXELS**2 + 1)
 
 
-def bytes_per_env(env) -> int:
+def bytes_per_env(settings: EnvSettings, bank: MapBank) -> int:
     """What one env of the simulation takes on its device: state, scratch, and the grids of the `wavefront` planner."""
-    total = sum(memory_per_env(sizes(env)).values())
-    if env.planner_config.name == "wavefront":
-        limited, robots = env.comm_config.limited, env.num_robots
-        shapes = [grid_shape(one) for one in env.maps]
+    total = sum(memory_per_env(sizes(settings, bank)).values())
+    if settings.planner.name == "wavefront":
+        limited, robots = settings.comm.limited, settings.num_robots
+        shapes = [grid_shape(one) for one in bank.maps]
         cells = max(width * height for width, height in shapes)
-        masks = robots if limited else len({one.collision_threshold for one in env.robot_configs})
+        masks = robots if limited else len({one.collision_threshold for one in settings.robots})
         total += grid_memory_per_env(
-            cells, robots, robots if limited else 1, masks, env.bank.max_free + env.bank.max_boundary,
+            cells, robots, robots if limited else 1, masks, bank.max_free + bank.max_boundary,
             max(-(-width // 32) * height for width, height in shapes), news_capacity(cells),
         )  # fmt: skip
     return total
 
 
-def check_memory(env) -> None:
+def check_memory(settings: EnvSettings, bank: MapBank) -> None:
     """Refuse a batch that the device cannot hold, before anything is allocated.
 
     Raises:
         ValueError: says how much is needed and free, and what to lower.
     """
     # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
-    channels = (PICTURE_CHANNELS * env.num_robots + TEAM_CHANNELS) * env.observation_config.pictures
-    per_env = bytes_per_env(env) + 4 * channels * PIXELS**2
-    if env.device.type == "cuda":
-        free = torch.cuda.mem_get_info(env.device)[0]
+    channels = (PICTURE_CHANNELS * settings.num_robots + TEAM_CHANNELS) * settings.observation.pictures
+    per_env = bytes_per_env(settings, bank) + 4 * channels * PIXELS**2
+    if settings.device.type == "cuda":
+        free = torch.cuda.mem_get_info(settings.device)[0]
     else:
         free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         if os.path.exists("/proc/meminfo"):  # pages the kernel would give back count as available
@@ -162,10 +165,10 @@ def check_memory(env) -> None:
                 for line in file:
                     if line.startswith("MemAvailable:"):
                         free = int(line.split()[1]) * 1024
-    if per_env * env.num_envs > free:
+    if per_env * settings.num_envs > free:
         most = int(free / per_env)
         lower = f"lower num_envs to {most}" if most else "lower num_robots or use a smaller map"
         raise ValueError(
-            f"num_envs={env.num_envs} needs {per_env * env.num_envs / 2**30:.1f} GiB "
-            f"({per_env / 2**20:.1f} MiB per env) and {env.device} has {free / 2**30:.1f} GiB free: {lower}"
+            f"num_envs={settings.num_envs} needs {per_env * settings.num_envs / 2**30:.1f} GiB "
+            f"({per_env / 2**20:.1f} MiB per env) and {settings.device} has {free / 2**30:.1f} GiB free: {lower}"
         )

@@ -1,4 +1,4 @@
-"""Shapes, types and bounds of what enters and leaves the env (design 2)."""
+"""Shapes, types and bounds of what enters and leaves the env (docs/concepts.md, Keys of the tensordict)."""
 
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded

@@ -1,4 +1,4 @@
-"""The radar filter as one dense PyTorch expression, from its definition (design 4.1), and how much slower it is.
+"""The radar filter as one dense PyTorch expression, from its definition, and how much slower it is.
 
 `python tests/dense_radar.py` prints the ratio that `test_bench_radar` compares with its record.
 """

@@ -1,4 +1,4 @@
-"""ExplorationEnv: the contract of design 2."""
+"""ExplorationEnv: the contract of docs/concepts.md."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Map merging against the oracle, and its laws (design 4.2)."""
+"""Map merging against the oracle, and its laws."""
 
 import numpy as np
 import pytest

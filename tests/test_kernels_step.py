@@ -295,7 +295,7 @@ def test_what_robots_know_travels_one_hop_a_step(episode):
 
 
 def test_pictures():
-    """The picture of the design from the flags, the poses and the past (design 4.2)."""
+    """The picture of the design from the flags, the poses and the past."""
     env = ExplorationEnv(
         [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)], 2, 4, seed=8, robot=robots(), radar=radars(),
         planner=PlannerConfig(name="direct"), local_steps=1, macro_steps=100,

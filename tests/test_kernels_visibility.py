@@ -1,4 +1,4 @@
-"""The radar kernel against the float64 oracle, and what must hold for any cloud (design 4.1)."""
+"""The radar kernel against the float64 oracle, and what must hold for any cloud."""
 
 import math
 

@@ -26,7 +26,7 @@ def test_memory_is_counted_before_it_is_taken(limited):
     taken = sum(tensor.nbytes for tensor in env.simulation.tensors.values())
     for block in env.simulation.blocks:
         taken += sum(grid.capacity for grid in arrays_of(block.wavefront))
-    assert bytes_per_env(env) * 6 == pytest.approx(taken, rel=0.02)
+    assert bytes_per_env(env.settings, env.bank) * 6 == pytest.approx(taken, rel=0.02)
 
 
 def arrays_of(*owners) -> list[wp.array]:

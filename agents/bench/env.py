@@ -132,7 +132,7 @@ class Batch:
             "laps": len(self.rates),
             "seconds": self.seconds,
             "first_step_seconds": self.first,
-            "memory_per_env": bytes_per_env(env),
+            "memory_per_env": bytes_per_env(env.settings, env.bank),
             "collided_at_end": env.simulation.tensors["collided"].float().mean().item(),
         }
 

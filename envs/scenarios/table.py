@@ -1,4 +1,4 @@
-"""The table of scenarios: sizes, robots, radars and episode lengths that belong together (design 5)."""
+"""The table of scenarios: sizes, robots, radars and episode lengths that belong together."""
 
 import math
 from collections.abc import Callable

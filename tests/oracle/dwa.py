@@ -1,4 +1,4 @@
-"""Dynamic window approach (design 4.4): score every candidate control a few steps ahead, take the best."""
+"""Dynamic window approach (docs/planners.md): score every candidate control a few steps ahead, take the best."""
 
 import math
 

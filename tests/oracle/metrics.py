@@ -1,4 +1,4 @@
-"""Metrics of an episode and of many (design 4.6), from the values after every local step."""
+"""Metrics of an episode and of many (docs/concepts.md, Metrics), from the values after every local step."""
 
 import math
 

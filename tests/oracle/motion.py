@@ -1,4 +1,4 @@
-"""Robots and motion (design 4.3): state (x, y, v, theta) at the rear, explicit Euler, footprint, collision."""
+"""Robots and motion: state (x, y, v, theta) at the rear, explicit Euler, footprint, collision."""
 
 import math
 
@@ -133,7 +133,7 @@ def body_to_body(state_a, size_a, state_b, size_b) -> float:
 
 
 def collided(states, lengths, widths, thresholds, boundary, *, mode: str = "centre"):
-    """`(hit, margin)` (N,): collides now (design 4.3); how far from undecided at least [m].
+    """`(hit, margin)` (N,): collides now; how far from undecided at least [m].
 
     states: of the rear points. centre: the body's centre nearer than the robot's threshold to a boundary point
     or another centre. footprint: the rectangle meets a boundary point or another rectangle, or, with a threshold

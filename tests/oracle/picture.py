@@ -1,4 +1,4 @@
-"""The picture of a map (design 4.2): 125 x 125 pixels over a square frame around the extent."""
+"""The picture of a map: 125 x 125 pixels over a square frame around the extent."""
 
 import math
 

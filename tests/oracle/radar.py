@@ -1,4 +1,4 @@
-"""Ray-masked point filtering (design 4.1): which points of a cloud a radar sees from where it stands.
+"""Ray-masked point filtering (docs/paper.md, masking): which points of a cloud a radar sees from where it stands.
 
 Every verdict is given with its certainty: `visible` is the definition in float64, `clear` is False where a
 threshold lies within `tolerance` of the compared value, so that float32 may fall on either side of it.

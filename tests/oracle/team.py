@@ -1,4 +1,4 @@
-"""Maps of the robots and of the team (design 4.2), reward and end of an episode (4.5), by counting."""
+"""Maps of the robots and of the team, reward and end of an episode (docs/concepts.md), by counting."""
 
 import math
 
@@ -86,7 +86,7 @@ def reward_terms(
     unfinished: float = 0.0,
     gained_for: int | None = None,
 ) -> dict[str, np.ndarray]:
-    """The terms of one local step, each (N,), signed and weighted as they enter the reward (design 4.5).
+    """The terms of one local step, each (N,), signed and weighted as they enter the reward (docs/concepts.md, Reward).
 
     succeeded: coverage reached its threshold in this very step; collided_now: bool (N,), in this step;
     charged: steps left that are charged too, at `coverage_now` (`steps_charged`); unfinished: weight of the time
