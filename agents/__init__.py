@@ -6,11 +6,11 @@ Names are looked up on first use, so that `maexp maps ...` need not wait for Tor
 from maexp.envs.lazy import lazy_names
 
 _HOMES = {
-    "make_policy": "actor",
-    "make_critic": "algorithms",
-    "make_loss": "algorithms",
-    "ALGORITHMS": "algorithms",
-    "ModelConfig": "model",
+    "make_policy": "networks.actor",
+    "make_critic": "algorithms.table",
+    "make_loss": "algorithms.table",
+    "ALGORITHMS": "algorithms.table",
+    "ModelConfig": "settings.model",
 }
 __all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_loss", "make_policy"]
 

@@ -9,15 +9,15 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
-from maexp.agents.actor import make_policy
-from maexp.agents.algorithms import find_algorithm
+from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
+from maexp.agents.networks.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
 from maexp.agents.settings.schema import SUPPLIED, given
-from maexp.agents.updaters import Updater
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,

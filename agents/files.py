@@ -30,6 +30,12 @@ def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
         fill(file)
 
 
+def short(path: Path) -> str:
+    """The path as one would type it here."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+
+
 def _without_nan(value: Any) -> Any:
     """JSON has no NaN: null instead."""
     if isinstance(value, dict):

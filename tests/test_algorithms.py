@@ -9,9 +9,9 @@ from torchrl.collectors import Collector
 from toy_env import ToyEnv
 
 from maexp.agents import ALGORITHMS, make_critic, make_loss, make_policy
-from maexp.agents.algorithms import find_algorithm
-from maexp.agents.losses import NonFiniteLoss
-from maexp.agents.model import ModelConfig
+from maexp.agents.algorithms.losses import NonFiniteLoss
+from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.settings.model import ModelConfig
 
 TINY = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 FAST = {  # the toy's best settings in few steps; the defaults are for long runs on real maps

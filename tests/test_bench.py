@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.agents.bench import kernels
-from maexp.agents.bench.census import count_moment
-from maexp.agents.bench.counts import FORMULAS, kernel_cost
-from maexp.agents.bench.scale import large_maze
-from maexp.agents.bench.shared import spread, sweep_points
 from maexp.agents.cli import main
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, move_sweeps
+from maexp.agents.speed import kernels
+from maexp.agents.speed.census import count_moment
+from maexp.agents.speed.counts import FORMULAS, kernel_cost
+from maexp.agents.speed.scale import large_maze
+from maexp.agents.speed.shared import spread, sweep_points
 from maexp.envs import ExplorationEnv, make_map
 
 TINY = ["scenario=maze_small", "scenario.maps=[0]", "num_envs=2", "seconds=0.02"]

@@ -33,8 +33,8 @@ from maexp.agents.benchmark.table import (
 )
 from maexp.agents.cli import main
 from maexp.agents.commands.benchmark import prepare
-from maexp.agents.logs import read_metrics
 from maexp.agents.settings.overrides import make_overrides
+from maexp.agents.training.logs import read_metrics
 
 TINY = [
     "preset=smoke", "scenarios=maze_small", "policies=voronoi,random", "algorithms=mappo", "seeds=0,1", "episodes=3",

@@ -8,10 +8,10 @@ import torch
 
 from maexp.agents.benchmark.cell import EnvShelf, finished, run_cell
 from maexp.agents.benchmark.plan import Cell, cell_overrides, compose_settings, list_cells, training_cell
-from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.cli import main
 from maexp.agents.commands.benchmark import prepare
 from maexp.agents.settings.overrides import make_overrides
+from maexp.agents.training.checkpoint import find_checkpoint
 
 WORDS = [
     "preset=smoke", "scenarios=maze_small,random_obstacles", "policies=cost_utility",

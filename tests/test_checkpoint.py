@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.agents import checkpoint
-from maexp.agents.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
 from maexp.agents.errors import UserError
+from maexp.agents.training import checkpoint
+from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
 from maexp.envs import files
 
 

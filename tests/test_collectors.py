@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from maexp.agents.build import load_maps
-from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.cli import main
-from maexp.agents.collect import Teams, WorkerLost, batch_statistics, divide_teams
 from maexp.agents.errors import UserError
-from maexp.agents.logs import read_metrics
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides
-from maexp.agents.train import make_both
+from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.collect import Teams, WorkerLost, batch_statistics, divide_teams
+from maexp.agents.training.logs import read_metrics
+from maexp.agents.training.train import make_both
 from maexp.envs import ExplorationEnv, make_map
 
 ROBOTS, STEPS = 2, 5

@@ -7,8 +7,8 @@ import pytest
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
 from maexp.agents.errors import UserError
-from maexp.agents.model import PRESETS
 from maexp.agents.settings.compose import compose_config, group_choices, groups
+from maexp.agents.settings.model import PRESETS
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
 from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
 from maexp.envs.config import (

@@ -11,9 +11,9 @@ from torchrl.objectives.multiagent import MAPPOLoss
 from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_critic, make_loss, make_policy
-from maexp.agents.actor import REGION_HEADS
-from maexp.agents.advantages import write_advantages
-from maexp.agents.distributions import OFFSET, REGION, Heads, RegionHeads
+from maexp.agents.algorithms.advantages import write_advantages
+from maexp.agents.networks.actor import REGION_HEADS
+from maexp.agents.networks.distributions import OFFSET, REGION, Heads, RegionHeads
 
 TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 BATCH, ROBOTS, REGIONS = 5, 3, 7

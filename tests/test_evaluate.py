@@ -11,11 +11,11 @@ from maexp.agents import make_policy
 from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import describe_episodes
-from maexp.agents.comparison import describe_differences
 from maexp.agents.errors import UserError
-from maexp.agents.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
+from maexp.agents.evaluation.comparison import describe_differences
+from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
+from maexp.agents.evaluation.results import paired_differences
 from maexp.agents.policies import POLICIES
-from maexp.agents.results import paired_differences
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map

@@ -13,7 +13,7 @@ from test_runtime import survey
 from maexp.agents import ModelConfig, make_policy
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.export import export_policy, find_chooser
+from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime.features import FEATURES, Candidates, Motion, list_candidates
 from maexp.agents.runtime.folder import LearnedChoice

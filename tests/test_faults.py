@@ -19,11 +19,11 @@ import torch
 
 from maexp.agents.benchmark.cell import read_result, write_result
 from maexp.agents.benchmark.plan import Cell, cell_folder
-from maexp.agents.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.logs import MetricsLog
-from maexp.agents.results import write_results
+from maexp.agents.evaluation.results import write_results
+from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
+from maexp.agents.training.logs import MetricsLog
 from maexp.envs import ExplorationEnv, MapError, PointCloudMap, make_map
 
 CELL = Cell("maze_small", "random", 0)

@@ -10,15 +10,15 @@ from test_train import TINY, assert_same
 from toy_env import OFFSET, ToyEnv
 
 from maexp.agents import ALGORITHMS, make_policy
-from maexp.agents.actor import ALIVE, MAP
-from maexp.agents.checkpoint import find_checkpoint, load_checkpoint
+from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.cli import main
-from maexp.agents.distributions import OFFSET as OFFSET_KEY
-from maexp.agents.distributions import REGION
-from maexp.agents.imitation import imitate, negative_log_likelihood
-from maexp.agents.logs import read_metrics
-from maexp.agents.model import ModelConfig
-from maexp.agents.updaters import Meter
+from maexp.agents.networks.actor import ALIVE, MAP
+from maexp.agents.networks.distributions import OFFSET as OFFSET_KEY
+from maexp.agents.networks.distributions import REGION
+from maexp.agents.settings.model import ModelConfig
+from maexp.agents.training.checkpoint import find_checkpoint, load_checkpoint
+from maexp.agents.training.imitation import imitate, negative_log_likelihood
+from maexp.agents.training.logs import read_metrics
 
 SMALL = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 WARM = [*TINY, "planner=wavefront", "warm_start=nearest_frontier", "warm_start_frames=12", "checkpoint_keep=9"]

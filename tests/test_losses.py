@@ -7,12 +7,12 @@ import torch
 from toy_env import ToyEnv
 
 from maexp.agents import make_critic, make_loss, make_policy
-from maexp.agents.actor import ALIVE, MAP
-from maexp.agents.advantages import ADVANTAGE, TARGET, TEAM_TARGET, write_advantages
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.agents.critics import TEAM_VALUE, VALUE
-from maexp.agents.losses import policy_divergence
-from maexp.agents.model import ModelConfig
+from maexp.agents.algorithms.advantages import ADVANTAGE, TARGET, TEAM_TARGET, write_advantages
+from maexp.agents.algorithms.losses import policy_divergence
+from maexp.agents.networks.actor import ALIVE, MAP
+from maexp.agents.networks.critics import TEAM_VALUE, VALUE
+from maexp.agents.settings.model import ModelConfig
 
 TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 GAMMA, LAMBDA = 0.9, 0.7

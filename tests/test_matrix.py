@@ -10,8 +10,8 @@ from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy
 from maexp.agents.build import load_maps, make_env, model_settings
-from maexp.agents.collect import make_collector
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.training.collect import make_collector
 from maexp.envs import SCENARIOS
 
 TEAM = {"random_obstacles": 1, "maze": 2, "maze_small": 4}  # robots; three elsewhere

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from maexp.agents.mixers import MIXERS, make_mixer
+from maexp.agents.networks.mixers import MIXERS, make_mixer
 
 FEATURES = 5
 

@@ -9,9 +9,9 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_policy
-from maexp.agents.critics import TEAM_VALUE, VALUE, build_critic
-from maexp.agents.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
-from maexp.agents.model import PRESETS, model_config
+from maexp.agents.networks.critics import TEAM_VALUE, VALUE, build_critic
+from maexp.agents.networks.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
+from maexp.agents.settings.model import PRESETS, model_config
 
 PIXELS, SIDE = 29, 3
 CONV = ModelConfig(stem="conv", channels=8, grid_features=8, depth=2, heads=2, merge_maps=False, critic_hidden=16)
@@ -275,7 +275,7 @@ def test_unknown_preset_and_foreign_env_are_named():
 
 def test_pictures_and_offsets_of_the_real_env_agree():
     """The seam with `kernels/observe.py`: where pose and grid say robots and regions are, there they are drawn."""
-    from maexp.agents.encoder import region_centres
+    from maexp.agents.networks.encoder import region_centres
     from maexp.envs import ExplorationEnv, make_map
 
     maze = make_map("maze_small", 3)

@@ -1,5 +1,6 @@
 """The package that is installed holds every folder and setting that the source does."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -35,6 +36,16 @@ def test_imports_go_one_way():
             text = path.read_text()
             for other in others:
                 assert f"import maexp.{other}" not in text and f"from maexp.{other}" not in text, path
+
+
+def test_rooms_of_agents_import_only_those_before_them():
+    order = "runtime settings networks algorithms policies evaluation training irsim benchmark speed commands".split()
+    agents = ROOT / "agents"
+    assert set(order) == {path.parent.name for path in agents.glob("*/*.py")}
+    for place, room in enumerate(order):
+        text = "".join(path.read_text() for path in (agents / room).glob("*.py"))
+        used = set(re.findall(r"from maexp\.agents\.(\w+)[. ]", text)) & set(order)
+        assert used <= set(order[: place + 1]), room
 
 
 def test_constraints_name_exact_versions():

@@ -8,7 +8,7 @@ from browser import find_browser, open_tab
 from PIL import Image
 
 from maexp.agents.cli import main
-from maexp.agents.films import play_teams
+from maexp.agents.evaluation.films import play_teams
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.render import EXPLORED, LIGHT, UNEXPLORED

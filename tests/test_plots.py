@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from maexp.agents import plots
-from maexp.agents.plots import draw_contributions, draw_coverage, draw_curves, draw_summary
+from maexp.agents.evaluation import plots
+from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_curves, draw_summary
 
 
 @pytest.fixture
@@ -186,7 +186,7 @@ def test_contributions_are_ranked_within_episodes(tmp_path, figures):
 @pytest.fixture(scope="module")
 def recorded():
     """Two batches of three episodes, the second one cut to one, and what the env itself reports of them."""
-    from maexp.agents.evaluate import evaluate
+    from maexp.agents.evaluation.evaluate import evaluate
     from maexp.envs import ExplorationEnv, make_map
     from maexp.envs.recorder import CoverageRecorder
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from oracle.grid import frontier_cells, geodesic_distance
 
-from maexp.agents.policies import (
+from maexp.agents.policies.classical import (
     CHOICES,
     POLICIES,
     FrontierPlanner,

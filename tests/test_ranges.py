@@ -7,7 +7,7 @@ import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
-from maexp.agents.model import PRESETS, ModelConfig
+from maexp.agents.settings.model import PRESETS, ModelConfig
 
 # What each setting may be and what it may not be, from what it means (not from the code).
 GOOD = {

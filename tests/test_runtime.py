@@ -8,7 +8,7 @@ import pytest
 import torch
 from runtime_cases import Moment, moments
 
-from maexp.agents import policies
+from maexp.agents.policies import classical
 from maexp.agents.runtime import CHOICES, TeamPlanner, choices, features, frontiers, values, ways
 from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.team import read_team
@@ -57,10 +57,10 @@ def test_numbers_are_those_of_the_kernels_and_policies():
         (frontiers, targets, ("RAYS",)),
         (values, env_targets, ("BETA", "LEAST_GAIN")),
         (features, target_view, ("FAR", "WAY_AHEAD", "FEATURES")),
-        (choices, policies, ("RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
+        (choices, classical, ("RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
     ):
         assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
-    assert set(CHOICES) == set(policies.POLICIES) - {"oracle"}  # no robot knows the true map
+    assert set(CHOICES) == set(classical.POLICIES) - {"oracle"}  # no robot knows the true map
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -96,7 +96,7 @@ def test_robots_take_the_targets_that_the_policies_take(name):
         nav = now.nav
         for policy in ("nearest_frontier", "cost_utility", "voronoi", "potential_field", "hungarian"):
             plan = TeamPlanner(policy, **now.settings).plan(**now.call)
-            there = policies.FrontierPlanner(now.env, policies.CHOICES[policy])
+            there = classical.FrontierPlanner(now.env, classical.CHOICES[policy])
             there(None)
             chosen = there.tracker.state["chosen"][0].squeeze(-1)
             assert np.array_equal(plan.active, (chosen >= 0).numpy())
@@ -123,5 +123,5 @@ def test_trees_find_frontiers_as_those_of_the_kernels_do():
         y, x = np.divmod(np.concatenate(grown), scene.grid.width)
         blocks = scene.targets.block_of(x, y)
         ours += len({tuple(one) for one in blocks.tolist()})
-        theirs += int(now.nav.grow_trees(policies.RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
+        theirs += int(now.nav.grow_trees(classical.RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
     assert ours == pytest.approx(theirs, rel=0.2)

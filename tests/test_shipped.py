@@ -5,9 +5,9 @@ import shutil
 
 import pytest
 
-from maexp.agents.card import describe_results
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
+from maexp.agents.policies.card import describe_results
 from maexp.agents.runtime.shipped import SHIPPED, shipped_names
 
 

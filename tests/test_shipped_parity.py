@@ -8,8 +8,8 @@ import pytest
 import torch
 from runtime_cases import moment
 
-from maexp.agents.export import find_chooser
-from maexp.agents.exported import load_policy_folder
+from maexp.agents.policies.export import find_chooser
+from maexp.agents.policies.load import load_policy_folder
 from maexp.agents.runtime import TeamPlanner, shipped_names
 from maexp.agents.runtime.shipped import SHIPPED
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map

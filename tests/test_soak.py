@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from maexp.agents.checkpoint import find_checkpoint
-from maexp.agents.logs import read_metrics
+from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.logs import read_metrics
 
 SECONDS = float(os.environ.get("MAEXP_SOAK_SECONDS", 30))
 WORDS = [

@@ -7,11 +7,11 @@ import torch
 from oracle.targets import columns as oracle_columns
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from maexp.agents.actor import make_policy
-from maexp.agents.algorithms import find_algorithm
-from maexp.agents.collect import make_collector
-from maexp.agents.model import ModelConfig
+from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.networks.actor import make_policy
 from maexp.agents.policies import POLICIES
+from maexp.agents.settings.model import ModelConfig
+from maexp.agents.training.collect import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.target_view import FEATURES
 from maexp.envs.targets import BETA

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from maexp.agents.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.cli import main
-from maexp.agents.logs import MetricsLog, read_metrics
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
+from maexp.agents.training.logs import MetricsLog, read_metrics
 
 TINY = [
     "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
@@ -229,7 +229,7 @@ def test_evaluate_goes_by_the_runs_own_settings():
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_is_named(monkeypatch, capsys):
-    from maexp.agents.updaters import GradientUpdater
+    from maexp.agents.algorithms.updaters import GradientUpdater
 
     learn, calls = GradientUpdater.update, []
 
@@ -290,7 +290,7 @@ def test_a_signal_after_an_iteration_was_kept_loses_none(monkeypatch):
         if len(shown) == 2:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("maexp.agents.train.Progress.show", show)
+    monkeypatch.setattr("maexp.agents.training.train.Progress.show", show)
     words = [*TINY, "hydra.run.dir=run", "total_frames=600000", "checkpoint_every=100000"]
     assert main(["train", *words]) == 130
     rows = [int(row["iteration"]) for row in read_metrics(Path("run/metrics.csv"))]

@@ -6,9 +6,9 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from toy_env import ToyEnv
 
 from maexp.agents import make_policy
-from maexp.agents.algorithms import ALGORITHMS, make_critic, make_loss
-from maexp.agents.model import ModelConfig
-from maexp.agents.trust_region import TRPO, conjugate_gradient, flatten
+from maexp.agents.algorithms.table import ALGORITHMS, make_critic, make_loss
+from maexp.agents.algorithms.trust_region import TRPO, conjugate_gradient, flatten
+from maexp.agents.settings.model import ModelConfig
 
 TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 

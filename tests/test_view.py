@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from maexp.agents.cli import main
-from maexp.agents.films import draw_film, play_teams
+from maexp.agents.evaluation.films import draw_film, play_teams
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, MapError, make_map
 from maexp.envs.render import EXPLORED, draw_frame, watch_episode

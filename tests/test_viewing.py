@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from maexp.agents.cli import main
-from maexp.agents.films import play_teams
+from maexp.agents.evaluation.films import play_teams
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.render import EXPLORED, OVERLAP, ROBOT_COLOURS, UNEXPLORED, WALL_SEEN, WALL_UNSEEN, robot_colour

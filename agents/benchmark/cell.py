@@ -13,16 +13,15 @@ import numpy as np
 
 from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, lock, training_cell
 from maexp.agents.build import load_maps, make_env, model_settings
-from maexp.agents.checkpoint import find_checkpoint, list_checkpoints, restore_policy
-from maexp.agents.commands.run_folder import short
-from maexp.agents.comparison import CHOOSING
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluate import evaluate
-from maexp.agents.files import write_file, write_json
-from maexp.agents.policies import CHOICES, POLICIES
+from maexp.agents.evaluation.comparison import CHOOSING
+from maexp.agents.evaluation.evaluate import evaluate
+from maexp.agents.evaluation.results import describe_run
+from maexp.agents.files import short, write_file, write_json
+from maexp.agents.policies.classical import CHOICES, POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.results import describe_run
-from maexp.agents.train import TrainingRun, train, write_config
+from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
+from maexp.agents.training.train import TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve

@@ -5,7 +5,7 @@ import numpy as np
 from maexp.agents.benchmark.cell import CellResult
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.benchmark.table import weigh
-from maexp.agents.comparison import DECIDES
+from maexp.agents.evaluation.comparison import DECIDES
 from maexp.envs.metrics import summarise
 
 Played = list[tuple[Cell, CellResult]]

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from maexp.agents.figures import COLOURS, LOOK, MARKERS, finish, save
-from maexp.agents.plots import draw_coverage_lines
+from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, finish, save
+from maexp.agents.evaluation.plots import draw_coverage_lines
 
 KINDS = {"trained": (COLOURS[0], MARKERS[0]), "classical": (COLOURS[1], MARKERS[1]), "paper": ("#606060", MARKERS[3])}
 REFERENCE, BLACK = "random", COLOURS.index("#000000")  # looks the same in all panels

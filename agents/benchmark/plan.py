@@ -13,10 +13,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
-from maexp.agents.policies import POLICIES
+from maexp.agents.policies.classical import POLICIES
 from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote

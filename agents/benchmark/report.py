@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.benchmark.cell import VALIDATION, CellResult, finished, read_result
 from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
 from maexp.agents.benchmark.paper_results import paper_value
@@ -19,10 +19,9 @@ from maexp.agents.benchmark.table import (
     table_latex,
     table_markdown,
 )
-from maexp.agents.commands.run_folder import short
-from maexp.agents.files import write_json, write_text
-from maexp.agents.policies import CHOICES
-from maexp.agents.results import PACKAGES, find_commit
+from maexp.agents.files import short, write_json, write_text
+from maexp.agents.policies.classical import CHOICES
+from maexp.agents.versions import PACKAGES, find_commit
 
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
 

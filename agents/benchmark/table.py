@@ -10,7 +10,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.envs.metrics import resample_weights, summarise
 

@@ -47,7 +47,7 @@ def check(cfg: Any) -> None:
 
 def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     """Measure what `action` names; each has a module of its own."""
-    home = importlib.import_module(f"maexp.agents.bench.{cfg.task}")
+    home = importlib.import_module(f"maexp.agents.speed.{cfg.task}")
     with blame_input():
         home.run(cfg, where, overrides)
     return 0

@@ -23,14 +23,15 @@ from maexp.agents.benchmark.plan import (
 from maexp.agents.benchmark.pool import Outcome, WorkerPool, last_lines
 from maexp.agents.benchmark.report import SMOKE, Report
 from maexp.agents.build import pick_device
-from maexp.agents.commands.run_folder import check_writable, short
+from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
+from maexp.agents.files import short
 from maexp.agents.progress import Progress, duration
 from maexp.agents.settings.checks import check_counts, check_steps
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.train import stop_on_signals, write_config
+from maexp.agents.training.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130
 SHOWN = 2  # running cells in the line of progress

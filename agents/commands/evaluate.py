@@ -9,22 +9,22 @@ from typing import Any
 import torch
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
-from maexp.agents.checkpoint import find_checkpoint, restore_policy
-from maexp.agents.checksums import warn_of_changed_maps
-from maexp.agents.commands.run_folder import short
-from maexp.agents.comparison import choose_best, describe_differences
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluate import EvaluationResult, evaluate_recorded, play, pool
-from maexp.agents.exported import check_policies, load_policy_folder, policy_name, show_targets
-from maexp.agents.films import EPISODES, check_render, play_teams, write_film
-from maexp.agents.policies import POLICIES
+from maexp.agents.evaluation.comparison import choose_best, describe_differences
+from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
+from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
+from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
+from maexp.agents.files import short
+from maexp.agents.policies.classical import POLICIES
+from maexp.agents.policies.load import check_policies, load_policy_folder, policy_name, show_targets
 from maexp.agents.progress import Progress
-from maexp.agents.results import describe_run, print_results, result_names, write_results
 from maexp.agents.settings.checks import check_counts, check_goals, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.train import check_action, write_config
+from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
+from maexp.agents.training.checksums import warn_of_changed_maps
+from maexp.agents.training.train import check_action, write_config
 
 PICTURES = 4
 
@@ -161,7 +161,7 @@ def report(
 
 def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
     """Pictures of what came of all maps together: coverage over time, the metrics, the robots' shares; their names."""
-    from maexp.agents.plots import draw_contributions, draw_coverage, draw_summary
+    from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_summary
 
     whole = [one for one in results if not one.place]
     named = dict(zip(result_names(whole), whole, strict=True))

@@ -5,16 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.build import load_maps, make_env
-from maexp.agents.card import RESULTS, find_results, write_card
-from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.evaluate import load_policy
-from maexp.agents.commands.run_folder import check_writable, remove_if_empty, short
+from maexp.agents.commands.run_folder import check_writable, remove_if_empty
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.export import export_policy, find_chooser
+from maexp.agents.files import short
+from maexp.agents.policies.card import RESULTS, find_results, write_card
+from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
+from maexp.agents.training.checkpoint import find_checkpoint
 
 
 def prepare(overrides: list[str]) -> Recipe:

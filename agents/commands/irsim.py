@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.exported import open_policy
 from maexp.agents.files import write_json
+from maexp.agents.policies.load import open_policy
 from maexp.agents.runtime import CHOICES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe

@@ -8,9 +8,8 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.commands.run_folder import short
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import write_text
+from maexp.agents.files import short, write_text
 from maexp.envs.checker import check_map
 from maexp.envs.importing import draw_import, import_map_with_report
 from maexp.envs.importing.api import GRIDS, POINTS

@@ -42,7 +42,7 @@ def run_sweep(verb: str, overrides: list[str]) -> int:
 
 def combine_curves(folder: Path) -> None:
     """curves.png of all runs below `folder`: one line per setting, the seeds averaged."""
-    from maexp.agents.plots import draw_curves
+    from maexp.agents.evaluation.plots import draw_curves
 
     settings: dict[str, list[Path]] = {}
     for config in sorted(folder.glob("*/config.yaml")):

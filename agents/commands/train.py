@@ -5,18 +5,19 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.build import choose_device, make_env
-from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.evaluate import bind, draw_results, evaluate_all, report
-from maexp.agents.commands.run_folder import check_writable, short
-from maexp.agents.comparison import choose_best
+from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
-from maexp.agents.imitation import check_warm_start, warm_start
-from maexp.agents.logs import check_logger
-from maexp.agents.policies import POLICIES
+from maexp.agents.evaluation.comparison import choose_best
+from maexp.agents.files import short
+from maexp.agents.policies.classical import POLICIES
 from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.train import TrainingRun, check_collector, describe_workers, train, write_config
+from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.imitation import check_warm_start, warm_start
+from maexp.agents.training.logs import check_logger
+from maexp.agents.training.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
@@ -129,14 +130,14 @@ def finish(done: TrainingRun) -> None:
 
 def draw_curves(where: Path) -> None:
     """curves.png from metrics.csv."""
-    from maexp.agents.plots import draw_curves as draw
+    from maexp.agents.evaluation.plots import draw_curves as draw
 
     draw(where / "metrics.csv", where / "curves.png")
 
 
 def draw_rollout(cfg: Any, done: TrainingRun, best: str | None, path: Path) -> None:
     """A film of the trained team in the first held-out episode, beside the best classical planner if there is one."""
-    from maexp.agents.films import draw_film, play_teams
+    from maexp.agents.evaluation.films import draw_film, play_teams
     from maexp.envs.film import write_gif
 
     env = make_env(cfg, done.suite.held_out[:1], done.sizes[0], 1, device=choose_device(cfg, "train_device"))

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.build import import_files, load_maps, make_env
-from maexp.agents.checkpoint import find_checkpoint
 from maexp.agents.commands.evaluate import bind, load_policy, open_player
-from maexp.agents.commands.run_folder import remove_if_empty, short
+from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.exported import check_policies, policy_name, show_targets
-from maexp.agents.films import EPISODES, MOST_TEAMS, play_teams
+from maexp.agents.evaluation.films import EPISODES, MOST_TEAMS, play_teams
+from maexp.agents.files import short
+from maexp.agents.policies.load import check_policies, policy_name, show_targets
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import given
+from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.envs import PointCloudMap, import_map, make_map
 from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import torch
 
-from maexp.agents.exported import load_policy_folder
-from maexp.agents.policies import POLICIES
+from maexp.agents.policies.classical import POLICIES
+from maexp.agents.policies.load import load_policy_folder
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
 
 from .config import DT, TrialConfig

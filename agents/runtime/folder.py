@@ -1,7 +1,7 @@
 """A trained policy as a folder: `policy.onnx`, `weights.safetensors`, and `contract.json`: what goes in and what it
 was trained for.
 
-Written by `maexp.agents.export`. Nothing in it is unpickled; a file that was changed is refused.
+Written by `maexp.agents.policies.export`. Nothing in it is unpickled; a file that was changed is refused.
 """
 
 from __future__ import annotations

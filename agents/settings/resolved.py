@@ -6,9 +6,9 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
-from maexp.agents.model import ModelConfig
 from maexp.agents.settings.algorithms import Settings, find_presets
 from maexp.agents.settings.indices import map_indices
+from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import given
 from maexp.envs.config import (
     CommConfig,

@@ -13,9 +13,9 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from maexp.agents.model import ModelConfig
 from maexp.agents.runtime.choices import CHOICES
 from maexp.agents.settings.algorithms import PRESETS
+from maexp.agents.settings.model import ModelConfig
 from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
 from maexp.envs.importing.options import ImportOptions
 

@@ -4,15 +4,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.actor import make_policy
-from maexp.agents.checkpoint import mismatched
 from maexp.agents.errors import UserError
-from maexp.agents.export import find_chooser
-from maexp.agents.model import ModelConfig
-from maexp.agents.policies import POLICIES
+from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.weights import mismatched
+from maexp.agents.policies.classical import POLICIES
+from maexp.agents.policies.export import find_chooser
 from maexp.agents.runtime.folder import AGAIN, WEIGHTS, Contract, read_checked, read_contract
 from maexp.agents.runtime.shipped import CONTRACT, find_policy, shipped_names
 from maexp.agents.settings.checks import check_distinct
+from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
 

@@ -17,10 +17,13 @@ from typing import Any
 import torch
 import warp as wp
 
-from maexp.agents.bench.census import count_moment
-from maexp.agents.bench.counts import kernel_cost
-from maexp.agents.bench.env import advance
-from maexp.agents.bench.shared import (
+from maexp.agents.build import load_maps, make_env, pick_device
+from maexp.agents.errors import UserError
+from maexp.agents.progress import Progress
+from maexp.agents.speed.census import count_moment
+from maexp.agents.speed.counts import kernel_cost
+from maexp.agents.speed.env import advance
+from maexp.agents.speed.shared import (
     LEAST_LAPS,
     describe_point,
     print_table,
@@ -29,9 +32,6 @@ from maexp.agents.bench.shared import (
     time_call,
     write_report,
 )
-from maexp.agents.build import load_maps, make_env, pick_device
-from maexp.agents.errors import UserError
-from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
 from maexp.kernels.observe import picture_shapes

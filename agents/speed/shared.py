@@ -17,10 +17,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from maexp.agents.files import write_json
-from maexp.agents.results import PACKAGES, find_commit
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import split_sweeps, without
+from maexp.agents.versions import PACKAGES, find_commit
 
 OWN = ("task", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""

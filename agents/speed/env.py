@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
-from maexp.agents.bench.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.progress import Progress
+from maexp.agents.speed.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
 from maexp.envs import ExplorationEnv
 from maexp.envs.simulation import bytes_per_env
 

@@ -14,23 +14,23 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from maexp.agents.actor import ALIVE
+from maexp.agents.algorithms.losses import check_finite
+from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.build import choose_device, make_env
-from maexp.agents.checkpoint import find_checkpoint, restore_policy
-from maexp.agents.collect import batch_statistics, divide_teams
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.exported import is_exported, load_policy_folder, show_targets
 from maexp.agents.files import write_text
-from maexp.agents.losses import check_finite
-from maexp.agents.model import PRESETS, ModelConfig
-from maexp.agents.policies import POLICIES
+from maexp.agents.networks.actor import ALIVE
+from maexp.agents.policies.classical import POLICIES
+from maexp.agents.policies.load import is_exported, load_policy_folder, show_targets
 from maexp.agents.progress import Progress
 from maexp.agents.runtime.shipped import advise, shipped_names
 from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
+from maexp.agents.settings.model import PRESETS, ModelConfig
 from maexp.agents.settings.resolved import model_settings
-from maexp.agents.train import check_action
-from maexp.agents.updaters import Meter
+from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
+from maexp.agents.training.collect import batch_statistics, divide_teams
+from maexp.agents.training.train import check_action
 
 LEARNING_RATE = 2e-3
 PASSES = 4  # over each batch

@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from maexp.agents.actor import ALIVE, GRID, MAP, PARAMS, POSE
-from maexp.agents.advantages import write_advantages
-from maexp.agents.encoder import compact, pools_pictures
-from maexp.agents.losses import ANCHOR, check_finite
-from maexp.agents.trust_region import TRPO
+from maexp.agents.algorithms.advantages import write_advantages
+from maexp.agents.algorithms.losses import ANCHOR, check_finite
+from maexp.agents.algorithms.trust_region import TRPO
+from maexp.agents.networks.actor import ALIVE, GRID, MAP, PARAMS, POSE
+from maexp.agents.networks.encoder import compact, pools_pictures
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
 CALIBRATION_ROUNDS = 5

@@ -7,10 +7,10 @@ from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, distributions, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from maexp.agents.distributions import ACTION, Heads, RegionHeads
-from maexp.agents.model import ModelConfig, model_config
-from maexp.agents.networks import TargetGenerator
-from maexp.agents.target_networks import TargetChooser
+from maexp.agents.networks.distributions import ACTION, Heads, RegionHeads
+from maexp.agents.networks.target_chooser import TargetChooser
+from maexp.agents.networks.target_generator import TargetGenerator
+from maexp.agents.settings.model import ModelConfig, model_config
 
 MAP = ("agents", "observation", "map")
 POSE = ("agents", "observation", "pose")

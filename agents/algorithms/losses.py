@@ -13,10 +13,10 @@ from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.utils import distance_loss
 
-from maexp.agents.actor import ALIVE, PARAMS
-from maexp.agents.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
-from maexp.agents.critics import TEAM_VALUE, VALUE
-from maexp.agents.distributions import Heads
+from maexp.agents.algorithms.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
+from maexp.agents.networks.actor import ALIVE, PARAMS
+from maexp.agents.networks.critics import TEAM_VALUE, VALUE
+from maexp.agents.networks.distributions import Heads
 
 ANCHOR = ("agents", "anchor")
 

@@ -22,9 +22,9 @@ from torch.utils._pytree import tree_map_only
 from torchrl.collectors import MultiSyncCollector
 
 from maexp.agents.build import choose_device, choose_starts, make_env
-from maexp.agents.collect import Experience, TeamCollector, Teams, WorkerLost
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
+from maexp.agents.training.collect import Experience, TeamCollector, Teams, WorkerLost
 from maexp.envs import PointCloudMap
 
 LOOK_EVERY = 0.2  # seconds between two looks whether the workers are alive

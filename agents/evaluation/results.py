@@ -1,7 +1,5 @@
 """What a run found: summary.json and results.json, and the table on the terminal."""
 
-import subprocess
-from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,10 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
-from maexp.agents.evaluate import EvaluationResult
+from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import write_json
+from maexp.agents.versions import PACKAGES, find_commit
 
-PACKAGES = ("maexp", "torch", "torchrl", "tensordict", "warp-lang", "numpy")
 COLUMNS = {
     "exploration_ratio": "coverage",
     "coverage_auc": "over time",
@@ -41,17 +39,6 @@ def describe_run(cfg: Any, maps: list, seconds: float) -> dict:
         "versions": {name: metadata.version(name) for name in PACKAGES},
         "seconds": round(seconds, 2),
     }
-
-
-@cache
-def find_commit() -> str | None:
-    """The commit of the source folder, None for an installed package."""
-    here = Path(__file__).resolve().parent
-    try:
-        done = subprocess.run(["git", "-C", here, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
 
 
 def result_names(results: list[EvaluationResult]) -> list[str]:

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from torchrl.modules import PopArtValueNorm
 
-from maexp.agents import losses
-from maexp.agents.critics import build_critic
-from maexp.agents.model import ModelConfig
+from maexp.agents.algorithms import losses
+from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
+from maexp.agents.networks.critics import build_critic
 from maexp.agents.settings.algorithms import PRESETS, Presets, Settings
-from maexp.agents.updaters import GradientUpdater, TrustRegionUpdater, Updater
+from maexp.agents.settings.model import ModelConfig
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.objectives.value import GAE, MultiAgentGAE
 
-from maexp.agents.critics import TEAM_VALUE, VALUE
+from maexp.agents.networks.critics import TEAM_VALUE, VALUE
 
 REWARD = ("agents", "reward")
 ADVANTAGE = ("agents", "advantage")

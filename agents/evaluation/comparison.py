@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from maexp.agents.build import MapSuite, make_env
-from maexp.agents.evaluate import EvaluationResult, evaluate
-from maexp.agents.policies import CHOICES, POLICIES
+from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
+from maexp.agents.evaluation.results import result_names
+from maexp.agents.policies.classical import CHOICES, POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.results import result_names
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"

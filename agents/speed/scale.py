@@ -14,16 +14,16 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator
 
-from maexp.agents.bench.env import Batch
-from maexp.agents.bench.shared import LEAST_LAPS, print_table, write_report
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.errors import UserError
-from maexp.agents.figures import save
-from maexp.agents.plots import COLOURS, LOOK
+from maexp.agents.evaluation.figures import save
+from maexp.agents.evaluation.plots import COLOURS, LOOK
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_distinct
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
+from maexp.agents.speed.env import Batch
+from maexp.agents.speed.shared import LEAST_LAPS, print_table, write_report
 from maexp.envs import PointCloudMap
 from maexp.envs.scenarios.maze import build_maze
 

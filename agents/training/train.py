@@ -22,19 +22,25 @@ from maexp.agents.build import (
     other_scenarios,
     set_steps,
 )
-from maexp.agents.checkpoint import load_matching, random_state, save_checkpoint, seed_everything, set_random_state
-from maexp.agents.checksums import checksums, warn_of_changed_maps
-from maexp.agents.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluate import evaluate
+from maexp.agents.evaluation.evaluate import evaluate
 from maexp.agents.files import write_text
-from maexp.agents.logs import MetricsLog
 from maexp.agents.memory import check_batch_memory
+from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
-from maexp.agents.results import find_commit
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config, settings_of
 from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
+from maexp.agents.training.checkpoint import (
+    random_state,
+    save_checkpoint,
+    seed_everything,
+    set_random_state,
+)
+from maexp.agents.training.checksums import checksums, warn_of_changed_maps
+from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
+from maexp.agents.training.logs import MetricsLog
+from maexp.agents.versions import find_commit
 
 BACKENDS = ("single", "processes", "ray")
 
@@ -275,7 +281,7 @@ def make_both(cfg: Any, maps: list, words: Any = None) -> tuple[Learner, Experie
     if alone:
         pairs = zip(envs, steps, strict=True)
         return learner, Experience([make_collector(env, learner.policy, length, there) for env, length in pairs])
-    from maexp.agents.workers import make_workers  # here: most runs have none
+    from maexp.agents.training.workers import make_workers  # here: most runs have none
 
     return learner, make_workers(cfg, maps, teams, learner.policy)
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from maexp.agents.actor import make_policy
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
-from maexp.agents.model import ModelConfig
+from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.weights import load_matching
+from maexp.agents.settings.model import ModelConfig
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
@@ -109,27 +110,6 @@ def find_checkpoint(place: str | Path) -> tuple[Path, dict]:
         except UserError as error:
             warnings.warn(f"{error} Falling back to the one before.", stacklevel=2)
     raise UserError(f"{place} holds no whole checkpoint: give the folder of a run of maexp train.")
-
-
-def load_matching(policy: Any, state: dict) -> None:
-    """Load a policy's weights.
-
-    Raises:
-        UserError: they belong to another network.
-    """
-    wrong = mismatched(policy.state_dict(), state)
-    if wrong:
-        raise UserError(
-            f"The checkpoint holds another network ({len(wrong)} tensors differ, first {wrong[0]}): "
-            "use the model and planner settings it was trained with."
-        )
-    policy.load_state_dict(state)
-
-
-def mismatched(own: dict, state: dict) -> list[str]:
-    """Names of the tensors that one of two states lacks, or that differ in shape."""
-    wrong = [name for name in own if name not in state or state[name].shape != own[name].shape]
-    return wrong + [name for name in state if name not in own]
 
 
 def restore_policy(env: Any, model: str | ModelConfig, saved: dict) -> Any:

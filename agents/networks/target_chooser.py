@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from maexp.agents.model import ModelConfig
-from maexp.agents.networks import contact_bias
+from maexp.agents.networks.target_generator import contact_bias
+from maexp.agents.settings.model import ModelConfig
 from maexp.envs.target_view import FEATURES
 
 SCORE = FEATURES.index("score")

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from maexp.agents.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
+from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
 from maexp.envs.metrics import resample_weights, resampled_means
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist

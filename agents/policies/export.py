@@ -14,9 +14,9 @@ import torch
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
-from maexp.agents.results import find_commit
+from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.runtime.folder import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
-from maexp.agents.target_networks import TargetChooser
+from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.target_view import FEATURES

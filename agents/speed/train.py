@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from maexp.agents.bench.shared import describe_point, print_table, spread, sweep_points, write_report
 from maexp.agents.build import Learner, load_maps, make_env, make_learner, set_steps
-from maexp.agents.checkpoint import seed_everything
-from maexp.agents.collect import Stopwatch, make_collector
 from maexp.agents.memory import check_batch_memory
-from maexp.agents.model import PRESETS
 from maexp.agents.progress import Progress
+from maexp.agents.settings.model import PRESETS
 from maexp.agents.settings.resolved import model_settings
+from maexp.agents.speed.shared import describe_point, print_table, spread, sweep_points, write_report
+from maexp.agents.training.checkpoint import seed_everything
+from maexp.agents.training.collect import Stopwatch, make_collector
 from maexp.envs import ExplorationEnv
 
 TEAM_SIZES = [3]

@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from maexp.agents.actor import (
+from maexp.agents.networks.actor import (
     ALIVE,
     COMM,
     COVERAGE,
@@ -18,10 +18,10 @@ from maexp.agents.actor import (
     observation_keys,
     observation_shape,
 )
-from maexp.agents.encoder import CellEncoder, add_state
-from maexp.agents.mixers import make_mixer
-from maexp.agents.model import ModelConfig, model_config
-from maexp.agents.target_networks import TargetReader
+from maexp.agents.networks.encoder import CellEncoder, add_state
+from maexp.agents.networks.mixers import make_mixer
+from maexp.agents.networks.target_chooser import TargetReader
+from maexp.agents.settings.model import ModelConfig, model_config
 
 VALUE = ("agents", "state_value")
 TEAM_VALUE = ("team", "state_value")

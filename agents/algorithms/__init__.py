@@ -1,0 +1,7 @@
+"""The six algorithms: their table, losses, estimates of advantages and updaters."""
+
+from maexp.envs.lazy import lazy_names
+
+__all__ = ["ALGORITHMS"]
+
+__getattr__ = lazy_names(__name__, {"ALGORITHMS": "table"})

@@ -1,0 +1,1 @@
+"""Evaluation: episodes of any policy, results and their comparison, plots and films."""

@@ -1,0 +1,1 @@
+"""Networks: the target generator, the choice among targets, actors and critics."""
