@@ -207,8 +207,8 @@ class ExplorationEnv(EnvBase):
     def observe(self, mask: torch.Tensor | None = None) -> TensorDict:
         """What the teams see now, and info of the step just made.
 
-        Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures of these
-        envs only, the others' are black.
+        Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures and
+        targets of these envs only, the others' are black and 0.
         """
         e, n, r = self.num_envs, self.num_robots, REGIONS
         pictures = self.observation_config.pictures
@@ -224,7 +224,7 @@ class ExplorationEnv(EnvBase):
             "alive": state["collided"] == 0,
         } | ({"map": picture} if pictures else {})  # fmt: skip
         if self.target_view is not None:
-            seen = self.target_view.observe()
+            seen = self.target_view.observe(mask)
             observation |= {"targets": seen["features"], "targets_mask": seen["mask"]}
         agents = TensorDict(
             {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},

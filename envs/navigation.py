@@ -6,6 +6,8 @@ envs at once, on the env's device, without a loop over envs or robots.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,8 +33,20 @@ OPEN_GROUND = 1.2  # places with so many clearances of room around are open: DWA
 OPEN_SAMPLES = 7  # places on a way that are looked at
 
 
+class Rows:
+    """Tensors [E, ...] by name, of which only some rows are given out."""
+
+    def __init__(self, tensors: dict[str, torch.Tensor], rows: torch.Tensor):
+        self.tensors, self.rows = tensors, rows
+
+    def __getitem__(self, name: str) -> torch.Tensor:
+        return self.tensors[name][self.rows]
+
+
 class Navigation:
     """Known grids, distances and targets of all envs of an `ExplorationEnv`.
+
+    Inside `only` everything is about some envs: E below then counts those.
 
     R rows per env hold what is known: 1 where all communicate, else N (a robot knows what it has heard). K is
     the number of blocks of the largest map, T the most blocks with a target that an env has now. Attributes below are
@@ -50,7 +64,8 @@ class Navigation:
 
     def __init__(self, env: ExplorationEnv):
         sim = env.simulation
-        self.state, self.device = sim.tensors, env.device
+        self.envs: torch.Tensor | None = None
+        self._state, self.device = sim.tensors, env.device
         self.num_envs, self.num_robots = env.num_envs, env.num_robots
         self.launch = launch_on(env.device)
         nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
@@ -59,7 +74,7 @@ class Navigation:
         self.rows = self.num_robots if limited else 1
         prefix = "known" if limited else "viewers"
         self.arrays = {
-            name: wp.from_torch(self.state[name], dtype=kind)
+            name: wp.from_torch(self._state[name], dtype=kind)
             for name, kind in (
                 ("map_id", wp.int32), ("active", wp.int32), ("collided", wp.int32), ("center", wp.vec3),
                 (f"{prefix}_free", wp.int32), (f"{prefix}_boundary", wp.int32),
@@ -99,65 +114,110 @@ class Navigation:
             wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width", "height")
         )
         self.origin = wp.to_torch(self.grids.origin)
-        self.known = wp.to_torch(self.known_grids.known).view(e, r, cells)
-        self.frontier = torch.zeros_like(self.known)
-        self.distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
+        self._known = wp.to_torch(self.known_grids.known).view(e, r, cells)
+        self._frontier = torch.zeros_like(self._known)
+        self._distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
-        self._target = torch.zeros((e * r, k), dtype=torch.int32, device=self.device)
+        self._target = torch.zeros((e, r, k), dtype=torch.int32, device=self.device)
         self._size = torch.zeros_like(self._target)
-        self._sums = torch.zeros((e * r, k, 2), dtype=torch.int64, device=self.device)
+        self._sums = torch.zeros((e, r, k, 2), dtype=torch.int64, device=self.device)
+
+    @contextmanager
+    def only(self, envs: torch.Tensor | None) -> Iterator[None]:
+        """Look at some envs, int64 [S], and leave what is there of the others as it is; None: at all."""
+        self.envs = envs
+        try:
+            yield
+        finally:
+            self.envs = None
+
+    def pick(self, values: torch.Tensor) -> torch.Tensor:
+        """What concerns the envs looked at: [E, ...] -> [S, ...]."""
+        return values if self.envs is None else values[self.envs]
+
+    def put(self, values: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """`values` [E, ...] with `rows` [S, ...] for the envs looked at."""
+        return rows if self.envs is None else values.index_copy_(0, self.envs, rows)
+
+    def _spread(self, rows: torch.Tensor) -> torch.Tensor:
+        """[S, ...] -> int32 [E, ...], -1 for envs not looked at."""
+        rows = rows.to(torch.int32).contiguous()
+        return rows if self.envs is None else self.put(rows.new_full((self.num_envs, *rows.shape[1:]), -1), rows)
 
     def update(self) -> None:
         """Bring everything up to date with the env."""
         a, grids = self.arrays, self.grids
         self.known_grids.paint(self.launch)
         self.passable.paint(self.launch)
+        grid_of_env = self._spread(self.state["map_id"])
         self.launch(
             targets._locate_robots, (self.num_envs, self.num_robots),
-            inputs=[grids, a["map_id"], a["active"], a["collided"], a["center"], self.passable.passable,
-                    self.paths.row_of_item],
+            inputs=[grids, wp.from_torch(grid_of_env), a["active"], a["collided"], a["center"],
+                    self.passable.passable, self.paths.row_of_item],
             outputs=[self.paths.search.sources, self.paths.search.stop],
         )  # fmt: skip
         self.paths.flood(self.launch)
-        rows = self.known_grids.grid_of_row
-        frontier = wp.from_torch(self.frontier.flatten(0, 1))
+        self._place_targets(wp.from_torch(grid_of_env.repeat_interleave(self.rows)))
+        self._list_targets()
+
+    def _place_targets(self, rows: wp.array) -> None:
+        """Frontier cells, and the targets that they are gathered in; ``rows`` int32 [E * R], the map of each, -1: leave
+        it as it is."""
+        grids = self.grids
+        frontier = wp.from_torch(self._frontier.flatten(0, 1))
         mark_frontier(
             self.known_grids.known, rows, grids.width, grids.height, frontier, self.tallest, self.launch
         )  # fmt: skip
-        self._size.zero_()
-        self._sums.zero_()
-        size, sums = wp.from_torch(self._size), wp.from_torch(self._sums)
+        for counted in (self._size, self._sums):
+            counted[slice(None) if self.envs is None else self.envs] = 0
+        size, sums, target = (wp.from_torch(one.flatten(0, 1)) for one in (self._size, self._sums, self._target))
         self.launch(
-            targets._sum_frontier, (len(self._size), self.tallest),
+            targets._sum_frontier, (rows.shape[0], self.tallest),
             inputs=[grids, rows, self.block_side, frontier], outputs=[size, sums],
         )  # fmt: skip
         self.launch(
-            targets._place_targets, tuple(self._target.shape),
+            targets._place_targets, tuple(target.shape),
             inputs=[grids, rows, self.block_side, self.search, size, sums, self.paths.search.distance, self.rows,
                     self.num_robots],
-            outputs=[wp.from_torch(self._target)],
+            outputs=[target],
         )  # fmt: skip
-        self._list_targets()
 
     def _list_targets(self) -> None:
         """The blocks where some row has a target, env by env (of some 4,000 blocks a hundred have)."""
-        target = self._target.view(self.num_envs, self.rows, -1)
+        target = self.pick(self._target)
         env, block = (target >= 0).any(1).nonzero(as_tuple=True)
-        count = torch.bincount(env, minlength=self.num_envs)
+        count = torch.bincount(env, minlength=len(target))
         slot = torch.arange(len(env), device=self.device) - (count.cumsum(0) - count)[env]
         most = max(int(count.max()), 1)
-        self.block = torch.full((self.num_envs, 1, most), -1, device=self.device)
+        self.block = torch.full((len(target), 1, most), -1, device=self.device)
         self.block[env, 0, slot] = block
         cell = target.gather(2, self.block.clamp_min(0).expand(-1, self.rows, -1)).long()
         self.cell = torch.where(self.block >= 0, cell, -1)
 
     @property
+    def state(self) -> "dict[str, torch.Tensor] | Rows":
+        """The simulation's tensors."""
+        return self._state if self.envs is None else Rows(self._state, self.envs)
+
+    @property
+    def known(self) -> torch.Tensor:
+        return self.pick(self._known)
+
+    @property
+    def frontier(self) -> torch.Tensor:
+        return self.pick(self._frontier)
+
+    @property
+    def distance(self) -> torch.Tensor:
+        return self.pick(self._distance)
+
+    @property
     def target(self) -> torch.Tensor:
-        return self._target.view(self.num_envs, self.rows, -1).long()
+        return self.pick(self._target).long()
 
     @property
     def size(self) -> torch.Tensor:
-        return self._size.view(self.num_envs, self.rows, -1)
+        return self.pick(self._size)
 
     def look_around(
         self, radius: float, cells: torch.Tensor | None = None, known: torch.Tensor | None = None
@@ -172,7 +232,7 @@ class Navigation:
         Returns:
             float32 [E, R, K or M], unknown cells; float32 [E, R, K or M, 2], their middle, from the target [m].
         """
-        start = self._target if cells is None else cells.flatten(0, 1).to(torch.int32).contiguous()
+        start = self._spread(self.target if cells is None else cells).flatten(0, 1)
         grid = self.known_grids.known if known is None else wp.from_torch(known.flatten(0, 1).contiguous())
         area = torch.empty(start.shape, device=self.device)
         middle = torch.empty((*start.shape, 2), device=self.device)
@@ -183,7 +243,7 @@ class Navigation:
             outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
         )  # fmt: skip
         shape = (self.num_envs, self.rows, -1)
-        return area.view(shape), middle.view(*shape, 2)
+        return self.pick(area.view(shape)), self.pick(middle.view(*shape, 2))
 
     def _spread_rays(self, radius: float) -> list[wp.array]:
         """Cells of the rays of a radius [m], computed once, and their directions."""
@@ -203,7 +263,7 @@ class Navigation:
             samples: random points a tree grows toward.
             branch: length of the longest branch [m].
         """
-        found = torch.zeros_like(self._target)
+        found = torch.zeros_like(self._target).flatten(0, 1)
         items = self.num_envs * self.num_robots
         node = torch.empty((items, samples, 2), device=self.device)
         state = [wp.from_torch(self.state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
@@ -252,7 +312,7 @@ class Navigation:
         Returns:
             float32 [E, N, M, 2] [m]; the first cell of the map where there is no way.
         """
-        wanted = cells.to(torch.int32).contiguous()
+        wanted = self._spread(cells)
         cell = torch.empty_like(wanted)
         self.launch(
             targets._first_cells, tuple(wanted.shape),
@@ -260,7 +320,7 @@ class Navigation:
                     self.paths.search.distance, wp.from_torch(wanted), int(STRAIGHT * ahead)],
             outputs=[wp.from_torch(cell)],
         )  # fmt: skip
-        return self.points(cell.clamp_min(0).long())
+        return self.points(self.pick(cell).clamp_min(0).long())
 
     def waypoints(self, cells: torch.Tensor, points: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
         """The farthest point in sight on every robot's way.

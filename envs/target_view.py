@@ -69,14 +69,27 @@ class TargetView:
         }
 
     @torch.no_grad()
-    def observe(self) -> dict[str, torch.Tensor]:
+    def observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them there are.
 
         Without any (the robot has collided, or knows no way to a frontier) the first candidate stands for driving
-        anywhere; its features are 0.
+        anywhere; its features are 0. ``mask`` int32 [E]: look at these envs only, the others show none.
         """
-        s, scene = self.state, self.tracker.look(compact=True)
+        if mask is None or bool(mask.all()):
+            return self._look()
+        features = torch.zeros((*self.state["mask"].shape, len(FEATURES)), device=mask.device)
+        blank = {"features": features, "mask": torch.zeros_like(self.state["mask"])}
+        envs = mask.nonzero().squeeze(-1)
+        if not len(envs):
+            return blank
+        with self.tracker.nav.only(envs):
+            return {name: blank[name].index_copy_(0, envs, rows) for name, rows in self._look().items()}
+
+    def _look(self) -> dict[str, torch.Tensor]:
+        """`observe` of the envs that `Navigation.only` leaves."""
+        scene = self.tracker.look(compact=True)
         nav = scene.nav
+        s = {name: nav.pick(value) for name, value in self.state.items()}
         s["has_last"] = s["has_last"] & (nav.state["macro_step"] != 0).unsqueeze(-1)
         value = value_targets(scene)
         best = _best(value, self.count)
@@ -85,7 +98,10 @@ class TargetView:
         s["block"], s["mask"] = scene.block.gather(2, best), some
         s["cell"] = scene.cells().gather(2, best)
         s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
-        columns = self._columns(scene, best, some)
+        self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
+        travel = torch.where(some, scene.travel.gather(2, best), 0.0) / nav.radar_range
+        near = _Near(self, s, scene, best, some, travel)
+        columns = near.plan() | near.way() | near.worth() | near.bearings() | near.others() | near.team()
         features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
         return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": some.clone()}
 
@@ -119,22 +135,21 @@ class TargetView:
         for prefix, part in (("target_view", self.state), ("target", self.tracker.state)):
             for name in part:
                 part[name] = state[f"{prefix}_{name}"].to(part[name].device).clone()
-
-    def _columns(self, scene: Scene, best: torch.Tensor, some: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Every feature by name, shapes that expand to [E, N, M]."""
-        travel = torch.where(some, scene.travel.gather(2, best), 0.0) / scene.nav.radar_range
-        near = _Near(self, scene, best, some, travel)
-        return near.plan() | near.way() | near.worth() | near.bearings() | near.others() | near.team()
+        self.tracker.nav.update()  # plain DWA drives along the ways that were found when the robots last looked
 
 
 class _Near:
     """The features of the candidates of one moment, group by group."""
 
-    def __init__(self, view: TargetView, scene: Scene, best: torch.Tensor, some: torch.Tensor, travel: torch.Tensor):
-        self.view, self.scene, self.best, self.some, self.travel = view, scene, best, some, travel
+    def __init__(
+        self, view: TargetView, state: dict[str, torch.Tensor], scene: Scene, best: torch.Tensor, some: torch.Tensor,
+        travel: torch.Tensor,
+    ):  # fmt: skip
+        self.view, self.state, self.scene = view, state, scene
+        self.best, self.some, self.travel = best, some, travel
         nav = scene.nav
         self.nav, self.reach = nav, nav.radar_range
-        self.point = view.state["point"]
+        self.point = state["point"]
         self.to = self.point - nav.centers().unsqueeze(2)
         self.distance = self.to.norm(dim=-1) / self.reach
         self.gain = scene.gain.gather(2, best)
@@ -181,9 +196,9 @@ class _Near:
     def bearings(self) -> dict[str, torch.Tensor]:
         heading = self.nav.state["pose"][..., 3]
         ahead = torch.stack((heading.cos(), heading.sin()), -1).unsqueeze(2)
-        wanted = torch.where(self.some, self.view.state["cell"], -1)
+        wanted = torch.where(self.some, self.state["cell"], -1)
         way = self.nav.points_on_way(wanted, WAY_AHEAD) - self.nav.centers().unsqueeze(2)
-        toward = self.view.state["toward"]
+        toward = self.state["toward"]
         columns = {"unknown_far": toward.norm(dim=-1) / self.reach}
         for name, vector in (("", self.to), ("way_", way), ("unknown_", toward)):
             unit = vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-6)
@@ -192,7 +207,7 @@ class _Near:
         return columns
 
     def others(self) -> dict[str, torch.Tensor]:
-        scene, s = self.scene, self.view.state
+        scene, s = self.scene, self.state
         envs, robots, count = self.best.shape
         ways = torch.where(scene.alive.unsqueeze(-1), self.nav.travel(scene.nav.cell) / self.reach, torch.inf)
         theirs = ways.unsqueeze(1).expand(-1, robots, -1, -1)
@@ -209,7 +224,7 @@ class _Near:
 
     def team(self) -> dict[str, torch.Tensor]:
         nav, env, tracker = self.nav, self.view.env, self.view.tracker
-        speed, limit = tracker.speed(), env.simulation.robot_tensors["max_speed"]
+        speed, limit = tracker.speed(), nav.pick(env.simulation.robot_tensors["max_speed"])
         cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
         columns = {
             "count": self.some.sum(-1) / 10.0,

@@ -196,9 +196,8 @@ class TargetTracker:
 
     def drive(self, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
-        robots = self.env.simulation.robot_tensors
-        drive = speed * self.seconds + 0.5 * robots["max_accel"] * self.seconds**2
-        return torch.minimum(drive, robots["max_speed"] * self.seconds)
+        accel, limit = (self.nav.pick(self.env.simulation.robot_tensors[one]) for one in ("max_accel", "max_speed"))
+        return torch.minimum(speed * self.seconds + 0.5 * accel * self.seconds**2, limit * self.seconds)
 
     def speed(self) -> torch.Tensor:
         """Of every robot [m/s], float32 [E, N]."""
@@ -233,7 +232,8 @@ class TargetTracker:
     ) -> torch.Tensor:
         """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
         each robot those that it got stuck on the way to. ``block`` as in `Scene`."""
-        nav, s = self.nav, self.state
+        nav = self.nav
+        s = {name: nav.pick(value) for name, value in self.state.items()}
         step = nav.state["macro_step"]
         fresh, due = step == 0, step != s["counted"]
         s["dwell"][fresh], s["chosen"][fresh] = 0, -1
@@ -255,6 +255,7 @@ class TargetTracker:
         # Nothing else left: try them all once more.
         again = ~kept.isfinite().flatten(1).any(1)
         s["dwell"][again] = 0
+        self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
         return torch.where(again.view(-1, 1, 1), travel, kept)
 
     def _roam(self) -> torch.Tensor:

@@ -24,7 +24,7 @@ def _mark_frontier(
     # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     # Map:
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: leave it as it is
     width: wp.array(dtype=wp.int32),  # [grid]
     height: wp.array(dtype=wp.int32),  # [grid]
     # Out:
@@ -32,6 +32,8 @@ def _mark_frontier(
 ):
     row, y = wp.tid()
     grid = grid_of_row[row]
+    if grid < 0:
+        return
     w = width[grid]
     h = height[grid]
     if y >= h:
@@ -71,7 +73,7 @@ def mark_frontier(
 
     Args:
         known: uint8 [rows, cells], `UNKNOWN`, `FREE` or `OBSTACLE`; cell = iy * width + ix, own width.
-        grid_of_row: int32 [rows], which grid (map) a row has now.
+        grid_of_row: int32 [rows], which grid (map) a row has now; -1: leave its frontier as it is.
         width, height: int32 [grids], cells of each grid along x and y.
         frontier: uint8 [rows, cells], out: 1 on frontier cells, 0 elsewhere.
         tallest: cells of the tallest grid along y.

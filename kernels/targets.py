@@ -9,7 +9,7 @@ import math
 import warp as wp
 
 from maexp.kernels.frontier import OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import UNREACHED
+from maexp.kernels.geodesic import SKIP, UNREACHED
 from maexp.kernels.known_grid import NavGrids, nav_cell
 from maexp.kernels.passable import near_wall
 from maexp.kernels.types import point_xy
@@ -26,7 +26,7 @@ RAY_ANGLE = 2.0 * math.pi / RAYS
 def _locate_robots(
     # Map:
     grids: NavGrids,
-    map_id: wp.array(dtype=wp.int32),  # [env]
+    grid_of_env: wp.array(dtype=wp.int32),  # [env], -1: search nothing, leave the distances as they are
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
@@ -40,7 +40,10 @@ def _locate_robots(
 ):
     e, i = wp.tid()
     item = e * center.shape[1] + i
-    m = map_id[e]
+    m = grid_of_env[e]
+    if m < 0:
+        stop[item] = SKIP
+        return
     stop[item] = -1
     sources[item, 0] = -1
     if active[e] != 0 and collided[e, i] == 0:
@@ -65,7 +68,7 @@ def is_reached(
 def _sum_frontier(
     # Map:
     grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: leave it as it is
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
     # In:
     frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
@@ -76,6 +79,8 @@ def _sum_frontier(
     """Gather the frontier cells of a line of cells in their blocks."""
     row, y = wp.tid()
     m = grid_of_row[row]
+    if m < 0:
+        return
     w = grids.width[m]
     if y >= grids.height[m]:
         return
@@ -94,7 +99,7 @@ def _sum_frontier(
 def _place_targets(
     # Map:
     grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: leave it as it is
     block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
     search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
     # In:
@@ -109,11 +114,13 @@ def _place_targets(
 ):
     """The reached cell nearest to the middle of a block's frontier cells, in the block or close to it."""
     row, k = wp.tid()
+    m = grid_of_row[row]
+    if m < 0:
+        return
     target_cell[row, k] = -1
     count = size[row, k]
     if count == 0:
         return
-    m = grid_of_row[row]
     w = grids.width[m]
     h = grids.height[m]
     b = block[m]

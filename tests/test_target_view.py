@@ -108,8 +108,31 @@ def test_a_reset_of_some_envs_leaves_the_others():
     assert torch.equal(kept[TARGETS][[0, 2]], want[TARGETS][[0, 2]])
 
 
-def test_a_saved_state_goes_on_bit_for_bit():
-    env, fresh = make_env(), make_env()
+@pytest.mark.parametrize(("planner", "reach"), [("wavefront", math.inf), ("wavefront", 12.0), ("dwa", math.inf)])
+def test_a_reset_of_some_envs_looks_at_these_alone(planner, reach):
+    """What they show is what a look at all envs shows, and so is what is kept for later decisions."""
+    env = make_env(planner=PlannerConfig(name=planner), comm=CommConfig(range=reach))
+    td, nav = play(env, 3)[-1], env.target_view.tracker.nav
+    nav.distance[[0, 2]] += 10
+    before = nav.distance.clone()
+    reset = torch.tensor([[False], [True], [False], [True]])
+    after = env._reset(td.clone().set("_reset", reset))
+    assert torch.equal(nav.distance[[0, 2]], before[[0, 2]]), "the ways of the others were searched again"
+    assert not torch.equal(nav.distance[[1, 3]], before[[1, 3]])
+    kept = env.target_view.state_dict()
+    wanted = env.observe()
+    for key in (TARGETS, MASK):
+        assert torch.equal(after[key][[1, 3]], wanted[key][[1, 3]]) and wanted[key][[1, 3]].any()
+        assert not after[key][[0, 2]].any()
+    some = wanted[MASK]
+    for name, value in env.target_view.state_dict().items():
+        listed = value.shape[:3] == some.shape  # absent candidates stand for nothing
+        assert torch.equal(kept[name][some], value[some]) if listed else torch.equal(kept[name], value), name
+
+
+@pytest.mark.parametrize("planner", ["wavefront", "dwa"])
+def test_a_saved_state_goes_on_bit_for_bit(planner):
+    env, fresh = (make_env(planner=PlannerConfig(name=planner)) for _ in range(2))
     td = play(env, 3)[-1]
     fresh.load_state_dict(env.state_dict())
     for a, b in zip(play(env, 3, td.clone()), play(fresh, 3, td.clone()), strict=True):
