@@ -191,11 +191,15 @@ def test_same_step_autoreset(world):
 
 def test_without_autoreset(world):
     batch = vector_env(world, 3, 2, autoreset_mode="Disabled", **SMALL)
-    assert play(batch, 4)[3][3].all()
+    last = play(batch, 4)[3]
+    assert last[3].all()
     with pytest.raises(RuntimeError, match=r"teams \[0, 1, 2\] are done"):
         batch.step(batch.action_space.sample())
     seen, info = batch.reset(options={"reset_mask": np.array([True, False, True])})
     assert info["local_steps"].tolist() == [0, 12, 0]
+    for name in ("map", "team_map"):
+        assert np.array_equal(seen[name][1], last[0][name][1]) and seen[name][1].any(), "the others go on seeing"
+        assert not np.array_equal(seen[name][0], last[0][name][0])
     with pytest.raises(RuntimeError, match=r"teams \[1\] are done"):
         batch.step(batch.action_space.sample())
     batch.reset(options={"reset_mask": np.array([False, True, False])})

@@ -68,6 +68,7 @@ class TeamVectorEnv(VectorEnv):
         self.single_action_space = action_space(action, self._direct, (self.env.num_robots,))
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._done: np.ndarray | None = None
+        self._seen: TensorDictBase | None = None  # what the teams saw last
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         """Start episodes: of all teams, or of those in ``options["reset_mask"]`` (bool [E]).
@@ -101,7 +102,7 @@ class TeamVectorEnv(VectorEnv):
                 f"teams {np.flatnonzero(before).tolist()} are done: call reset(options={{'reset_mask': ...}})"
             )
         action = to_action(actions, self._kind, self._direct, (self.num_envs, self.env.num_robots), self.env.device)
-        now = self.env.step(action)["next"]
+        now = self._seen = self.env.step(action)["next"]
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
             now = self._start_anew(now, before)
         terminated, truncated = (now[key].cpu().numpy().reshape(-1) for key in ("terminated", "truncated"))
@@ -125,10 +126,17 @@ class TeamVectorEnv(VectorEnv):
         self.env.close(raise_if_closed=False)
 
     def _restart(self, mask: np.ndarray) -> TensorDictBase:
-        """A fresh episode for the teams in ``mask``; what all of them see then."""
-        wanted = torch.as_tensor(mask, device=self.env.device).unsqueeze(-1)
-        asked = TensorDict({"_reset": wanted}, batch_size=[self.num_envs], device=self.env.device)
-        return self.env._reset(asked)  # reset() would want the last step's tensordict, only to copy it
+        """A fresh episode for the teams in ``mask``; what all of them see then.
+
+        The env observes these teams alone: the others go on seeing what they saw.
+        """
+        wanted = torch.as_tensor(mask, device=self.env.device)
+        asked = TensorDict({"_reset": wanted.unsqueeze(-1)}, batch_size=[self.num_envs], device=self.env.device)
+        now = self.env._reset(asked)  # reset() would want the last step's tensordict, only to copy it
+        if self._seen is not None:
+            now = now.where(wanted, self._seen.select(*now.keys(True, True)))
+        self._seen = now
+        return now
 
     def _start_anew(self, now: TensorDictBase, before: np.ndarray) -> TensorDictBase:
         """``now`` with a fresh episode for the teams that were done before; the env lets such teams rest and earn 0."""
