@@ -195,7 +195,7 @@ class Navigation:
         self.cell = torch.where(self.block >= 0, cell, -1)
 
     @property
-    def state(self) -> "dict[str, torch.Tensor] | Rows":
+    def state(self) -> dict[str, torch.Tensor] | Rows:
         """The simulation's tensors."""
         return self._state if self.envs is None else Rows(self._state, self.envs)
 
