@@ -96,7 +96,7 @@ STATE = {
         "_place_team _move_robots"),
     "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
     "target": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
-        "_clear_robots _set_goal _pick_waypoint _hold_back"),
+        "_clear_robots _set_goal _pick_waypoint _hold_back _hold_turns"),
     "control": Field(wp.vec2, "E N", "m/s^2, rad", "acceleration, then steering [rad], yaw rate [rad/s] or sideways"
         " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct"),
     "collided": Field(wp.int32, "E N", "", "1 once the robot has collided: it stands for good",

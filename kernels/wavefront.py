@@ -22,6 +22,7 @@ from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.state import robots_struct
+from maexp.kernels.stopping import hold_turns
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import PATH_CELLS, in_sight, is_passable, nearest_cell, nearest_passable, path_slot, step_back
 
@@ -301,6 +302,7 @@ def pick_waypoints(launch: Launch, shard: "Shard") -> None:
         own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.target)
         fit_clearance(launch, shard, own)
         hold_back(launch, shard, own)
+        hold_turns(launch, shard, own)
 
 
 def grid_memory_per_env(

@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 from oracle import pace as oracle
 
-from maexp.kernels import pace, targets
+from maexp.kernels import pace, stopping, targets
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.types import Robots
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, Robots
 from maexp.kernels.ways import PATH_CELLS
 
 pytestmark = pytest.mark.kernels
@@ -121,6 +121,50 @@ def test_waypoints_leave_room_to_brake():
                 got = (target.numpy()[e, i] - ORIGIN[MAP_OF_ENV[e]]) / world.cell[e]
                 np.testing.assert_allclose(got, want, atol=2e-3)
     assert drawn > 10
+
+
+def test_differential_drives_can_stop_on_the_way_that_they_drive():
+    seen = set()
+    for seed in range(8):
+        world = World(seed, obstacles=(0.0, 0.01, 0.03, 0.1)[seed % 4])
+        rng, horizon, dt = world.rng, 3, 0.1
+        kind = np.where(rng.random((3, ROBOTS)) < 0.8, DIFFERENTIAL, ACKERMANN)
+        top, rate, radar = (rng.uniform(a, b, (3, ROBOTS)) for a, b in ((1, 4), (0.5, 3), (2, 12)))
+        kept = world.clearance * rng.uniform(0.3, 1.0, (3, ROBOTS))
+        robots = world.robots()
+        robots.kind, robots.max_turn = array(kind, wp.int32), array(rate, wp.float32)
+        robots.max_speed, robots.radar_range = (array(one * world.cell, wp.float32) for one in (top, radar))
+        pose = np.zeros((3, ROBOTS, 4))
+        pose[..., 2], pose[..., 3] = world.speed * world.cell, world.heading
+        active, collided, center = world.state()
+        target = array(world.metres(world.target), wp.vec2)
+        clearance = array(kept * world.cell, wp.float32)
+        launch(
+            stopping._hold_turns, (3, ROBOTS),
+            [nav_grids(), array(MAP_OF_ENV, wp.int32), robots, 1, horizon, dt,
+             active, collided, array(pose, wp.vec4), center, world.walls()],
+            [target, clearance],
+        )  # fmt: skip
+        for e, i in np.ndindex(3, ROBOTS):
+            want = (*world.target[e, i], kept[e, i])
+            if world.moves(e, i) and kind[e, i] == DIFFERENTIAL:
+                names = ("ease", "looks", "least_look", "straight_on", "nudge", "narrow")
+                p = {name: getattr(stopping, name.upper()) for name in names} | world.constants(e, i) | {
+                    "spare": stopping.SPARE_CELLS, "slowest": stopping.SLOWEST / world.cell[e, 0], "fine": 0.01,
+                    "horizon": horizon, "dt": dt, "top": top[e, i], "rate": rate[e, i], "radar": radar[e, i],
+                }  # fmt: skip
+                back = np.pi if world.speed[e, i] < 0 else 0.0
+                me = {
+                    "x": world.at[e, i, 0], "y": world.at[e, i, 1], "speed": abs(world.speed[e, i]),
+                    "heading": world.heading[e, i] + back, "target": world.target[e, i], "keeps": kept[e, i],
+                }  # fmt: skip
+                want = oracle.held_turn(world.known[e], me, p)
+                aside = np.linalg.det([np.subtract(want[:2], world.at[e, i]), world.target[e, i] - world.at[e, i]])
+                seen |= {("aside", abs(aside) > 1e-6), ("narrowed", want[2] < kept[e, i])}
+            got = (target.numpy()[e, i] - ORIGIN[MAP_OF_ENV[e]]) / world.cell[e]
+            np.testing.assert_allclose(got, want[:2], atol=5e-3)
+            assert clearance.numpy()[e, i] / world.cell[e, 0] == pytest.approx(want[2], abs=1e-5)
+    assert len(seen) == 4
 
 
 def test_clearance_fits_the_narrowest_place_of_the_path_nearby():

@@ -52,7 +52,7 @@ COPY_BYTES = 2**28
 MATRIX = 1536
 MODULES = (
     "collision", "dynamics", "geodesic", "known_grid", "merge", "neighbours", "observe", "pace", "passable", "planner",
-    "reset", "reward", "visibility", "wavefront",
+    "reset", "reward", "stopping", "visibility", "wavefront",
 )  # fmt: skip
 KEY = ("scenario", "planner", "num_envs", "num_robots", "radar_range", "stage", "kernel")
 

@@ -60,6 +60,50 @@ def held_back(known, team, i: int, p) -> tuple[float, float]:
     return me["x"] + tx * share, me["y"] + ty * share
 
 
+def free_way(known, me, heading: float, turn: float, keep: float, span: float, p) -> float:
+    """How far robot `me` gets on a way that turns by `turn` at its rate and speed and then goes straight on: it looks
+    ahead as far as the gap to the nearest obstacle allows, and stops looking where that is less than `keep`."""
+    x, y, s, wanted = me["x"], me["y"], 0.0, 0.0
+    bend = abs(turn) * max(me["speed"], p["slowest"]) / p["rate"]
+    for _ in range(p["looks"]):
+        while s < wanted - 1e-9:  # driven in small steps
+            step = min(wanted - s, p["fine"])
+            angle = heading + (turn * min(s + step / 2, bend) / bend if bend else 0.0)
+            x, y, s = x + step * math.cos(angle), y + step * math.sin(angle), s + step
+        if wanted >= span:
+            break
+        gap = nearest_obstacle(known, x, y, p["look"]) - keep
+        if gap < 0:
+            break
+        wanted += max(gap, p["least_look"])
+    return min(wanted, span)
+
+
+def held_turn(known, me, p) -> tuple[float, float, float]:
+    """Where the waypoint of a differential drive lies once it can stop on its way, and what clearance it keeps.
+
+    `me`: x, y, speed (without sign), heading (of the motion), target, keeps (the clearance so far).
+    """
+    dx, dy = me["target"][0] - me["x"], me["target"][1] - me["y"]
+    lead = p["horizon"] * p["dt"]
+    span = p["top"] ** 2 / (2 * p["ease"] * p["accel"]) + lead * p["top"]
+    span = min(span, p["radar"] - p["threshold"] - 1)
+    keep = min(p["threshold"] + p["spare"], nearest_obstacle(known, me["x"], me["y"], p["look"]))
+    turn = (math.atan2(dy, dx) - me["heading"] + math.pi) % (2 * math.pi) - math.pi
+    straight = free = free_way(known, me, me["heading"], 0.0, keep, span, p)
+    if abs(turn) > p["straight_on"]:
+        free = free_way(known, me, me["heading"], turn, keep, span, p)
+    fastest = math.sqrt(2 * p["ease"] * p["accel"] * max(free - lead * me["speed"], 0))
+    soonest = sum(me["speed"] - p["accel"] * k * p["dt"] for k in range(p["horizon"])) * p["dt"]
+    length = max(min(math.hypot(dx, dy), max(lead * fastest, p["nudge"] * p["clearance"])), soonest, 0)
+    angle, keeps = math.atan2(dy, dx), me["keeps"]
+    if fastest < me["speed"]:
+        keeps = min(keeps, p["narrow"] * p["threshold"])
+        if straight > free:
+            angle, length = me["heading"], max(soonest, 0)
+    return me["x"] + length * math.cos(angle), me["y"] + length * math.sin(angle), keeps
+
+
 def fitted_clearance(known, x: float, y: float, path, p) -> float:
     """What the path's cells (column, row) around (x, y) have of room, between the least and the usual clearance."""
     gaps = [math.inf]
