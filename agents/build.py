@@ -6,8 +6,11 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.algorithms.table import find_algorithm
 from maexp.agents.algorithms.updaters import Updater
@@ -17,7 +20,7 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
-from maexp.agents.settings.schema import SUPPLIED, given
+from maexp.agents.settings.schema import SUPPLIED, EnvSettings, LearnerSettings, ScenarioSettings, TrainSettings, given
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
@@ -71,13 +74,13 @@ def pick_device(name: str, setting: str = "device") -> torch.device:
     return device
 
 
-def choose_device(cfg: Any, name: str) -> torch.device:
+def choose_device(cfg: TrainSettings, name: str) -> torch.device:
     """The device of `collector.sample_device` or `collector.train_device`: what is set there, else `device`."""
-    own = cfg.collector[name]
+    own = getattr(cfg.collector, name)
     return pick_device(cfg.device) if own is None else pick_device(own, f"collector.{name}")
 
 
-def load_maps(scenario: Any, train: bool = True) -> MapSuite:
+def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
     """The maps of a scenario's settings; those trained on are left out unless `train`.
 
     Raises:
@@ -100,7 +103,7 @@ def load_maps(scenario: Any, train: bool = True) -> MapSuite:
     return MapSuite(build(indices) if train else [], build(held_out), unseen, lambda: build(validation or indices))
 
 
-def import_files(scenario: Any) -> list[PointCloudMap]:
+def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of scenario=pointcloud: `scenario.path` names a file, or several with commas between them."""
     from maexp.envs.importing import import_map
 
@@ -114,7 +117,7 @@ def import_files(scenario: Any) -> list[PointCloudMap]:
 
 
 def make_env(
-    cfg: Any, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None, **others: Any
+    cfg: EnvSettings, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None, **others: Any
 ) -> ExplorationEnv:
     """The environment that the settings describe, on `maps`; `others` are arguments of `ExplorationEnv`.
 
@@ -144,7 +147,7 @@ def make_env(
     )
 
 
-def choose_starts(cfg: Any, num_robots: int) -> Any:
+def choose_starts(cfg: EnvSettings, num_robots: int) -> str | np.ndarray:
     """`scenario.starts` for an env: drawn, fixed, or the poses that its file holds.
 
     Raises:
@@ -154,7 +157,7 @@ def choose_starts(cfg: Any, num_robots: int) -> Any:
     return starts if starts in STARTS else read_starts(starts, num_robots)
 
 
-def other_scenarios(cfg: Any, words: Any) -> list[Any]:
+def other_scenarios(cfg: DictConfig, words: DictConfig) -> list[DictConfig]:
     """The settings once more for each scenario of `scenario.also`, with what a scenario supplies left to it.
 
     `words` tell what that is: settings that hold no values of a checkpoint.
@@ -167,7 +170,7 @@ def other_scenarios(cfg: Any, words: Any) -> list[Any]:
     return [_with_scenario(cfg, words, name) for name in names]
 
 
-def _with_scenario(cfg: Any, words: Any, name: str) -> Any:
+def _with_scenario(cfg: DictConfig, words: DictConfig, name: str) -> DictConfig:
     if name not in SCENARIOS or SCENARIOS[name].build is None:
         known = ", ".join(one for one, row in SCENARIOS.items() if row.build is not None)
         raise UserError(f"scenario.also={name} is no scenario with maps of its own: choose among {known}.")
@@ -182,7 +185,7 @@ def _with_scenario(cfg: Any, words: Any, name: str) -> Any:
     return other
 
 
-def set_steps(cfg: Any, env: ExplorationEnv) -> int:
+def set_steps(cfg: TrainSettings, env: ExplorationEnv) -> int:
     """Write down the macro steps of every team in a batch; unless set, those of an episode.
 
     Batches in step with the episodes hold all parts of an episode alike; others would alternate between them.
@@ -191,7 +194,9 @@ def set_steps(cfg: Any, env: ExplorationEnv) -> int:
     return cfg.collector.steps
 
 
-def team_configs(cfg: Any, num_robots: int) -> tuple[Any, Any]:
+def team_configs(
+    cfg: EnvSettings, num_robots: int
+) -> tuple[RobotConfig | list[RobotConfig], RadarConfig | list[RadarConfig]]:
     """Robot and radar of a team: one of each for all robots, or lists where `robot.team` tells robots apart.
 
     An entry of `robot.team` holds settings of a robot, and under `radar` those of its radar. A team larger than
@@ -207,7 +212,7 @@ def team_configs(cfg: Any, num_robots: int) -> tuple[Any, Any]:
     return robots, [RadarConfig(**(radar | one.get("radar", {}))) for one in entries]
 
 
-def _check_team(entries: Any) -> None:
+def _check_team(entries: object) -> None:
     allowed = [one.name for one in fields(RobotConfig)] + ["radar"]
     if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
         raise UserError("robot.team must be a list of settings, as [{kind: ackermann}, {kind: differential}].")
@@ -220,12 +225,12 @@ def _check_team(entries: Any) -> None:
 class Learner:
     """The networks of a run and what trains them."""
 
-    policy: Any
-    critic: Any
+    policy: ProbabilisticActor
+    critic: TensorDictModule
     updater: Updater
 
 
-def make_learner(cfg: Any, env: ExplorationEnv) -> Learner:
+def make_learner(cfg: LearnerSettings, env: ExplorationEnv) -> Learner:
     """Policy, critic and updater of the settings, for the specs of `env`."""
     row = find_algorithm(cfg.algorithm.name)
     settings, model = algorithm_settings(cfg), model_settings(cfg)

@@ -6,10 +6,13 @@ import sys
 import warnings
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 from maexp.agents.errors import UserError, describe_disk_error
 from maexp.agents.memory import keep_freed_memory
+
+if TYPE_CHECKING:  # nobody waits for Hydra to print a line of help
+    from omegaconf import DictConfig
 
 BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 
@@ -167,7 +170,7 @@ def run_verb(name: str, words: list[str]) -> int:
         raise
 
 
-def print_settings(cfg: Any) -> None:
+def print_settings(cfg: "DictConfig") -> None:
     """All settings with the values that they come to, as --cfg job asks for."""
     from maexp.agents.errors import blame_input
     from maexp.agents.settings.resolved import resolve, to_yaml

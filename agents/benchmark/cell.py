@@ -20,6 +20,7 @@ from maexp.agents.evaluation.results import describe_run
 from maexp.agents.files import short, write_file, write_json
 from maexp.agents.policies.classical import CHOICES, POLICIES
 from maexp.agents.progress import Progress
+from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.training.train import TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
@@ -71,7 +72,7 @@ def finished(where: Path, cell: Cell, suite: str) -> bool:
     return (cell_folder(where, cell) / f"{suite}.json").is_file()
 
 
-def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[str]) -> bool:
+def run_cell(cfg: BenchmarkSettings, where: Path, cell: Cell, shelf: EnvShelf, suites: list[str]) -> bool:
     """Bring a cell to its end, from wherever it was left; False if it was told to stop.
 
     Raises:
@@ -89,7 +90,7 @@ def run_cell(cfg: Any, where: Path, cell: Cell, shelf: EnvShelf, suites: list[st
     return True
 
 
-def train_cell(cfg: Any, where: Path, cell: Cell) -> dict | None:
+def train_cell(cfg: BenchmarkSettings, where: Path, cell: Cell) -> dict | None:
     """The last checkpoint of what a cell trains, from wherever it was left; None if it was told to stop.
 
     Another worker that is at the same training is waited for.
@@ -110,7 +111,13 @@ def train_cell(cfg: Any, where: Path, cell: Cell) -> dict | None:
 
 
 def play_suite(
-    cfg: Any, settings: Any, cell: Cell, suite: str, team: dict | None, folder: Path, shelf: EnvShelf
+    cfg: BenchmarkSettings,
+    settings: TrainSettings,
+    cell: Cell,
+    suite: str,
+    team: dict | None,
+    folder: Path,
+    shelf: EnvShelf,
 ) -> None:
     """Play the episodes of one set of maps; writes the arrays, then the summary that marks the end.
 

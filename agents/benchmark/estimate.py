@@ -13,6 +13,7 @@ from maexp.agents.benchmark.plan import Cell, as_list, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner, set_steps
 from maexp.agents.errors import blame_input
 from maexp.agents.policies.classical import POLICIES
+from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.envs.scenarios import find_scenario
 
 FRAMES = 48  # macro steps of teams in a measured batch, at least, where a batch of the training has as many
@@ -61,7 +62,7 @@ class Estimate:
         return f"{max(minutes, 1):.0f} minutes"
 
 
-def estimate_cells(cfg: Any, cells: list[Cell], suites: int, workers: int) -> Estimate:
+def estimate_cells(cfg: BenchmarkSettings, cells: list[Cell], suites: int, workers: int) -> Estimate:
     """Measure every scenario once, and every algorithm once, each on one map and for a few macro steps.
 
     Raises:
@@ -85,7 +86,7 @@ def estimate_cells(cfg: Any, cells: list[Cell], suites: int, workers: int) -> Es
     return Estimate(seconds, workers, details=[f"{', '.join(details)} a macro step of a team"])
 
 
-def _frames(cfg: Any, cell: Cell, suites: int) -> tuple[int, int]:
+def _frames(cfg: BenchmarkSettings, cell: Cell, suites: int) -> tuple[int, int]:
     """(macro steps of teams trained, at most played)."""
     length = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or UNKNOWN_LENGTH
     frames = length_of(cfg, cell).get("total_frames", cfg.total_frames)
@@ -94,12 +95,12 @@ def _frames(cfg: Any, cell: Cell, suites: int) -> tuple[int, int]:
     return (frames if cell.trains else 0), cfg.episodes * suites * length
 
 
-def _volume(cfg: Any, cell: Cell, suites: int) -> float:
+def _volume(cfg: BenchmarkSettings, cell: Cell, suites: int) -> float:
     frames, played = _frames(cfg, cell, suites)
     return PLAIN * (10 * frames + played) / 1000 + OVERHEAD
 
 
-def _measure_env(cfg: Any, cell: Cell) -> tuple[float, float]:
+def _measure_env(cfg: BenchmarkSettings, cell: Cell) -> tuple[float, float]:
     """(seconds a macro step of a team under a classical policy takes, seconds building the env takes)."""
     settings, _ = cell_config(cfg, cell)
     with blame_input():
@@ -113,7 +114,7 @@ def _measure_env(cfg: Any, cell: Cell) -> tuple[float, float]:
     return lap / size, build
 
 
-def _measure_learner(cfg: Any, cell: Cell) -> tuple[float, float]:
+def _measure_learner(cfg: BenchmarkSettings, cell: Cell) -> tuple[float, float]:
     """(seconds the policy takes for a team, seconds an update takes per macro step of a team)."""
     settings, _ = cell_config(cfg, cell)
     if find_scenario(cell.scenario).build is not None:

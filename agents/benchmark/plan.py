@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.errors import UserError
@@ -21,6 +21,7 @@ from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
+from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 PLAN = "benchmark.json"
@@ -66,12 +67,12 @@ class Cell:
         return self.policy in ALGORITHMS
 
 
-def training_cell(cfg: Any, cell: Cell) -> Cell:
+def training_cell(cfg: BenchmarkSettings, cell: Cell) -> Cell:
     """The cell whose folder holds the training: one for all scenarios where they are trained on together."""
     return replace(cell, scenario=TOGETHER) if cfg.together and cell.trains else cell
 
 
-def list_cells(cfg: Any) -> list[Cell]:
+def list_cells(cfg: BenchmarkSettings) -> list[Cell]:
     """All cells in the order they are run: seed by seed, scenario by scenario, classical policies first."""
     names = policy_names(cfg)
     ordered = [one for one in names if one in POLICIES] + [one for one in names if one in ALGORITHMS]
@@ -84,7 +85,7 @@ def list_cells(cfg: Any) -> list[Cell]:
     ]
 
 
-def own_maps(cfg: Any, scenario: str) -> list[int | None]:
+def own_maps(cfg: BenchmarkSettings, scenario: str) -> list[int | None]:
     """The maps that have a policy each, or one None where a policy is trained on all."""
     if cfg.policy_per_map is None:
         return [None]
@@ -98,12 +99,12 @@ def as_list(value: Any) -> list:
     return list(value) if OmegaConf.is_list(value) or isinstance(value, list | tuple) else [value]
 
 
-def policy_names(cfg: Any) -> list[str]:
+def policy_names(cfg: BenchmarkSettings) -> list[str]:
     """Algorithms and classical policies, each once."""
     return list(dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies)))
 
 
-def check_lists(cfg: Any) -> None:
+def check_lists(cfg: DictConfig) -> None:
     """Raise UserError unless scenarios, policies, seeds and maps are lists of what there is."""
     known = {
         "scenarios": list(SCENARIOS), "algorithms": list(ALGORITHMS), "policies": list(POLICIES), "maps": list(SUITES)
@@ -127,7 +128,7 @@ def check_lists(cfg: Any) -> None:
     _check_together(cfg)
 
 
-def _check_together(cfg: Any) -> None:
+def _check_together(cfg: DictConfig) -> None:
     if not cfg.together:
         return
     if cfg.iterations is not None:
@@ -140,7 +141,7 @@ def _check_together(cfg: Any) -> None:
             raise UserError(f"scenarios={scenario} and together=true: only generated scenarios are trained on at once.")
 
 
-def _check_policy_per_map(cfg: Any) -> None:
+def _check_policy_per_map(cfg: BenchmarkSettings) -> None:
     if cfg.policy_per_map is None:
         return
     counts = plain(cfg.policy_per_map) if OmegaConf.is_dict(cfg.policy_per_map) else cfg.policy_per_map
@@ -155,7 +156,7 @@ def _check_policy_per_map(cfg: Any) -> None:
 # Settings of a cell
 
 
-def cell_overrides(cfg: Any, cell: Cell) -> list[str]:
+def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
     """The cell as overrides of `maexp train`: it can be resumed, evaluated and understood by itself."""
     first, *others = as_list(cfg.scenarios) if cell.scenario == TOGETHER else [cell.scenario]
     words = [f"scenario={first}", f"seed={cell.seed}"]
@@ -178,12 +179,12 @@ def _usual() -> dict:
     return raw(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
 
 
-def raw(cfg: Any) -> dict:
+def raw(cfg: DictConfig) -> dict:
     """Settings as plain containers, references to the scenario as they are."""
     return OmegaConf.to_container(cfg, resolve=False)
 
 
-def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
+def _maps_of(cfg: BenchmarkSettings, cell: Cell) -> dict[str, Any]:
     """Which maps the cell trains on and which are held out, where not all of them."""
     if cell.scenario == TOGETHER or find_scenario(cell.scenario).build is None:
         return {}
@@ -198,7 +199,7 @@ def _maps_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     return chosen
 
 
-def length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
+def length_of(cfg: BenchmarkSettings, cell: Cell) -> dict[str, Any]:
     """For `iterations`: each collects one whole episode of every team."""
     if cfg.iterations is None:
         return {}
@@ -208,13 +209,13 @@ def length_of(cfg: Any, cell: Cell) -> dict[str, Any]:
     return {"collector.steps": steps, "total_frames": cfg.iterations * cfg.num_envs * steps}
 
 
-def cell_config(cfg: Any, cell: Cell) -> tuple[Any, list[str]]:
+def cell_config(cfg: BenchmarkSettings, cell: Cell) -> tuple[TrainSettings, list[str]]:
     """(settings of maexp train, overrides) of a cell."""
     words = cell_overrides(cfg, cell)
     return compose_settings("train", words), words
 
 
-def compose_settings(verb: str, overrides: list[str]) -> Any:
+def compose_settings(verb: str, overrides: list[str]) -> DictConfig:
     """The settings of a verb without Hydra's own."""
     return without_hydra(compose_config(verb, overrides))
 
@@ -241,7 +242,7 @@ def cell_folder(where: Path, cell: Cell) -> Path:
     return where / "cells" / cell.name
 
 
-def write_plan(where: Path, cfg: Any, overrides: list[str]) -> None:
+def write_plan(where: Path, cfg: DictConfig, overrides: list[str]) -> None:
     """benchmark.json: the words of the command line, and the settings that all cells share."""
     write_json(where / PLAN, {"overrides": overrides, "settings": shared_settings(cfg)})
 
@@ -263,7 +264,7 @@ def read_plan(place: str | Path) -> dict:
         raise UserError(f"{path} is damaged: start the benchmark anew in another folder.") from error
 
 
-def shared_settings(cfg: Any) -> dict[str, Any]:
+def shared_settings(cfg: DictConfig) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
     shared = {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
@@ -274,7 +275,7 @@ def _is_free(name: str) -> bool:
     return any(name == one or name.startswith(f"{one}.") for one in FREE)
 
 
-def check_unchanged(where: Path, cfg: Any) -> None:
+def check_unchanged(where: Path, cfg: DictConfig) -> None:
     """Raise UserError if a setting differs from that of the cells already there."""
     if not (where / PLAN).is_file() or not any((where / "cells").glob("*/*/*")):
         return

@@ -2,7 +2,6 @@
 
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from maexp.agents.benchmark.table import (
 )
 from maexp.agents.files import short, write_json, write_text
 from maexp.agents.policies.classical import CHOICES
+from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.versions import PACKAGES, find_commit
 
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
@@ -36,7 +36,7 @@ class Report:
         suites: the sets of maps
     """
 
-    def __init__(self, cfg: Any, where: Path, cells: list[Cell], suites: list[str]):
+    def __init__(self, cfg: BenchmarkSettings, where: Path, cells: list[Cell], suites: list[str]):
         self.cfg, self.where, self.cells, self.suites = cfg, where, cells, suites
         self._results: dict[tuple[Cell, str], CellResult] = {}
         self._columns: dict[tuple, Column] = {}

@@ -4,12 +4,12 @@ import importlib
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.overrides import find_override, move_sweeps
 from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.schema import BenchSettings
 
 ONE_VALUE = ("task", "seconds", "baseline", "largest", "device", "hydra")
 
@@ -30,7 +30,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: BenchSettings) -> None:
     """Raise UserError for counts out of range, and for settings that another measurement has."""
     check_counts(cfg, "num_envs")
     check_steps(cfg.collector)
@@ -41,11 +41,12 @@ def check(cfg: Any) -> None:
     if cfg.largest is not None:
         check_counts(cfg, "largest")
     for name, action in (("baseline", "kernels"), ("axes", "scale"), ("largest", "scale")):
-        if cfg[name] is not None and cfg.task != action:
-            raise UserError(f"{name}={cfg[name]} belongs to maexp bench {action}, not to maexp bench {cfg.task}.")
+        value = getattr(cfg, name)
+        if value is not None and cfg.task != action:
+            raise UserError(f"{name}={value} belongs to maexp bench {action}, not to maexp bench {cfg.task}.")
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> int:
     """Measure what `action` names; each has a module of its own."""
     home = importlib.import_module(f"maexp.agents.speed.{cfg.task}")
     with blame_input():

@@ -4,7 +4,6 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from maexp.agents.benchmark.cell import finished
 from maexp.agents.benchmark.estimate import Estimate, estimate_cells
@@ -31,6 +30,7 @@ from maexp.agents.settings.checks import check_counts, check_steps
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.training.train import stop_on_signals, write_config
 
 FAILED, STOPPED = 1, 130
@@ -72,23 +72,23 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
         raise
 
 
-def check(cfg: Any) -> None:
+def check(cfg: BenchmarkSettings) -> None:
     """Raise UserError for counts out of range and unknown names."""
     check_counts(cfg, "num_envs", "num_robots", "total_frames", "checkpoint_every", "checkpoint_keep", "episodes")
     check_steps(cfg.collector)
     for name in ("workers", "iterations", "train_maps", "test_maps"):
-        if cfg[name] is not None:
+        if getattr(cfg, name) is not None:
             check_counts(cfg, name)
     check_lists(cfg)
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: BenchmarkSettings, where: Path, overrides: list[str]) -> int:
     """Run the cells that are not done, then write the tables and pictures."""
     with lock(where):
         return run_locked(cfg, where, overrides)
 
 
-def run_locked(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run_locked(cfg: BenchmarkSettings, where: Path, overrides: list[str]) -> int:
     """The same, while no one else is at the folder."""
     suites = as_list(cfg.maps)
     cells = list_cells(cfg)
@@ -122,7 +122,7 @@ def count_gpus(device: str) -> int:
     return torch.cuda.device_count()
 
 
-def announce(cfg: Any, cells: list[Cell], todo: list[Cell], workers: int) -> None:
+def announce(cfg: BenchmarkSettings, cells: list[Cell], todo: list[Cell], workers: int) -> None:
     """Say what is about to happen."""
     done = len(cells) - len(todo)
     print(f"preset {cfg.preset}: {len(cells)} cells ({len(set(c.policy for c in cells))} policies, "
@@ -134,7 +134,7 @@ def announce(cfg: Any, cells: list[Cell], todo: list[Cell], workers: int) -> Non
         print("measuring a few steps to say how long it will take", flush=True)
 
 
-def confirm(cfg: Any, expected: Estimate) -> None:
+def confirm(cfg: BenchmarkSettings, expected: Estimate) -> None:
     """Say how long it will take; refuse what nobody may have meant."""
     print(expected.text, flush=True)
     if expected.hours > LONG and not cfg.confirm:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
@@ -22,11 +24,14 @@ from maexp.agents.settings.checks import check_counts, check_goals, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
+from maexp.agents.settings.schema import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
 from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
 from maexp.agents.training.checksums import warn_of_changed_maps
 from maexp.agents.training.train import check_action, write_config
+from maexp.envs import ExplorationEnv, PointCloudMap
 
 PICTURES = 4
+Player = str | TensorDictModuleBase  # a classical policy by its name, or a trained one
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -44,7 +49,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: EvaluateSettings) -> None:
     """Raise UserError for counts out of range and unknown policies."""
     check_counts(cfg, "num_envs", "episodes")
     team_sizes(cfg.num_robots)
@@ -53,14 +58,14 @@ def check(cfg: Any) -> None:
     check_render(cfg)
 
 
-def policy_names(cfg: Any) -> list[str]:
+def policy_names(cfg: EvaluateSettings) -> list[str]:
     """The policies asked for by name or folder."""
     if cfg.policy is None:
         return []
     return [cfg.policy] if isinstance(cfg.policy, str) else [str(one) for one in cfg.policy]
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with blame_input():
         suite = load_maps(cfg.scenario, train=False)
@@ -90,7 +95,9 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def load_policy(cfg: Any, env: Any, maps: list) -> Any:
+def load_policy(
+    cfg: EvaluateSettings | ViewSettings | ExportSettings, env: ExplorationEnv, maps: list[PointCloudMap]
+) -> ProbabilisticActor:
     """The policy of a checkpoint, for any team size; says which of the `maps` it will play on have changed since."""
     saved = find_checkpoint(cfg.checkpoint)[1]
     check_action(saved, cfg)
@@ -98,17 +105,17 @@ def load_policy(cfg: Any, env: Any, maps: list) -> Any:
     return restore_policy(env, model_settings(cfg), saved)
 
 
-def open_player(word: str, env: Any) -> Any:
+def open_player(word: str, env: ExplorationEnv) -> Player:
     """What `bind` takes: the name of a classical policy, or a trained one."""
     return word if word in POLICIES else load_policy_folder(word, env)
 
 
-def bind(policy: Any, env: Any) -> Any:
+def bind(policy: Player, env: ExplorationEnv) -> TensorDictModuleBase:
     """A policy to call: the classical ones are made for an env, the trained one fits every env."""
     return POLICIES[policy](env) if isinstance(policy, str) else policy
 
 
-def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[EvaluationResult]:
+def evaluate_all(cfg: EpisodeSettings, env: ExplorationEnv, policies: dict[str, Player]) -> list[EvaluationResult]:
     """Each policy on the same episodes."""
     results = []
     for name, policy in policies.items():
@@ -119,7 +126,7 @@ def evaluate_all(cfg: Any, env: Any, policies: dict[str, Any]) -> list[Evaluatio
     return results
 
 
-def evaluate_places(cfg: Any, envs: list, policies: dict[str, Any]) -> list[EvaluationResult]:
+def evaluate_places(cfg: EvaluateSettings, envs: list, policies: dict[str, Player]) -> list[EvaluationResult]:
     """Each policy on the same episodes in each of several places, and in all of them together."""
     parts = [evaluate_all(cfg, env, policies) for env in envs]
     if len(envs) == 1:
@@ -130,7 +137,9 @@ def evaluate_places(cfg: Any, envs: list, policies: dict[str, Any]) -> list[Eval
     return results
 
 
-def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Path) -> list[Path]:
+def film_all(
+    cfg: EvaluateSettings, env: ExplorationEnv, maps: list[PointCloudMap], policies: dict[str, Player], where: Path
+) -> list[Path]:
     """A film of each policy in the first `render_envs` of the episodes, and the episodes as files."""
     films = []
     env = make_env(cfg, maps, env.num_robots, min(cfg.render_envs, cfg.episodes))
@@ -143,7 +152,12 @@ def film_all(cfg: Any, env: Any, maps: list, policies: dict[str, Any], where: Pa
 
 
 def report(
-    cfg: Any, results: list[EvaluationResult], suite: MapSuite, best: dict[int, str | None], path: Path, **extra: Any
+    cfg: EpisodeSettings,
+    results: list[EvaluationResult],
+    suite: MapSuite,
+    best: dict[int, str | None],
+    path: Path,
+    **extra: Any,
 ) -> None:
     """The table on the terminal, how far the learned team is ahead of the best classical planner, and the JSON.
 
@@ -179,7 +193,7 @@ def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSui
     return words + ", for each team size" * (len({one.num_robots for one in results}) > 1)
 
 
-def draw_ends(cfg: Any, maps: list, name: str, policy: Any, path: Path) -> None:
+def draw_ends(cfg: EvaluateSettings, maps: list, name: str, policy: Player, path: Path) -> None:
     """The last moment of the first few episodes of a policy, side by side."""
     from maexp.envs.render import draw_teams
     from maexp.envs.viewing.show import write_picture

@@ -15,6 +15,7 @@ from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
+from maexp.agents.settings.schema import ExportSettings
 from maexp.agents.training.checkpoint import find_checkpoint
 
 
@@ -31,7 +32,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: ExportSettings) -> None:
     """Raise UserError for what cannot be written."""
     team_sizes(cfg.num_robots)
     if not cfg.out:
@@ -39,7 +40,7 @@ def check(cfg: Any) -> None:
     check_writable(Path(cfg.out).absolute())
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
     """Write the folder."""
     out = Path(cfg.out)
     sizes = team_sizes(cfg.num_robots)
@@ -57,7 +58,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def describe_training(cfg: Any, saved: dict) -> dict[str, Any]:
+def describe_training(cfg: ExportSettings, saved: dict) -> dict[str, Any]:
     """How the policy of a checkpoint was trained."""
     settings = settings_of(saved)
     return {
@@ -71,7 +72,7 @@ def describe_training(cfg: Any, saved: dict) -> dict[str, Any]:
     }
 
 
-def result_files(cfg: Any, checkpoint: Path) -> list[Path]:
+def result_files(cfg: ExportSettings, checkpoint: Path) -> list[Path]:
     """Results of the evaluations that are named, or else of the run's own."""
     if cfg.results:
         return [find_results(Path(one)) for one in split_folders(cfg.results)]

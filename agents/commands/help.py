@@ -1,11 +1,14 @@
 """`maexp VERB --help`: examples, settings and the choices of each group."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from maexp.agents.settings.compose import group_choices, groups
 
+if TYPE_CHECKING:
+    from maexp.agents.cli import Verb
 
-def verb_help(name: str, verb: Any) -> str:
+
+def verb_help(name: str, verb: "Verb") -> str:
     """The help of a verb; the choices are the files of `conf/` with the comment on their first line."""
     from maexp.agents.settings.schema import describe, schema
 

@@ -4,7 +4,6 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from maexp.agents.policies.load import open_policy
 from maexp.agents.runtime import CHOICES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import given
+from maexp.agents.settings.schema import IrsimSettings, given
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.film import write_gif
 from maexp.envs.scenarios import default_macro_steps, find_scenario
@@ -31,7 +30,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: IrsimSettings) -> None:
     """Raise UserError for what is missing or out of range, before a folder is made."""
     check_counts(cfg, "num_robots")
     check_counts(cfg, "episode", "people", "seed", least=0)
@@ -43,7 +42,7 @@ def check(cfg: Any) -> None:
         raise UserError('maexp irsim needs the simulator ir-sim: pip install "maexp[irsim]".')
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
     from maexp.agents.irsim import ours
     from maexp.agents.irsim.pictures import draw_curves, draw_moment
@@ -81,7 +80,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def make_config(cfg: Any, world: PointCloudMap):
+def make_config(cfg: IrsimSettings, world: PointCloudMap):
     """The trial of these settings; what is not given is that of the floor's scenario."""
     from maexp.agents.irsim.config import DT, TOLERANCE, TrialConfig
 

@@ -12,7 +12,7 @@ from maexp.agents.files import write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import given
+from maexp.agents.settings.schema import MapsSettings, given
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.importing.bags import is_bag
@@ -33,7 +33,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
     return None if find_override(overrides, "task") == "list" else claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: MapsSettings) -> None:
     """Raise UserError for what is missing or out of range, before a folder is made."""
     check_counts(cfg, "num_robots")
     check_counts(cfg, "index", least=0)
@@ -57,12 +57,12 @@ def check(cfg: Any) -> None:
         check_folder(cfg)
 
 
-def _is_folder(cfg: Any) -> bool:
+def _is_folder(cfg: MapsSettings) -> bool:
     """Whether a folder of several files is to be imported; the folder of a bag is one map."""
     return cfg.task == "import" and Path(cfg.file).is_dir() and not is_bag(Path(cfg.file))
 
 
-def check_folder(cfg: Any) -> None:
+def check_folder(cfg: MapsSettings) -> None:
     """Raise UserError for settings that are meant for one file."""
     if cfg.out:
         raise UserError(f"out={cfg.out} is for one file: hydra.run.dir=FOLDER says where the maps of {cfg.file} go.")
@@ -71,7 +71,7 @@ def check_folder(cfg: Any) -> None:
     find_files(Path(cfg.file))
 
 
-def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
+def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
     """Do what `action` says; 1 where the map turned out unusable."""
     if cfg.task == "list":
         print_scenarios()
@@ -96,7 +96,7 @@ def run(cfg: Any, where: Path | None, overrides: list[str]) -> int:
     return 0 if report.ok else UNUSABLE
 
 
-def write_files(cfg: Any, where: Path, world: PointCloudMap, imported: ImportReport | None) -> list[Path]:
+def write_files(cfg: MapsSettings, where: Path, world: PointCloudMap, imported: ImportReport | None) -> list[Path]:
     """The map (unless it was only looked at) and its picture, in the run's folder or where `out` says."""
     name = file_name(world)
     out = Path(cfg.out) if cfg.out else where / (f"{name}.png" if cfg.task == "show" else f"{name}.npz")
@@ -119,7 +119,7 @@ def file_name(world: PointCloudMap) -> str:
     return re.sub(r"[^\w .()=+-]", "_", world.name)[:100].lstrip(".") or "map"
 
 
-def read_map(cfg: Any) -> tuple[PointCloudMap, ImportReport | None]:
+def read_map(cfg: MapsSettings) -> tuple[PointCloudMap, ImportReport | None]:
     """The map of a scenario's name or of a file, and what the import did."""
     if cfg.file in SCENARIOS and not Path(cfg.file).exists():
         return make_map(cfg.file, cfg.index), None
@@ -128,7 +128,7 @@ def read_map(cfg: Any) -> tuple[PointCloudMap, ImportReport | None]:
     return import_map_with_report(cfg.file, **import_options(cfg))
 
 
-def import_options(cfg: Any) -> dict[str, Any]:
+def import_options(cfg: MapsSettings) -> dict[str, Any]:
     """The settings of the import that were given, and the team."""
     return {"num_robots": cfg.num_robots} | given(cfg.importing)
 

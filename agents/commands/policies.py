@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.folder import CARD, read_contract
 from maexp.agents.runtime.shipped import SHIPPED, find_policy, shipped_names
 from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.schema import PoliciesSettings
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -18,7 +18,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> None:
     """Nothing is written."""
 
 
-def check(cfg: Any) -> None:
+def check(cfg: PoliciesSettings) -> None:
     """Raise UserError for a name too much or too few."""
     if cfg.task == "list" and cfg.name:
         raise UserError(f"maexp policies list lists all and takes no name: leave {cfg.name} out.")
@@ -26,7 +26,7 @@ def check(cfg: Any) -> None:
         raise UserError(f"maexp policies show needs a name after it: {', '.join(shipped_names())}.")
 
 
-def run(cfg: Any, where: None, overrides: list[str]) -> int:
+def run(cfg: PoliciesSettings, where: None, overrides: list[str]) -> int:
     """Print one line a policy, or the card of one and where it lies."""
     with blame_input():
         if cfg.task == "list":

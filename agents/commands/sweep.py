@@ -3,7 +3,6 @@
 import os
 import sys
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import hydra
@@ -18,7 +17,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.compose import compose_config, explain
 from maexp.agents.settings.overrides import find_override, without
-from maexp.agents.settings.schema import register_schema
+from maexp.agents.settings.schema import TrainSettings, register_schema
 
 
 def run_sweep(verb: str, overrides: list[str]) -> int:
@@ -63,7 +62,7 @@ def _default_folder(verb: str) -> str:
     return OmegaConf.select(compose_config(verb, []), "hydra.sweep.dir")
 
 
-def _run_job(cfg: Any) -> None:
+def _run_job(cfg: TrainSettings) -> None:
     settings = HydraConfig.get()
     overrides = list(settings.overrides.task)
     print(f"Run {settings.job.num}: {' '.join(overrides)}")

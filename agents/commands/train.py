@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from maexp.agents.build import choose_device, make_env
 from maexp.agents.commands.evaluate import bind, draw_results, evaluate_all, report
@@ -14,6 +13,7 @@ from maexp.agents.policies.classical import POLICIES
 from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
+from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger
@@ -54,7 +54,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return found
 
 
-def check(cfg: Any) -> None:
+def check(cfg: TrainSettings) -> None:
     """Raise UserError for counts out of range."""
     check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep")
     check_counts(cfg, "episodes", "evaluate_every", least=0)
@@ -69,14 +69,14 @@ def check(cfg: Any) -> None:
     check_distinct("classical", classical_names(cfg))
 
 
-def classical_names(cfg: Any) -> list[str]:
+def classical_names(cfg: TrainSettings) -> list[str]:
     """The classical policies played at the end."""
     if cfg.classical is None:
         return []
     return [cfg.classical] if isinstance(cfg.classical, str) else [str(one) for one in cfg.classical]
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
     saved = _resumable(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
@@ -98,7 +98,7 @@ def _list(sizes: list[int]) -> str:
     return " and ".join(filter(None, (", ".join(map(str, sizes[:-1])), str(sizes[-1]))))
 
 
-def _describe(cfg: Any) -> str:
+def _describe(cfg: TrainSettings) -> str:
     """Who simulates, where that is not this process; and whether what is learned from is one batch old."""
     if cfg.collector.backend == "single":
         return ""
@@ -135,7 +135,7 @@ def draw_curves(where: Path) -> None:
     draw(where / "metrics.csv", where / "curves.png")
 
 
-def draw_rollout(cfg: Any, done: TrainingRun, best: str | None, path: Path) -> None:
+def draw_rollout(cfg: TrainSettings, done: TrainingRun, best: str | None, path: Path) -> None:
     """A film of the trained team in the first held-out episode, beside the best classical planner if there is one."""
     from maexp.agents.evaluation.films import draw_film, play_teams
     from maexp.envs.film import write_gif

@@ -4,7 +4,6 @@ import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from maexp.agents.policies.load import check_policies, policy_name, show_targets
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import given
+from maexp.agents.settings.schema import ViewSettings, given
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.envs import PointCloudMap, import_map, make_map
 from maexp.envs.render import percent
@@ -57,7 +56,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     return claim()
 
 
-def check(cfg: Any) -> None:
+def check(cfg: ViewSettings) -> None:
     """Raise UserError for what cannot be viewed, before a folder is made."""
     check_counts(cfg, "num_envs", "num_robots")
     check_counts(cfg, "index", "port", least=0)
@@ -96,7 +95,7 @@ def holds_episodes(place: str | None) -> bool:
     return place is not None and Path(place).exists() and bool(episode_files(Path(place)))
 
 
-def wants_page(cfg: Any) -> bool:
+def wants_page(cfg: ViewSettings) -> bool:
     """Whether a page is asked for, in the browser or as a file."""
     return cfg.browser or str(cfg.out).endswith(".html")
 
@@ -111,7 +110,7 @@ def check_out(out: Path) -> None:
         raise UserError(f"out={out} lies in no folder: make {out.parent} first.")
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> int:
+def run(cfg: ViewSettings, where: Path, overrides: list[str]) -> int:
     """Find what is to be seen, and show it as asked and as this machine can."""
     with blame_input():
         episodes, world = find_subject(cfg, where)
@@ -126,7 +125,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> int:
     return status
 
 
-def find_subject(cfg: Any, where: Path) -> tuple[list[Episode], PointCloudMap | None]:
+def find_subject(cfg: ViewSettings, where: Path) -> tuple[list[Episode], PointCloudMap | None]:
     """The episodes to be seen, or else the map.
 
     Raises:
@@ -199,7 +198,7 @@ def split_name(file: Path) -> tuple[int, str]:
     return (int(number), name) if number.isascii() and number.isdigit() else (0, file.stem)
 
 
-def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
+def find_map(cfg: ViewSettings, place: Path | None) -> PointCloudMap:
     """The map of a file, of scenario=pointcloud, or of a scenario and an index."""
     if place is not None:
         return import_map(str(place), **given(cfg.scenario.importing))
@@ -208,11 +207,12 @@ def find_map(cfg: Any, place: Path | None) -> PointCloudMap:
     return make_map(cfg.scenario.name, cfg.index)
 
 
-def check_team(cfg: Any, episodes: list[Episode]) -> None:
+def check_team(cfg: ViewSettings, episodes: list[Episode]) -> None:
     """Raise UserError for what needs a team where there is none, and for a robot that is not in every team."""
     for name in ("seen_by", "episode", "seconds"):
-        if cfg[name] is not None and not episodes:
-            raise UserError(f"{name}={cfg[name]} is not here: there is no team on a map alone; add policy=NAME.")
+        value = getattr(cfg, name)
+        if value is not None and not episodes:
+            raise UserError(f"{name}={value} is not here: there is no team on a map alone; add policy=NAME.")
     fewest = min((one.num_robots for one in episodes), default=0)
     if cfg.seen_by is not None and not 0 <= cfg.seen_by < fewest:
         raise UserError(f"seen_by={cfg.seen_by} is not here: give one of 0 to {fewest - 1}.")
@@ -233,7 +233,7 @@ def record_at(episode: Episode, seconds: float | None) -> int:
     return max(int(np.searchsorted(episode.seconds, seconds + 1e-6, side="right")) - 1, 0)
 
 
-def show_scene(cfg: Any, episodes: list[Episode], world: PointCloudMap | None, where: Path) -> int:
+def show_scene(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap | None, where: Path) -> int:
     """The first episode, or the map: a window where there is a display, else a picture."""
     snapshot = None
     if episodes:
@@ -258,21 +258,22 @@ def show_scene(cfg: Any, episodes: list[Episode], world: PointCloudMap | None, w
     return 0
 
 
-def see_again(cfg: Any, where: Path) -> list[str]:
+def see_again(cfg: ViewSettings, where: Path) -> list[str]:
     """The words that show what was just seen again, without playing it anew."""
     if (where / EPISODES).is_dir():
         return [short(where)]
-    return [str(cfg.place), *(f"{name}={cfg[name]}" for name in ("policy", "episode") if cfg[name] is not None)]
+    again = {"policy": cfg.policy, "episode": cfg.episode}
+    return [str(cfg.place), *(f"{name}={value}" for name, value in again.items() if value is not None)]
 
 
-def make_stage(cfg: Any, world: PointCloudMap, has_team: bool) -> Stage:
+def make_stage(cfg: ViewSettings, world: PointCloudMap, has_team: bool) -> Stage:
     """The map with its walls cut: as set, or so that a team can be seen between them."""
     (xmin, ymin), (xmax, ymax) = world.extent
     default = CUT_SHARE * max(xmax - xmin, ymax - ymin) if has_team else None
     return Stage(world, default if cfg.cut is None else cfg.cut)
 
 
-def show_page(cfg: Any, episodes: list[Episode], world: PointCloudMap | None) -> int:
+def show_page(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap | None) -> int:
     """The page in the browser until interrupted, or the page as a file."""
     from maexp.envs.viewing.page import Page, write_page
 

@@ -8,12 +8,15 @@ from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CHOICES, POLICIES
 from maexp.agents.progress import Progress
+from maexp.agents.settings.schema import EpisodeSettings
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"
 
 
-def choose_best(cfg: Any, suite: MapSuite, names: Sequence[str], num_robots: int, **others: Any) -> str | None:
+def choose_best(
+    cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num_robots: int, **others: Any
+) -> str | None:
     """The classical planner among `names` that sees most over time on the validation maps; None where there is none.
 
     Args:

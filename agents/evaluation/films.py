@@ -2,12 +2,14 @@
 
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from maexp.agents.errors import UserError
+from maexp.agents.settings.schema import EvaluateSettings
+from maexp.envs import ExplorationEnv
 from maexp.envs.film import write_gif, write_mp4
 from maexp.envs.render import add_headline, draw_frame, draw_grid, watch_episode
 from maexp.envs.viewing.episode import Episode, EpisodeRecorder
@@ -18,7 +20,7 @@ MOST_TEAMS = 64  # in one film or on one page
 WIDTHS = ((1, 512), (2, 440), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
 
 
-def check_render(cfg: Any) -> None:
+def check_render(cfg: EvaluateSettings) -> None:
     """Raise UserError where no film could be written at the end."""
     if cfg.render_format not in WRITERS:
         raise UserError(f"render_format={cfg.render_format} is unknown: choose one of {', '.join(WRITERS)}.")
@@ -36,7 +38,13 @@ def check_render(cfg: Any) -> None:
 
 
 def play_teams(
-    env: Any, policy: Any, name: str, *, first: int = 0, seed: int = 0, every: int | None = None
+    env: ExplorationEnv,
+    policy: TensorDictModuleBase,
+    name: str,
+    *,
+    first: int = 0,
+    seed: int = 0,
+    every: int | None = None,
 ) -> list[Episode]:
     """Evaluation episodes `first`, `first` + 1, ... of all teams of `env`, recorded.
 

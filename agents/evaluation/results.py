@@ -2,7 +2,6 @@
 
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -12,6 +11,7 @@ from rich.table import Table
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import write_json
+from maexp.agents.settings.schema import EpisodeSettings
 from maexp.agents.versions import PACKAGES, find_commit
 
 COLUMNS = {
@@ -27,7 +27,7 @@ COLUMNS = {
 }
 
 
-def describe_run(cfg: Any, maps: list, seconds: float) -> dict:
+def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
     """What was run: scenario, maps, seed, commit, versions."""
     return {
         "scenario": cfg.scenario.name,

@@ -1,11 +1,12 @@
 """Weights of a policy: loaded only into the network they belong to."""
 
-from typing import Any
+
+from torch import nn
 
 from maexp.agents.errors import UserError
 
 
-def load_matching(policy: Any, state: dict) -> None:
+def load_matching(policy: nn.Module, state: dict) -> None:
     """Load a policy's weights.
 
     Raises:

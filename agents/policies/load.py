@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+
+from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy
@@ -13,6 +14,7 @@ from maexp.agents.runtime.folder import AGAIN, WEIGHTS, Contract, read_checked, 
 from maexp.agents.runtime.shipped import CONTRACT, find_policy, shipped_names
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.model import ModelConfig
+from maexp.agents.settings.schema import EnvSettings
 from maexp.envs import ExplorationEnv
 
 
@@ -51,7 +53,7 @@ def check_policies(words: list[str], setting: str = "policy") -> None:
     check_distinct(setting, [policy_name(word) for word in words])
 
 
-def show_targets(cfg: Any, words: Iterable[str], setting: str = "policy") -> None:
+def show_targets(cfg: EnvSettings, words: Iterable[str], setting: str = "policy") -> None:
     """Let the env of the settings show as many targets as the trained policies among `words` look at.
 
     Raises:
@@ -66,7 +68,7 @@ def show_targets(cfg: Any, words: Iterable[str], setting: str = "policy") -> Non
         cfg.observation.targets = next(iter(counts.values()))
 
 
-def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") -> Any:
+def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") -> ProbabilisticActor:
     """The trained policy in torch, on the device of `env`, for teams of any size; it takes the likeliest target, as on
     a robot.
 

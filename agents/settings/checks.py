@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
+from omegaconf import DictConfig
+
 from maexp.agents.errors import UserError
 
 LAST_SEED = 2**31 - 1  # the kernels' random numbers start from a 32-bit integer
 
 
-def check_counts(node: Any, *names: str, least: int = 1, prefix: str = "") -> None:
+def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = "") -> None:
     """Raise UserError unless each setting is a whole number of at least `least`."""
     for name in names:
         value = node[name]
@@ -16,7 +18,7 @@ def check_counts(node: Any, *names: str, least: int = 1, prefix: str = "") -> No
             raise UserError(f"{prefix}{name}={value} must be a whole number, {least} or more.")
 
 
-def check_steps(collector: Any) -> None:
+def check_steps(collector: DictConfig) -> None:
     """Raise UserError unless `collector.steps` is a whole number of at least 1, or null: those of an episode."""
     if collector.steps is not None:
         check_counts(collector, "steps", prefix="collector.")

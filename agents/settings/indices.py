@@ -7,10 +7,11 @@ from omegaconf import OmegaConf
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.schema import ScenarioSettings
 from maexp.envs.scenarios import cut_last_fifth, split
 
 
-def map_indices(scenario: Any) -> tuple[list[int], list[int], list[int]]:
+def map_indices(scenario: ScenarioSettings) -> tuple[list[int], list[int], list[int]]:
     """Indices of the maps that a scenario's settings train on, validate on (none: those trained on) and hold out."""
     trained_on, held_out = split(scenario.name)
     if scenario.held_out is not None and scenario.held_out_count is not None:

@@ -4,12 +4,12 @@ from dataclasses import asdict, fields
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.settings.algorithms import Settings, find_presets
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import given
+from maexp.agents.settings.schema import EnvSettings, LearnerSettings, ScenarioSettings, given
 from maexp.envs.config import (
     CommConfig,
     ObservationConfig,
@@ -29,17 +29,17 @@ FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfi
 PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
 
 
-def plain(cfg: Any) -> dict:
+def plain(cfg: DictConfig) -> dict:
     """Settings as plain containers, without Hydra's own."""
     return OmegaConf.to_container(without_hydra(cfg), resolve=True)
 
 
-def without_hydra(cfg: Any) -> Any:
+def without_hydra(cfg: DictConfig) -> DictConfig:
     """The settings without Hydra's own."""
     return OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
 
 
-def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
+def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
     """All settings with the values that they come to; what does not apply is absent, so that nothing is null.
 
     Args:
@@ -68,7 +68,7 @@ def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
     return _without_null(settings)
 
 
-def _resolve_scenario(scenario: Any, row: Scenario, maps: list | None) -> dict[str, Any]:
+def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | None) -> dict[str, Any]:
     settings = {"local_steps": scenario.local_steps or row.local_steps}
     fallback = default_macro_steps(maps, row) if maps and not row.macro_steps else row.macro_steps
     settings["macro_steps"] = scenario.macro_steps or fallback
@@ -84,7 +84,7 @@ def plain_value(value: Any) -> Any:
     return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
-def _resolve_robot(cfg: Any, row: Scenario) -> dict[str, Any]:
+def _resolve_robot(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
     robot, radar = given(cfg.robot, "team"), given(cfg.radar)
     team = []
@@ -95,22 +95,22 @@ def _resolve_robot(cfg: Any, row: Scenario) -> dict[str, Any]:
     return asdict(complete_robot(RobotConfig(**robot), row)) | {"team": team or None}
 
 
-def _resolve_planner(cfg: Any, row: Scenario) -> dict[str, Any]:
+def _resolve_planner(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
     planner = asdict(complete_planner(PlannerConfig(**given(cfg.planner)), row))
     return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(cfg.planner.name, ())}
 
 
-def algorithm_settings(cfg: Any) -> Settings:
+def algorithm_settings(cfg: LearnerSettings) -> Settings:
     """The settings of the algorithm."""
     return find_presets(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
 
 
-def model_settings(cfg: Any) -> ModelConfig:
+def model_settings(cfg: LearnerSettings) -> ModelConfig:
     """The sizes of the networks."""
     return ModelConfig(**given(cfg.model))
 
 
-def find_followers(cfg: Any) -> list[str]:
+def find_followers(cfg: DictConfig) -> list[str]:
     """Names of the settings that follow the scenario, as radar.range: null, or a reference to what it says."""
     names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
     for group, kind in FOLLOWERS.items():
@@ -119,7 +119,7 @@ def find_followers(cfg: Any) -> list[str]:
     return found + ["robot.team"] * bool(cfg.robot.team)
 
 
-def _follows(cfg: Any, group: str, name: str) -> bool:
+def _follows(cfg: DictConfig, group: str, name: str) -> bool:
     return OmegaConf.is_interpolation(cfg[group], name) or cfg[group][name] is None
 
 

@@ -3,6 +3,9 @@
 Values live in `conf/`, types here. Where settings belong to a class of the layers below (`RobotConfig`,
 `ModelConfig`, ...), their names and types are read from that class, each optional: null where a group does not have
 the setting, or where its value follows from the map.
+
+Hydra hands on a `DictConfig` of these types. A function that reads settings by attribute names the dataclass, so that
+one sees what there is; one that looks settings up by name, or takes any verb's, says `DictConfig`.
 """
 
 import types
@@ -11,7 +14,7 @@ from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, DictConfig
 
 from maexp.agents.runtime.choices import CHOICES
 from maexp.agents.settings.algorithms import PRESETS
@@ -45,7 +48,7 @@ def storable_type(kind: Any) -> Any:
     return union | None
 
 
-def given(node: Any, *leave_out: str) -> dict[str, Any]:
+def given(node: DictConfig, *leave_out: str) -> dict[str, Any]:
     """The values of a settings node that are not null, without the names in `leave_out`."""
     return {name: value for name, value in node.items() if value is not None and name not in leave_out}
 
@@ -191,6 +194,10 @@ class EvaluateSettings(LearnerSettings):
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
     render_envs: int = setting(1, "teams in a film, side by side, each in a held-out episode of its own")
     render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")
+
+
+EpisodeSettings = TrainSettings | EvaluateSettings
+"""Of the verbs that play evaluation episodes with several policies."""
 
 
 @dataclass

@@ -4,19 +4,19 @@ The formulas of `counts` turn these counts into bytes and operations. Counting r
 NumPy on a sample of robots, apart from the kernels; it takes seconds, not microseconds.
 """
 
-from typing import Any
 
 import numpy as np
 import torch
 
 from maexp.envs import ExplorationEnv
 from maexp.kernels.shadows import BINS
+from maexp.kernels.shards import Shard
 from maexp.kernels.types import PIXELS
 
 SAMPLE = 64  # robots that are looked at one by one
 
 
-def count_moment(env: ExplorationEnv, shard: Any, active: torch.Tensor) -> dict[str, float]:
+def count_moment(env: ExplorationEnv, shard: Shard, active: torch.Tensor) -> dict[str, float]:
     """Means per robot of a shard at this moment; robots of frozen envs count as zeros.
 
     The scratch of the last scan must still be there: call it right after a local step, with what was `active` [E]
@@ -30,7 +30,7 @@ def count_moment(env: ExplorationEnv, shard: Any, active: torch.Tensor) -> dict[
     return counts | count_sizes(env, shard)
 
 
-def count_sizes(env: ExplorationEnv, shard: Any) -> dict[str, float]:
+def count_sizes(env: ExplorationEnv, shard: Shard) -> dict[str, float]:
     """What does not depend on where the robots are."""
     sim, s = env.simulation, env.simulation.tensors
     part = slice(shard.first, shard.last)

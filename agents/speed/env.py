@@ -9,6 +9,7 @@ import torch
 
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.progress import Progress
+from maexp.agents.settings.schema import BenchSettings
 from maexp.agents.speed.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
 from maexp.envs import ExplorationEnv
 from maexp.envs.simulation import bytes_per_env
@@ -28,7 +29,7 @@ WARM_LAPS = 4
 time a step)."""
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
     """Robot-local-steps and macro steps per second at every point; ``where/bench_env.json`` and tables.
 
     A robot-local-step holds planner, motion, collision, radar, merging and reward; the observation is drawn once
@@ -90,7 +91,7 @@ class Batch:
         env: an env with those settings
     """
 
-    def __init__(self, cfg: Any, env: ExplorationEnv):
+    def __init__(self, cfg: BenchSettings, env: ExplorationEnv):
         self.cfg, self.env = cfg, env
         begin = time.perf_counter()
         torch.manual_seed(cfg.seed)
@@ -137,14 +138,14 @@ class Batch:
         }
 
 
-def measure_batch(cfg: Any, env: ExplorationEnv) -> dict:
+def measure_batch(cfg: BenchSettings, env: ExplorationEnv) -> dict:
     """Throughput of a batch over at least ``cfg.seconds``."""
     batch = Batch(cfg, env)
     batch.run(cfg.seconds, LEAST_LAPS)
     return batch.summary()
 
 
-def measure_latency(cfg: Any, maps: list, macro_steps: int = 10) -> float:
+def measure_latency(cfg: BenchSettings, maps: list, macro_steps: int = 10) -> float:
     """Seconds per local step of a single env: the paper's measure."""
     env = make_env(cfg, maps[:1], cfg.num_robots, num_envs=1)
     state = env.reset()

@@ -20,6 +20,7 @@ import warp as wp
 from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
+from maexp.agents.settings.schema import BenchSettings
 from maexp.agents.speed.census import count_moment
 from maexp.agents.speed.counts import kernel_cost
 from maexp.agents.speed.env import advance
@@ -36,6 +37,7 @@ from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.planner import set_goals
+from maexp.kernels.shards import Shard
 from maexp.kernels.step import local_step, observe, reset
 from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import find_paths, pick_waypoints
@@ -67,7 +69,7 @@ class Step:
     outputs: list[wp.array]
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
     """Times, bytes and operations of every kernel at every point; ``where/bench_kernels.json`` and tables."""
     points = sweep_points(cfg, overrides, TEAM_SIZES)
     before = load_baseline(cfg.baseline) if cfg.baseline else None
@@ -125,7 +127,7 @@ def load_modules(device: torch.device) -> dict[str, float]:
     return seconds
 
 
-def measure_kernels(env: ExplorationEnv, cfg: Any) -> list[dict]:
+def measure_kernels(env: ExplorationEnv, cfg: BenchSettings) -> list[dict]:
     """One row per kernel and stage of the first shard, at a moment some macro steps into the first episodes.
 
     A launch takes all envs of the shard at once; a run goes through them block by block, with warmer caches.
@@ -157,7 +159,7 @@ def measure_kernels(env: ExplorationEnv, cfg: Any) -> list[dict]:
     return rows
 
 
-def record_steps(env: ExplorationEnv, shard: Any) -> list[Step]:
+def record_steps(env: ExplorationEnv, shard: Shard) -> list[Step]:
     """Every launch of a macro step with one local step in it, then those of an observation and of a reset."""
     steps: list[Step] = []
     stage = STAGES[0]

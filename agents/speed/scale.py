@@ -5,10 +5,9 @@ on the CPU it is the processor's time, summed over threads.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
@@ -22,6 +21,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_distinct
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
+from maexp.agents.settings.schema import BenchSettings
 from maexp.agents.speed.env import Batch
 from maexp.agents.speed.shared import LEAST_LAPS, print_table, write_report
 from maexp.envs import PointCloudMap
@@ -67,7 +67,7 @@ AXES = {
 COLUMNS = ["ms / local step", "x smallest", "size x", "robot-local-steps/s", "MB/env", "build [s]", "start [s]"]
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
     """Costs along every axis asked for; ``where/bench_scale.json``, a table and a plot for each."""
     chosen = pick_axes(cfg.axes)
     plans = {name: plan_axis(AXES[name], cfg, overrides) for name in chosen}
@@ -84,7 +84,7 @@ def run(cfg: Any, where: Path, overrides: list[str]) -> None:
     write_report(where / "bench_scale.json", "bench_scale", cfg.device, {"tolerance": TOLERANCE, "axes": report})
 
 
-def pick_axes(wanted: Any) -> list[str]:
+def pick_axes(wanted: str | Sequence[str] | None) -> list[str]:
     """The axes to go along.
 
     Raises:
@@ -98,7 +98,7 @@ def pick_axes(wanted: Any) -> list[str]:
     return names
 
 
-def plan_axis(axis: Axis, cfg: Any, overrides: list[str]) -> list[tuple[int, Any]]:
+def plan_axis(axis: Axis, cfg: BenchSettings, overrides: list[str]) -> list[tuple[int, BenchSettings]]:
     """The values and settings of an axis; what the user set stays, but for the setting that is varied.
 
     Raises:
@@ -119,7 +119,7 @@ def plan_axis(axis: Axis, cfg: Any, overrides: list[str]) -> list[tuple[int, Any
     return list(zip(values, points, strict=True))
 
 
-def measure_axis(axis: str, plan: list[tuple[int, Any]], show: Callable[[str], None]) -> list[dict]:
+def measure_axis(axis: str, plan: list[tuple[int, BenchSettings]], show: Callable[[str], None]) -> list[dict]:
     """Throughput at every point, and what a local step of the batch costs.
 
     The points take turns, `ROUNDS` times: what else the machine does, and how fast it is just now, meets all alike.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -20,7 +21,9 @@ from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import split_sweeps, without
+from maexp.agents.settings.schema import BenchSettings, EnvSettings
 from maexp.agents.versions import PACKAGES, find_commit
+from maexp.envs import ExplorationEnv
 
 OWN = ("task", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""
@@ -28,7 +31,7 @@ LEAST_LAPS = 5
 WIDTH = 116  # columns of the widest table; a narrower terminal wraps lines, which is still readable
 
 
-def sweep_points(cfg: Any, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[Any]:
+def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[DictConfig]:
     """The settings of every combination of the settings given several values, team sizes last.
 
     Args:
@@ -70,7 +73,7 @@ def time_call(call: Callable[[], Any], device: torch.device) -> float:
     return time.thread_time() - begin
 
 
-def describe_point(env: Any, cfg: Any) -> dict[str, Any]:
+def describe_point(env: ExplorationEnv, cfg: EnvSettings) -> dict[str, Any]:
     """What tells the points of a sweep apart."""
     return {
         "scenario": cfg.scenario.name,

@@ -3,7 +3,6 @@
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -12,9 +11,10 @@ from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
 from maexp.agents.settings.model import PRESETS
 from maexp.agents.settings.resolved import model_settings
+from maexp.agents.settings.schema import BenchSettings, TrainSettings
 from maexp.agents.speed.shared import describe_point, print_table, spread, sweep_points, write_report
 from maexp.agents.training.checkpoint import seed_everything
-from maexp.agents.training.collect import Stopwatch, make_collector
+from maexp.agents.training.collect import Stopwatch, TeamCollector, make_collector
 from maexp.envs import ExplorationEnv
 
 TEAM_SIZES = [3]
@@ -26,14 +26,14 @@ PARTS = ("simulate", "policy", "advantage", "update")
 class Trainee:
     """What is trained at one point, and the seconds of its iterations by part."""
 
-    cfg: Any
+    cfg: TrainSettings
     env: ExplorationEnv
     learner: Learner
-    collector: Any
+    collector: TeamCollector
     laps: list[dict[str, float]] = field(default_factory=list)
 
     @classmethod
-    def build(cls, cfg: Any) -> "Trainee":
+    def build(cls, cfg: TrainSettings) -> "Trainee":
         """Raises what `maexp train` would: a setting or map that cannot be used."""
         seed_everything(cfg.seed)
         env = make_env(cfg, load_maps(cfg.scenario).train, cfg.num_robots)
@@ -74,13 +74,13 @@ class Trainee:
         }
 
 
-def _model_name(cfg: Any) -> str:
+def _model_name(cfg: TrainSettings) -> str:
     """The preset whose sizes these are."""
     sizes = replace(model_settings(cfg), action="regions")
     return next((name for name, one in PRESETS.items() if one == sizes), "own")
 
 
-def run(cfg: Any, where: Path, overrides: list[str]) -> None:
+def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
     """Seconds of an iteration by part at every point; ``where/bench_train.json`` and a table.
 
     The points take turns, one iteration each, so that what else the machine does meets all of them alike.

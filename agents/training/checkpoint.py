@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.settings.model import ModelConfig
+from maexp.envs import ExplorationEnv
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
@@ -74,7 +76,7 @@ def load_checkpoint(path: Path) -> dict:
     return state
 
 
-def _is_ours(state: Any) -> bool:
+def _is_ours(state: object) -> bool:
     """Whether a file holds the kinds of values that `maexp train` puts there."""
     if not isinstance(state, dict) or any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
         return False
@@ -84,7 +86,7 @@ def _is_ours(state: Any) -> bool:
     return "settings" not in state or _has_names(state["settings"])
 
 
-def _has_names(settings: Any) -> bool:
+def _has_names(settings: object) -> bool:
     """Whether settings of a run tell its scenario and planner."""
     groups = [settings.get(name) for name in ("scenario", "planner")] if isinstance(settings, dict) else [None]
     return all(isinstance(group, dict) and isinstance(group.get("name"), str) for group in groups)
@@ -112,7 +114,7 @@ def find_checkpoint(place: str | Path) -> tuple[Path, dict]:
     raise UserError(f"{place} holds no whole checkpoint: give the folder of a run of maexp train.")
 
 
-def restore_policy(env: Any, model: str | ModelConfig, saved: dict) -> Any:
+def restore_policy(env: ExplorationEnv, model: str | ModelConfig, saved: dict) -> ProbabilisticActor:
     """The policy of a checkpoint, for the teams of `env`.
 
     Raises:

@@ -9,14 +9,15 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.algorithms.losses import check_finite
 from maexp.agents.algorithms.updaters import Meter
-from maexp.agents.build import choose_device, make_env
+from maexp.agents.build import Learner, choose_device, make_env
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.networks.actor import ALIVE
@@ -28,16 +29,18 @@ from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.model import PRESETS, ModelConfig
 from maexp.agents.settings.resolved import model_settings
+from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
 from maexp.agents.training.collect import batch_statistics, divide_teams
-from maexp.agents.training.train import check_action
+from maexp.agents.training.train import TrainingRun, check_action
+from maexp.envs import ExplorationEnv
 
 LEARNING_RATE = 2e-3
 PASSES = 4  # over each batch
 LOG = "warm_start.csv"
 
 
-def check_warm_start(cfg: Any) -> None:
+def check_warm_start(cfg: TrainSettings) -> None:
     """Raise UserError for a teacher or a count that cannot be used."""
     check_counts(cfg, "warm_start_frames")
     if cfg.warm_start in POLICIES:
@@ -54,7 +57,7 @@ def check_warm_start(cfg: Any) -> None:
         )
 
 
-def _check_kind(cfg: Any, taught: str) -> None:
+def _check_kind(cfg: TrainSettings, taught: str) -> None:
     """Raise UserError where the teacher chooses something else than the policy that is to imitate it."""
     chosen = model_settings(cfg).action
     if chosen != taught:
@@ -64,7 +67,7 @@ def _check_kind(cfg: Any, taught: str) -> None:
         )
 
 
-def load_teacher(cfg: Any, env: Any) -> Any:
+def load_teacher(cfg: TrainSettings, env: ExplorationEnv) -> TensorDictModuleBase:
     """The policy to imitate in `env`."""
     if cfg.warm_start in POLICIES:
         return POLICIES[cfg.warm_start](env)
@@ -86,7 +89,7 @@ def model_of(saved: dict) -> ModelConfig:
     return replace(PRESETS[values.pop("preset", "small")], **values)
 
 
-def warm_start(run: Any) -> None:
+def warm_start(run: TrainingRun) -> None:
     """Let the policy and critic of a `TrainingRun` that has not begun imitate; the log is `warm_start.csv`."""
     cfg, updater = run.cfg, run.learner.updater
     optimizer = torch.optim.Adam(run.learner.policy.parameters(), lr=LEARNING_RATE, eps=1e-5)
@@ -107,7 +110,7 @@ def warm_start(run: Any) -> None:
     run.experience.update_policy_weights_()
 
 
-def demonstrate(run: Any, rounds: int) -> Iterator[list[TensorDictBase]]:
+def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]:
     """Batches [envs, steps] of every team size in which the teacher acts, from the start of episodes on."""
     cfg, device = run.cfg, choose_device(run.cfg, "train_device")
     with blame_input():
@@ -125,7 +128,7 @@ def demonstrate(run: Any, rounds: int) -> Iterator[list[TensorDictBase]]:
         yield batches
 
 
-def imitate(learner: Any, optimizer: torch.optim.Optimizer, steps: list[TensorDictBase], meter: Meter) -> None:
+def imitate(learner: Learner, optimizer: torch.optim.Optimizer, steps: list[TensorDictBase], meter: Meter) -> None:
     """One pass over the team steps: make what the teacher's living robots did more likely."""
     policy, updater = learner.policy, learner.updater
     for parts in updater.minibatches(steps, updater.settings.minibatch_size):
@@ -140,7 +143,7 @@ def imitate(learner: Any, optimizer: torch.optim.Optimizer, steps: list[TensorDi
         meter.add({"nll": loss.item()} | {f"nll_{name}": value.item() for name, value in mean.items()})
 
 
-def negative_log_likelihood(policy: Any, steps: TensorDictBase) -> dict[str, torch.Tensor]:
+def negative_log_likelihood(policy: ProbabilisticActor, steps: TensorDictBase) -> dict[str, torch.Tensor]:
     """Of the actions in `steps`, by the name of the head; mean over the robots that had not collided."""
     log_probs = policy.get_dist(steps.select(*policy.in_keys)).log_prob(steps)
     alive = steps.get(ALIVE, None)

@@ -7,10 +7,10 @@ import math
 import os
 import uuid
 from pathlib import Path
-from typing import Any
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_text
+from maexp.agents.settings.schema import LoggerSettings
 
 MODES = ("online", "offline")
 
@@ -26,7 +26,7 @@ class MetricsLog:
         config: plain settings, shown by W&B
     """
 
-    def __init__(self, folder: Path, settings: Any, kept: int, frames: int, config: dict):
+    def __init__(self, folder: Path, settings: LoggerSettings, kept: int, frames: int, config: dict):
         self.path = folder / "metrics.csv"
         self.columns = _keep_rows(self.path, kept)
         self.goes_on = self.columns is not None
@@ -98,7 +98,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
         return [{name: float(value or "nan") for name, value in row.items()} for row in csv.DictReader(file)]
 
 
-def check_logger(settings: Any) -> None:
+def check_logger(settings: LoggerSettings) -> None:
     """Raise UserError for a logger that is unknown or not installed."""
     for name in settings.backends:
         if name not in BACKENDS:
@@ -114,7 +114,7 @@ def check_logger(settings: Any) -> None:
 class TensorBoard:
     """Event files in `tensorboard/`. Where a killed run had logged beyond its checkpoint, that is struck out."""
 
-    def __init__(self, folder: Path, settings: Any, config: dict, frames: int):
+    def __init__(self, folder: Path, settings: LoggerSettings, config: dict, frames: int):
         from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=frames + 1 if frames else None)
@@ -130,7 +130,7 @@ class TensorBoard:
 class WeightsAndBiases:
     """A run of W&B, the same one when it is resumed. Offline, its files wait in `wandb/` for `wandb sync`."""
 
-    def __init__(self, folder: Path, settings: Any, config: dict, frames: int):
+    def __init__(self, folder: Path, settings: LoggerSettings, config: dict, frames: int):
         import wandb
 
         identity = folder / "wandb" / "identity"

@@ -12,6 +12,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from omegaconf import DictConfig
+
 from maexp.agents.build import (
     Learner,
     MapSuite,
@@ -31,6 +33,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config, settings_of
 from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
+from maexp.agents.settings.schema import LearnerSettings, TrainSettings
 from maexp.agents.training.checkpoint import (
     random_state,
     save_checkpoint,
@@ -41,6 +44,7 @@ from maexp.agents.training.checksums import checksums, warn_of_changed_maps
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
 from maexp.agents.versions import find_commit
+from maexp.envs import PointCloudMap
 
 BACKENDS = ("single", "processes", "ray")
 
@@ -88,7 +92,7 @@ class TrainingRun:
         seconds: training time so far, over all resumptions
     """
 
-    cfg: Any
+    cfg: TrainSettings
     folder: Path
     overrides: list[str]
     suite: MapSuite
@@ -101,7 +105,7 @@ class TrainingRun:
     stopped: bool = False
 
     @classmethod
-    def build(cls, cfg: Any, folder: Path, overrides: list[str], saved: dict | None = None) -> "TrainingRun":
+    def build(cls, cfg: TrainSettings, folder: Path, overrides: list[str], saved: dict | None = None) -> "TrainingRun":
         """Everything a run needs, at its start or as `saved` left it; nothing is written yet.
 
         Raises:
@@ -245,7 +249,9 @@ class TrainingRun:
         )
 
 
-def make_both(cfg: Any, maps: list, words: Any = None) -> tuple[Learner, Experience]:
+def make_both(
+    cfg: TrainSettings, maps: list[PointCloudMap], words: TrainSettings | None = None
+) -> tuple[Learner, Experience]:
     """The networks that learn and what gathers their experience, each on its device.
 
     Args:
@@ -286,7 +292,7 @@ def make_both(cfg: Any, maps: list, words: Any = None) -> tuple[Learner, Experie
     return learner, make_workers(cfg, maps, teams, learner.policy)
 
 
-def check_collector(settings: Any) -> None:
+def check_collector(settings: DictConfig) -> None:
     """Raise UserError for settings of `collector` that do not go together."""
     check_steps(settings)
     check_counts(settings, "workers", prefix="collector.")
@@ -300,12 +306,12 @@ def check_collector(settings: Any) -> None:
         raise UserError(f"collector.ray_address={settings.ray_address} needs collector=ray.")
 
 
-def describe_teams(cfg: Any) -> str:
+def describe_teams(cfg: TrainSettings) -> str:
     """The settings that choose a run's teams, as they are written on the command line."""
     return f"num_envs={cfg.num_envs} num_robots={','.join(map(str, team_sizes(cfg.num_robots)))}"
 
 
-def describe_workers(cfg: Any) -> str:
+def describe_workers(cfg: TrainSettings) -> str:
     """Which processes simulate, for messages and to tell whether a checkpoint's state fits."""
     workers, backend = cfg.collector.workers, cfg.collector.backend
     if backend == "single":
@@ -314,7 +320,7 @@ def describe_workers(cfg: Any) -> str:
     return f"{workers} {one if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"
 
 
-def check_action(saved: dict, cfg: Any) -> None:
+def check_action(saved: dict, cfg: LearnerSettings) -> None:
     """Refuse weights trained for the other kind of action: goals and controls have tensors of the same shapes.
 
     Raises:

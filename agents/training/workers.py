@@ -12,20 +12,24 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch.utils._pytree import tree_map_only
-from torchrl.collectors import MultiSyncCollector
+from torchrl.collectors import BaseCollector, MultiSyncCollector
 
 from maexp.agents.build import choose_device, choose_starts, make_env
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
+from maexp.agents.settings.schema import CollectorSettings, TrainSettings
 from maexp.agents.training.collect import Experience, TeamCollector, Teams, WorkerLost
 from maexp.envs import PointCloudMap
+
+if TYPE_CHECKING:  # needs Ray
+    from torchrl.collectors.distributed import RayCollector
 
 LOOK_EVERY = 0.2  # seconds between two looks whether the workers are alive
 SHOWS_WITHIN = 5.0  # seconds from a broken connection to the end of the process behind it
@@ -51,7 +55,7 @@ class WorkerEnv:
     teams: Teams
     device: torch.device
     num_threads: int
-    starts: Any
+    starts: str | np.ndarray
 
     def __call__(self):
         if threading.current_thread() is threading.main_thread():
@@ -210,7 +214,7 @@ class WorkerGroup:
         name: of the group, for messages: "collector worker", or with the team size where there are several
     """
 
-    def __init__(self, collector: Any, name: str):
+    def __init__(self, collector: BaseCollector, name: str):
         self.collector, self.name = collector, name
 
     def collect(self) -> tuple[TensorDictBase, list[tuple[float, float]]]:
@@ -256,7 +260,7 @@ class ProcessGroup(WorkerGroup):
 class RayGroup(WorkerGroup):
     """Workers in actors of a Ray cluster."""
 
-    def __init__(self, collector: Any, name: str):
+    def __init__(self, collector: "RayCollector", name: str):
         super().__init__(collector, name)
         self.places = collector.get_distant_attr("place")
         self.actors = [one._actor_id.hex() for one in collector.remote_collectors]
@@ -277,7 +281,9 @@ class RayGroup(WorkerGroup):
         ray.shutdown()
 
 
-def make_workers(cfg: Any, maps: list[PointCloudMap], teams: list[Teams], policy: torch.nn.Module) -> WorkerExperience:
+def make_workers(
+    cfg: TrainSettings, maps: list[PointCloudMap], teams: list[Teams], policy: torch.nn.Module
+) -> WorkerExperience:
     """The workers that the settings ask for, `collector.workers` for each of `teams`."""
     settings = cfg.collector
     device = choose_device(cfg, "sample_device")
@@ -354,7 +360,7 @@ def start_actors(factories: list[WorkerEnv], policy: torch.nn.Module, frames: in
     return RayGroup(collector, name)
 
 
-def connect_ray(settings: Any, cpus: int) -> None:
+def connect_ray(settings: CollectorSettings, cpus: int) -> None:
     """Join the cluster at `collector.ray_address`, or start one of this machine alone.
 
     Raises:
