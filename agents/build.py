@@ -178,10 +178,10 @@ def _with_scenario(cfg: DictConfig, words: DictConfig, name: str) -> DictConfig:
     other.scenario.name = name
     for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED):
         other.scenario[setting] = None
-    raw = OmegaConf.to_container(words, resolve=False)
+    unresolved = OmegaConf.to_container(words, resolve=False)
     for group, setting in (one.split(".") for one in find_followers(words)):
         if group != "scenario":
-            other[group][setting] = raw[group][setting]
+            other[group][setting] = unresolved[group][setting]
     return other
 
 

@@ -38,7 +38,7 @@ def check_batch_memory(env, steps: int, num_envs: int | None = None) -> None:
 def keep_freed_memory() -> None:
     """Let glibc reuse freed blocks of tensors instead of returning them to the system.
 
-    Batches of pictures are larger than the size from which glibc asks the system for fresh pages, which it must
+    Batches of pictures are larger than the size from which glibc asks the system for new pages, which it must
     then clear one by one: measured, a third of the small policy's forward pass. Other C libraries ignore this.
     """
     try:

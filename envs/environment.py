@@ -148,7 +148,7 @@ class ExplorationEnv(EnvBase):
         done = self._done()
         out = self.observe(mask)  # TorchRL takes the other envs' observation from what it had
         info = out["info"]
-        for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a fresh episode has made none
+        for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a new episode has made none
             keep = mask.reshape(-1, 1) == 0
             blank = -1 if name.startswith("coverage_step") else 0
             info[name] = torch.where(keep, info[name], torch.full_like(info[name], blank))

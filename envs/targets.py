@@ -235,9 +235,9 @@ class TargetTracker:
         nav = self.nav
         s = {name: nav.pick(value) for name, value in self.state.items()}
         step = nav.state["macro_step"]
-        fresh, due = step == 0, step != s["counted"]
-        s["dwell"][fresh], s["chosen"][fresh] = 0, -1
-        due = (due | fresh).view(-1, 1, 1)
+        begun, due = step == 0, step != s["counted"]
+        s["dwell"][begun], s["chosen"][begun] = 0, -1
+        due = (due | begun).view(-1, 1, 1)
         near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
         beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near) & due
         beside = beside.any(1, keepdim=True).expand_as(beside) if nav.rows == 1 else beside

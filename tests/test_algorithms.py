@@ -79,7 +79,7 @@ def test_one_update_moves_policy_and_critic_and_reports(name):
 def test_reference_settings_run(name):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=8)
-    policy, _, updater = build(name, env, TINY, preset="reference")
+    policy, _, updater = build(name, env, TINY, tuning="reference")
     (batch,) = batches(env, policy, 1)
     assert all(math.isfinite(v) for v in updater.update(batch).values())
 
@@ -183,5 +183,5 @@ def test_unknown_names_are_answered_with_the_choices():
         find_algorithm("ppo")
     with pytest.raises(ValueError, match="ippo has no setting 'clip'.*clip_epsilon"):
         ALGORITHMS["ippo"].configure(clip=0.1)
-    with pytest.raises(ValueError, match="preset='paper'.*reference"):
+    with pytest.raises(ValueError, match="tuning='paper'.*reference"):
         ALGORITHMS["ippo"].configure("paper")

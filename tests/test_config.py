@@ -8,7 +8,7 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups
-from maexp.agents.settings.model import PRESETS
+from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
 from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
 from maexp.envs.config import (
@@ -44,7 +44,7 @@ def test_every_choice_composes_and_is_described(group):
 def test_choices_match_the_tables_of_the_code():
     assert set(group_choices("scenario")) == set(SCENARIOS)
     assert set(group_choices("algorithm")) == set(ALGORITHMS)
-    assert set(group_choices("model")) == set(PRESETS)
+    assert set(group_choices("model")) == set(SIZES)
 
 
 REGIONS = ["action=regions"]  # action=targets brings settings of its own
@@ -61,7 +61,7 @@ def test_conf_algorithm_holds_the_defaults(algorithm):
 
 
 def test_conf_model_holds_the_presets():
-    for name, sizes in PRESETS.items():
+    for name, sizes in SIZES.items():
         held = given(compose_config("train", [*REGIONS, f"model={name}"]).model)
         assert held == asdict(sizes), f"conf/model/{name}.yaml"
 

@@ -11,7 +11,7 @@ from toy_env import ToyEnv
 from maexp.agents import ModelConfig, make_policy
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE, build_critic
 from maexp.agents.networks.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
-from maexp.agents.settings.model import PRESETS, model_config
+from maexp.agents.settings.model import SIZES, model_config
 
 PIXELS, SIDE = 29, 3
 CONV = ModelConfig(stem="conv", channels=8, grid_features=8, depth=2, heads=2, merge_maps=False, critic_hidden=16)
@@ -247,7 +247,7 @@ def test_pooled_pictures_serve_in_place_of_pictures(env):
 
 
 def test_heads_of_the_paper_preset():
-    paper = PRESETS["paper"]
+    paper = SIZES["paper"]
     assert (paper.width, paper.depth, paper.stem, paper.channels) == (48, 2, "conv", 32)
 
 

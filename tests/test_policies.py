@@ -8,7 +8,7 @@ import torch
 from oracle.grid import frontier_cells, geodesic_distance
 
 from maexp.agents.policies.classical import (
-    CHOICES,
+    CLASSICAL,
     POLICIES,
     FrontierPlanner,
     OraclePlanner,
@@ -51,7 +51,7 @@ def play(env, name: str, steps: int):
     return coverage, actions
 
 
-@pytest.mark.parametrize("name", CHOICES)
+@pytest.mark.parametrize("name", CLASSICAL)
 def test_reaches_95_percent_on_small_mazes(name):
     coverage, _ = play(make_env(8), name, 79)
     assert (coverage >= 0.95).float().mean() >= 7 / 8  # a team may lose all its robots; none did in 128
@@ -282,7 +282,7 @@ def test_choices_in_turn_spread_the_team():
     assert plan_in_turn(gain, value, points, alone)[1].tolist() == [[0, 0]]  # who hears nothing shares nothing
 
 
-@pytest.mark.parametrize("name", CHOICES)
+@pytest.mark.parametrize("name", CLASSICAL)
 @pytest.mark.parametrize("lost", [[1], [2], [1, 2]])
 def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(name, lost):
     """A robot that has collided has no way anywhere."""
@@ -296,7 +296,7 @@ def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(nam
         alive[:, lost], way[:, lost] = False, INF
         scene = scene_of(way[:, kept].tolist(), [[points] * len(kept)], alive=alive[:, kept].tolist(),
                          nav=Places(at[:, kept].tolist(), ways))  # fmt: skip
-        return CHOICES[name](scene)[0].tolist()
+        return CLASSICAL[name](scene)[0].tolist()
 
     whole, living = choose([0, 1, 2]), [i for i in range(3) if i not in lost]
     assert [whole[i] for i in living] == choose(living)

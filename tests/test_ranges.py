@@ -7,7 +7,7 @@ import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
-from maexp.agents.settings.model import PRESETS, ModelConfig
+from maexp.agents.settings.model import SIZES, ModelConfig
 
 # What each setting may be and what it may not be, from what it means (not from the code).
 GOOD = {
@@ -40,8 +40,8 @@ EVERYWHERE = [math.nan, math.inf, -math.inf, "much", None]
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_setting_of_an_algorithm_has_its_range(name):
     row = ALGORITHMS[name]
-    for preset in ("default", "reference"):
-        row.configure(preset)
+    for tuning in ("default", "reference"):
+        row.configure(tuning)
     for one in (field.name for field in fields(row.settings)):
         for value in GOOD[one]:
             assert getattr(row.configure(**{one: value}), one) == value
@@ -53,7 +53,7 @@ def test_every_setting_of_an_algorithm_has_its_range(name):
 
 @pytest.mark.parametrize("name", [one.name for one in fields(ModelConfig)])
 def test_every_size_of_a_network_has_its_range(name):
-    kind = type(getattr(PRESETS["small"], name))
+    kind = type(getattr(SIZES["small"], name))
     bad = {str: ["fft"], bool: [1], int: [0, -1, 2.0, 10**6, True], float: [-1e-9]}[kind]
     for value in bad + EVERYWHERE:
         with pytest.raises(ValueError, match=rf"model\.{name}=.*must be"):

@@ -57,7 +57,6 @@ def test_numbers_are_those_of_the_kernels_and_policies():
         (frontiers, targets, ("RAYS",)),
         (values, env_targets, ("BETA", "LEAST_GAIN")),
         (features, target_view, ("FAR", "WAY_AHEAD", "FEATURES")),
-        (choices, classical, ("RRT_SAMPLES", "RRT_HYSTERESIS", "DECAY", "REPULSION")),
     ):
         assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
     assert set(CHOICES) == set(classical.POLICIES) - {"oracle"}  # no robot knows the true map
@@ -96,7 +95,7 @@ def test_robots_take_the_targets_that_the_policies_take(name):
         nav = now.nav
         for policy in ("nearest_frontier", "cost_utility", "voronoi", "potential_field", "hungarian"):
             plan = TeamPlanner(policy, **now.settings).plan(**now.call)
-            there = classical.FrontierPlanner(now.env, classical.CHOICES[policy])
+            there = classical.FrontierPlanner(now.env, classical.CLASSICAL[policy])
             there(None)
             chosen = there.tracker.state["chosen"][0].squeeze(-1)
             assert np.array_equal(plan.active, (chosen >= 0).numpy())

@@ -7,7 +7,7 @@ from torchrl.modules import PopArtValueNorm
 from maexp.agents.algorithms import losses
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.networks.critics import build_critic
-from maexp.agents.settings.algorithms import PRESETS, Presets, Settings
+from maexp.agents.settings.algorithms import TUNINGS, Settings, Tunings
 from maexp.agents.settings.model import ModelConfig
 
 
@@ -20,32 +20,32 @@ class Algorithm:
         critic: local, team or mixed (`critics.py`)
         loss: class of the loss
         updater: class of the updater
-        presets: its settings
+        tunings: its settings
     """
 
     name: str
     critic: str
     loss: type
     updater: type[Updater]
-    presets: Presets
+    tunings: Tunings
 
     @property
     def settings(self) -> Settings:
         """The defaults."""
-        return self.presets.default
+        return self.tunings.default
 
     @property
     def reference(self) -> Settings:
         """Those of the original platform."""
-        return self.presets.reference
+        return self.tunings.reference
 
-    def configure(self, preset: str = "default", **overrides) -> Settings:
-        """The settings of a preset ("default" or "reference") with some replaced.
+    def configure(self, tuning: str = "default", **overrides) -> Settings:
+        """The settings of a tuning ("default" or "reference") with some replaced.
 
         Raises:
-            ValueError: unknown preset or setting, or a value out of its range.
+            ValueError: unknown tuning or setting, or a value out of its range.
         """
-        return self.presets.configure(preset, **overrides)
+        return self.tunings.configure(tuning, **overrides)
 
     def make_critic(self, env, model: "str | ModelConfig", settings: Settings | None = None):
         """The critic of this algorithm for the specs of `env`."""
@@ -68,12 +68,12 @@ class Algorithm:
 ALGORITHMS = {
     row.name: row
     for row in (
-        Algorithm("ippo", "local", losses.IPPO, GradientUpdater, PRESETS["ippo"]),
-        Algorithm("mappo", "team", losses.MAPPO, GradientUpdater, PRESETS["mappo"]),
-        Algorithm("itrpo", "local", losses.TRPOLoss, TrustRegionUpdater, PRESETS["itrpo"]),
-        Algorithm("matrpo", "team", losses.TRPOLoss, TrustRegionUpdater, PRESETS["matrpo"]),
-        Algorithm("vdppo", "mixed", losses.VDPPO, GradientUpdater, PRESETS["vdppo"]),
-        Algorithm("vda2c", "mixed", losses.VDA2C, GradientUpdater, PRESETS["vda2c"]),
+        Algorithm("ippo", "local", losses.IPPO, GradientUpdater, TUNINGS["ippo"]),
+        Algorithm("mappo", "team", losses.MAPPO, GradientUpdater, TUNINGS["mappo"]),
+        Algorithm("itrpo", "local", losses.TRPOLoss, TrustRegionUpdater, TUNINGS["itrpo"]),
+        Algorithm("matrpo", "team", losses.TRPOLoss, TrustRegionUpdater, TUNINGS["matrpo"]),
+        Algorithm("vdppo", "mixed", losses.VDPPO, GradientUpdater, TUNINGS["vdppo"]),
+        Algorithm("vda2c", "mixed", losses.VDA2C, GradientUpdater, TUNINGS["vda2c"]),
     )
 }
 
@@ -95,7 +95,7 @@ def make_critic(algorithm: str, env, model: "str | ModelConfig" = "small", **set
     Args:
         algorithm: a name of the table
         env: gives the specs and the device; not kept
-        model: a preset's name or a ModelConfig
+        model: a name (small, paper) or a ModelConfig
         settings: of the algorithm; only `mixer` matters here
     """
     row = find_algorithm(algorithm)
@@ -109,8 +109,8 @@ def make_loss(algorithm: str, policy, critic, preset: str = "default", **setting
         algorithm: a name of the table
         policy: from make_policy
         critic: from make_critic with the same name
-        preset: default or reference
-        settings: replace the preset's
+        preset: the tuning, default or reference
+        settings: replace those of the tuning
     """
     row = find_algorithm(algorithm)
     return row.make_loss(policy, critic, row.configure(preset, **settings))

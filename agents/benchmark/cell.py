@@ -18,7 +18,7 @@ from maexp.agents.evaluation.comparison import CHOOSING
 from maexp.agents.evaluation.evaluate import evaluate
 from maexp.agents.evaluation.results import describe_run
 from maexp.agents.files import short, write_file, write_json
-from maexp.agents.policies.classical import CHOICES, POLICIES
+from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
@@ -84,7 +84,7 @@ def run_cell(cfg: BenchmarkSettings, where: Path, cell: Cell, shelf: EnvShelf, s
     team = train_cell(cfg, where, training_cell(cfg, cell)) if cell.trains else None
     if cell.trains and team is None:
         return False
-    for suite in [VALIDATION] * (cell.policy in CHOICES) + suites:
+    for suite in [VALIDATION] * (cell.policy in CLASSICAL) + suites:
         if not finished(where, cell, suite):
             play_suite(cfg, settings, cell, suite, team, folder, shelf)
     return True

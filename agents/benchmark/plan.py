@@ -162,7 +162,7 @@ def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
     words = [f"scenario={first}", f"seed={cell.seed}"]
     words += [f"scenario.also={render(others)}"] if others else []
     words += [f"algorithm={cell.policy}"] if cell.trains else []
-    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), raw(cfg)))
+    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), unresolved(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
     changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
     changed = {name: value for name, value in changed.items() if not (name.startswith("algorithm.") and value is None)}
@@ -175,11 +175,11 @@ def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
 def _usual() -> dict:
     """The settings of maexp train without overrides; of scenario and algorithm, which are each cell's own, what is set
     for all cells without overrides."""
-    own = raw(compose_settings("benchmark", []))
-    return raw(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
+    own = unresolved(compose_settings("benchmark", []))
+    return unresolved(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
 
 
-def raw(cfg: DictConfig) -> dict:
+def unresolved(cfg: DictConfig) -> dict:
     """Settings as plain containers, references to the scenario as they are."""
     return OmegaConf.to_container(cfg, resolve=False)
 

@@ -19,7 +19,7 @@ from maexp.agents.benchmark.table import (
     table_markdown,
 )
 from maexp.agents.files import short, write_json, write_text
-from maexp.agents.policies.classical import CHOICES
+from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.versions import PACKAGES, find_commit
 
@@ -137,7 +137,7 @@ class Report:
 
     def _rival(self, scenario: str) -> str | None:
         """The best classical planner on the validation maps."""
-        planners = [name for name in dict.fromkeys(one.policy for one in self.cells) if name in CHOICES]
+        planners = [name for name in dict.fromkeys(one.policy for one in self.cells) if name in CLASSICAL]
         return find_best({name: self.results(scenario, name, VALIDATION) for name in planners})
 
     def differences(self, scenario: str, columns: list[Column]) -> dict[str, dict]:

@@ -1,4 +1,4 @@
-"""`maexp train`: settings, a fresh or a resumed run, then the evaluation and the pictures."""
+"""`maexp train`: settings, a new or a resumed run, then the evaluation and the pictures."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -6,7 +6,7 @@ from typing import Any
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.results import result_names
-from maexp.agents.policies.classical import CHOICES, POLICIES
+from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.schema import EpisodeSettings
 
@@ -22,7 +22,7 @@ def choose_best(
     Args:
         others: arguments of the env
     """
-    planners = [name for name in names if name in CHOICES]
+    planners = [name for name in names if name in CLASSICAL]
     if len(planners) < 2:
         return next(iter(planners), None)
     count = min(CHOOSING, cfg.episodes)
@@ -39,7 +39,7 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
     """A sentence for each learned team on all maps: how far it is ahead of the best classical planner of its size.
 
     Args:
-        best: team size -> the planner
+        best: team size -> its name
     """
     whole = [one for one in results if not one.place]
     rivals = {one.num_robots: one for one in whole if one.policy == best.get(one.num_robots)}
@@ -50,7 +50,7 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
     ]
 
 
-def _describe(name: str, planner: str, found: dict[str, dict]) -> str:
+def _describe(name: str, rival: str, found: dict[str, dict]) -> str:
     auc, steps = found[DECIDES], found["coverage_step_95_censored"]
     low, high = (100 * end for end in auc["ci95"])
     points = f"{100 * auc['mean']:+.1f} points of coverage over time [{low:+.1f}, {high:+.1f}]"
@@ -58,4 +58,4 @@ def _describe(name: str, planner: str, found: dict[str, dict]) -> str:
     low, high = steps["ci95"]
     later = f"{steps['mean']:+.0f} steps to 95 % [{low:+.0f}, {high:+.0f}]"
     name = name.replace("trained", "The trained team", 1)
-    return f"{name} {where} {planner}, the best classical planner on the validation maps: {points}, {later}."
+    return f"{name} {where} {rival}, the best classical planner on the validation maps: {points}, {later}."

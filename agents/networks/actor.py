@@ -110,7 +110,7 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
 
     Args:
         env: gives the specs and the device; not kept
-        model: a preset's name or a ModelConfig
+        model: a name (small, paper) or a ModelConfig
     """
     config = model_config(model)
     shape = observation_shape(env, config)

@@ -118,7 +118,7 @@ def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: st
     Args:
         kind: local, team or mixed
         env: gives the specs and the device; not kept
-        model: a preset's name or a ModelConfig
+        model: a name (small, paper) or a ModelConfig
         mixer: vdn or qmix
     """
     if kind not in KINDS:

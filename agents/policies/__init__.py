@@ -5,7 +5,7 @@ Names are looked up on first use, as those of `maexp.agents`.
 
 from maexp.envs.lazy import lazy_names
 
-_NAMES = ("CHOICES", "POLICIES", "REFERENCES", "FrontierPlanner")
-__all__ = ["CHOICES", "POLICIES", "REFERENCES", "FrontierPlanner"]
+_NAMES = ("CLASSICAL", "POLICIES", "REFERENCES", "FrontierPlanner")
+__all__ = ["CLASSICAL", "POLICIES", "REFERENCES", "FrontierPlanner"]
 
 __getattr__ = lazy_names(__name__, dict.fromkeys(_NAMES, "classical"))

@@ -96,9 +96,9 @@ def describe_maps(run: dict[str, Any]) -> str:
 def _differences(content: dict[str, Any]) -> list[str]:
     """A sentence a learned team: how far it is ahead of the best classical planner on the same episodes."""
     sentences = []
-    for size, planner in content["run"].get("best_classical", {}).items():
+    for size, best in content["run"].get("best_classical", {}).items():
         for name, rivals in content.get("difference", {}).items():
-            label = next((one for one in (f"{planner} N={size}", planner) if one in rivals), None)
+            label = next((one for one in (f"{best} N={size}", best) if one in rivals), None)
             if label is not None:
                 low, high = (100 * end for end in rivals[label][NEXT]["ci95"])
                 sentences += [

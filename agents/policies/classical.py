@@ -17,6 +17,7 @@ from functools import partial
 import torch
 from tensordict.nn import TensorDictModule
 
+from maexp.agents.runtime.choices import DECAY, REPULSION, RRT_HYSTERESIS, RRT_SAMPLES
 from maexp.envs import ExplorationEnv
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, keyed_uniform, plan_in_turn, value_targets
@@ -24,10 +25,6 @@ from maexp.kernels.assignment import FORBIDDEN, assign_targets
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 
 REGION_COUNT = 64
-RRT_SAMPLES = 512
-RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
-DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
-REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
 
 
 def choose_nearest(scene: Scene) -> torch.Tensor:
@@ -172,7 +169,7 @@ def _as_module(make: Callable, env: ExplorationEnv) -> TensorDictModule:
     )
 
 
-CHOICES: dict[str, Callable[[Scene], torch.Tensor]] = {
+CLASSICAL: dict[str, Callable[[Scene], torch.Tensor]] = {
     "nearest_frontier": choose_nearest,
     "cost_utility": choose_by_utility,
     "potential_field": choose_by_force,
@@ -180,14 +177,15 @@ CHOICES: dict[str, Callable[[Scene], torch.Tensor]] = {
     "voronoi": choose_by_area,
     "hungarian": choose_by_assignment,
 }
-"""Choice of targets of every planner."""
+"""The classical planners: name -> choice of targets, for many teams at once; `maexp.agents.runtime.CHOICES` are the
+same for one team in NumPy."""
 
 POLICIES: dict[str, Callable[[ExplorationEnv], TensorDictModule]] = {
     "random": partial(_as_module, RandomPolicy),
-    **{name: partial(_as_module, partial(FrontierPlanner, choose=choose)) for name, choose in CHOICES.items()},
+    **{name: partial(_as_module, partial(FrontierPlanner, choose=choose)) for name, choose in CLASSICAL.items()},
     "oracle": partial(_as_module, OraclePlanner),
 }
 """Name -> callable(env) -> policy."""
 
 REFERENCES = ("random", "oracle")
-"""Neither is a planner that a learned policy competes with: one knows nothing, the other the true map."""
+"""Neither is a classical planner that a learned policy competes with: one knows nothing, the other the true map."""

@@ -128,8 +128,8 @@ def look_around(grid: KnownGrid, cells: np.ndarray, radius: float, bounded: bool
     for first in range(0, len(cells), batch):
         state = image[start[first : first + batch, None, None] + index]
         hidden = np.logical_or.accumulate((state & need) != 0, axis=2)
-        fresh = ((state & UNSEEN) != 0) & ~hidden
-        seen[first : first + batch] = fresh.reshape(len(fresh), -1).astype(np.float32) @ value
+        shown = ((state & UNSEEN) != 0) & ~hidden
+        seen[first : first + batch] = shown.reshape(len(shown), -1).astype(np.float32) @ value
     middle = seen[:, 1:] * (grid.cell / np.maximum(seen[:, :1], 1e-6))
     return seen[:, 0].astype(np.float32), middle.astype(np.float32)
 

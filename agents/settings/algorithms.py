@@ -146,7 +146,7 @@ _TRUST = dict(max_kl=0.06, accept_ratio=0.5, max_grad_norm=10.0)
 
 
 @dataclass(frozen=True)
-class Presets:
+class Tunings:
     """The settings of one algorithm.
 
     Attributes:
@@ -159,44 +159,44 @@ class Presets:
     default: Settings
     reference: Settings
 
-    def configure(self, preset: str = "default", **overrides) -> Settings:
-        """The settings of a preset ("default" or "reference") with some replaced.
+    def configure(self, tuning: str = "default", **overrides) -> Settings:
+        """The settings of a tuning ("default" or "reference") with some replaced.
 
         Raises:
-            ValueError: unknown preset or setting, or a value out of its range.
+            ValueError: unknown tuning or setting, or a value out of its range.
         """
-        if preset not in ("default", "reference"):
-            raise ValueError(f"algorithm.preset={preset!r} is unknown; choose default or reference.")
+        if tuning not in ("default", "reference"):
+            raise ValueError(f"tuning={tuning!r} is unknown; choose default or reference.")
         known = [field.name for field in fields(self.default)]
         unknown = [name for name in overrides if name not in known]
         if unknown:
             raise ValueError(f"{self.name} has no setting {unknown[0]!r}; choose one of {', '.join(known)}.")
-        return replace(getattr(self, preset), **overrides)
+        return replace(getattr(self, tuning), **overrides)
 
 
-def _presets(name: str, settings: Settings, **reference) -> Presets:
-    return Presets(name, settings, _reference(settings, **reference))
+def _tunings(name: str, settings: Settings, **reference) -> Tunings:
+    return Tunings(name, settings, _reference(settings, **reference))
 
 
-PRESETS = {
+TUNINGS = {
     one.name: one
     for one in (
-        _presets("ippo", ClippedSettings(), **_CLIPPED),
-        _presets("mappo", ClippedSettings(), **_CLIPPED),
-        _presets("itrpo", TrustRegionSettings(), **_TRUST),
-        _presets("matrpo", TrustRegionSettings(), **_TRUST),
-        _presets("vdppo", MixedClippedSettings(), **_CLIPPED),
-        _presets("vda2c", ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
+        _tunings("ippo", ClippedSettings(), **_CLIPPED),
+        _tunings("mappo", ClippedSettings(), **_CLIPPED),
+        _tunings("itrpo", TrustRegionSettings(), **_TRUST),
+        _tunings("matrpo", TrustRegionSettings(), **_TRUST),
+        _tunings("vdppo", MixedClippedSettings(), **_CLIPPED),
+        _tunings("vda2c", ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
     )
 }
 
 
-def find_presets(algorithm: str) -> Presets:
+def find_tunings(algorithm: str) -> Tunings:
     """The row of the table.
 
     Raises:
         ValueError: unknown name.
     """
-    if algorithm not in PRESETS:
-        raise ValueError(f"algorithm={algorithm!r} is unknown; choose one of {', '.join(PRESETS)}.")
-    return PRESETS[algorithm]
+    if algorithm not in TUNINGS:
+        raise ValueError(f"algorithm={algorithm!r} is unknown; choose one of {', '.join(TUNINGS)}.")
+    return TUNINGS[algorithm]

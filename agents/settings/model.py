@@ -1,4 +1,4 @@
-"""Sizes of the networks: the dataclass and its presets."""
+"""Sizes of the networks: the dataclass, and those that have a name."""
 
 from dataclasses import dataclass
 
@@ -65,7 +65,7 @@ class ModelConfig:
         return self.channels + self.grid_features
 
 
-PRESETS = {
+SIZES = {
     "small": ModelConfig(),
     "paper": ModelConfig(
         stem="conv",
@@ -82,14 +82,14 @@ PRESETS = {
 
 
 def model_config(model: "str | ModelConfig") -> ModelConfig:
-    """The configuration behind a preset's name (or the configuration itself).
+    """The configuration behind a name (or the configuration itself).
 
     Raises:
-        ValueError: the name is not a preset.
+        ValueError: the name is unknown.
     """
     if isinstance(model, ModelConfig):
         return model
-    if model not in PRESETS:
-        names = ", ".join(PRESETS)
+    if model not in SIZES:
+        names = ", ".join(SIZES)
         raise ValueError(f"model={model!r} is unknown; choose one of {names} or give a ModelConfig.")
-    return PRESETS[model]
+    return SIZES[model]

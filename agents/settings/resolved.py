@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from maexp.agents.settings.algorithms import Settings, find_presets
+from maexp.agents.settings.algorithms import Settings, find_tunings
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import EnvSettings, LearnerSettings, ScenarioSettings, given
@@ -102,7 +102,7 @@ def _resolve_planner(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
 
 def algorithm_settings(cfg: LearnerSettings) -> Settings:
     """The settings of the algorithm."""
-    return find_presets(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
+    return find_tunings(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
 
 
 def model_settings(cfg: LearnerSettings) -> ModelConfig:

@@ -17,7 +17,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig
 
 from maexp.agents.runtime.choices import CHOICES
-from maexp.agents.settings.algorithms import PRESETS
+from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.model import ModelConfig
 from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
 from maexp.envs.importing.options import ImportOptions
@@ -73,7 +73,7 @@ RewardSettings = optional_settings(RewardConfig)
 ObservationSettings = optional_settings(ObservationConfig)
 CommSettings = optional_settings(CommConfig)
 AlgorithmSettings = optional_settings(
-    *{type(row.default): None for row in PRESETS.values()}, name=str | None
+    *{type(row.default): None for row in TUNINGS.values()}, name=str | None
 )
 ImportSettings = optional_settings(ImportOptions)
 

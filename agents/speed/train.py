@@ -9,7 +9,7 @@ import torch
 from maexp.agents.build import Learner, load_maps, make_env, make_learner, set_steps
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
-from maexp.agents.settings.model import PRESETS
+from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.schema import BenchSettings, TrainSettings
 from maexp.agents.speed.shared import describe_point, print_table, spread, sweep_points, write_report
@@ -75,9 +75,9 @@ class Trainee:
 
 
 def _model_name(cfg: TrainSettings) -> str:
-    """The preset whose sizes these are."""
+    """The name of these sizes."""
     sizes = replace(model_settings(cfg), action="regions")
-    return next((name for name, one in PRESETS.items() if one == sizes), "own")
+    return next((name for name, one in SIZES.items() if one == sizes), "own")
 
 
 def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:

@@ -216,6 +216,7 @@ def _ends(batch: TensorDictBase) -> dict[str, torch.Tensor]:
     after, info = batch["next"], batch["next", "info"]
     ends = {
         "coverage": info["coverage"].squeeze(-1),
+        # as in envs/metrics.py, but for a team whose last robot collides in the very step of success
         "success_rate": after["terminated"].squeeze(-1) & ~info["collided"].all(-1),
         "collisions": info["collided"].sum(-1),
         "path_length": info["path_length"].mean(-1),

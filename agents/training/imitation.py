@@ -27,7 +27,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.runtime.shipped import advise, shipped_names
 from maexp.agents.settings.checks import check_counts, check_goals
 from maexp.agents.settings.compose import settings_of
-from maexp.agents.settings.model import PRESETS, ModelConfig
+from maexp.agents.settings.model import SIZES, ModelConfig
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
@@ -86,7 +86,7 @@ def model_of(saved: dict) -> ModelConfig:
         for name, value in settings_of(saved).items()
         if name.startswith("model.") and value is not None
     }
-    return replace(PRESETS[values.pop("preset", "small")], **values)
+    return replace(SIZES[values.pop("preset", "small")], **values)
 
 
 def warm_start(run: TrainingRun) -> None:
