@@ -20,7 +20,14 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
-from maexp.agents.settings.schema import SUPPLIED, EnvSettings, LearnerSettings, ScenarioSettings, TrainSettings, given
+from maexp.agents.settings.schema import (
+    SUPPLIED,
+    CommonSettings,
+    LearnerSettings,
+    ScenarioSettings,
+    TrainSettings,
+    given,
+)
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
@@ -117,7 +124,7 @@ def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
 
 
 def make_env(
-    cfg: EnvSettings, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None, **others: Any
+    cfg: CommonSettings, maps: list[PointCloudMap], num_robots: int, num_envs: int | None = None, **others: Any
 ) -> ExplorationEnv:
     """The environment that the settings describe, on `maps`; `others` are arguments of `ExplorationEnv`.
 
@@ -147,7 +154,7 @@ def make_env(
     )
 
 
-def choose_starts(cfg: EnvSettings, num_robots: int) -> str | np.ndarray:
+def choose_starts(cfg: CommonSettings, num_robots: int) -> str | np.ndarray:
     """`scenario.starts` for an env: drawn, fixed, or the poses that its file holds.
 
     Raises:
@@ -195,7 +202,7 @@ def set_steps(cfg: TrainSettings, env: ExplorationEnv) -> int:
 
 
 def team_configs(
-    cfg: EnvSettings, num_robots: int
+    cfg: CommonSettings, num_robots: int
 ) -> tuple[RobotConfig | list[RobotConfig], RadarConfig | list[RadarConfig]]:
     """Robot and radar of a team: one of each for all robots, or lists where `robot.team` tells robots apart.
 

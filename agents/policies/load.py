@@ -14,7 +14,7 @@ from maexp.agents.runtime.folder import AGAIN, WEIGHTS, Contract, read_checked, 
 from maexp.agents.runtime.shipped import CONTRACT, find_policy, shipped_names
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import EnvSettings
+from maexp.agents.settings.schema import CommonSettings
 from maexp.envs import ExplorationEnv
 
 
@@ -53,7 +53,7 @@ def check_policies(words: list[str], setting: str = "policy") -> None:
     check_distinct(setting, [policy_name(word) for word in words])
 
 
-def show_targets(cfg: EnvSettings, words: Iterable[str], setting: str = "policy") -> None:
+def show_targets(cfg: CommonSettings, words: Iterable[str], setting: str = "policy") -> None:
     """Let the env of the settings show as many targets as the trained policies among `words` look at.
 
     Raises:

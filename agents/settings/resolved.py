@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from maexp.agents.settings.algorithms import Settings, find_tunings
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import EnvSettings, LearnerSettings, ScenarioSettings, given
+from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, given
 from maexp.envs.config import (
     CommConfig,
     ObservationConfig,
@@ -84,7 +84,7 @@ def plain_value(value: Any) -> Any:
     return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
-def _resolve_robot(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
+def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
     robot, radar = given(cfg.robot, "team"), given(cfg.radar)
     team = []
@@ -95,7 +95,7 @@ def _resolve_robot(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
     return asdict(complete_robot(RobotConfig(**robot), row)) | {"team": team or None}
 
 
-def _resolve_planner(cfg: EnvSettings, row: Scenario) -> dict[str, Any]:
+def _resolve_planner(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     planner = asdict(complete_planner(PlannerConfig(**given(cfg.planner)), row))
     return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(cfg.planner.name, ())}
 

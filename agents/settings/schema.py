@@ -136,7 +136,7 @@ class LoggerSettings:
 
 
 @dataclass
-class EnvSettings:
+class CommonSettings:
     """Settings that every verb with an environment shares."""
 
     scenario: ScenarioSettings = field(default_factory=ScenarioSettings)
@@ -153,7 +153,7 @@ class EnvSettings:
 
 
 @dataclass
-class LearnerSettings(EnvSettings):
+class LearnerSettings(CommonSettings):
     """Settings of everything that has a network."""
 
     algorithm: AlgorithmSettings = field(default_factory=AlgorithmSettings)

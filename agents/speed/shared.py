@@ -21,7 +21,7 @@ from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import split_sweeps, without
-from maexp.agents.settings.schema import BenchSettings, EnvSettings
+from maexp.agents.settings.schema import BenchSettings, CommonSettings
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs import ExplorationEnv
 
@@ -73,7 +73,7 @@ def time_call(call: Callable[[], Any], device: torch.device) -> float:
     return time.thread_time() - begin
 
 
-def describe_point(env: ExplorationEnv, cfg: EnvSettings) -> dict[str, Any]:
+def describe_point(env: ExplorationEnv, cfg: CommonSettings) -> dict[str, Any]:
     """What tells the points of a sweep apart."""
     return {
         "scenario": cfg.scenario.name,
