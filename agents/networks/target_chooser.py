@@ -5,9 +5,10 @@ any number of candidates and any team. What the classical planner thinks of a ca
 untrained policy makes that planner's choices, and learns where to differ.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
@@ -31,9 +32,26 @@ class Attention(nn.Module):
 
     def forward(self, members: Tensor, bias: Tensor) -> Tensor:
         """`bias` [batch, members or 1, members] is 0 where a member is looked at and -inf elsewhere."""
-        query, key, value = self.project(self.norm(members)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(query, key, value, attn_mask=bias.unsqueeze(1))
-        return members + self.out(mixed.transpose(1, 2).flatten(-2))
+        parts = self.project(self.norm(members)).chunk(3 * self.heads, dim=-1)
+        return members + self.out(attend(parts, bias))
+
+
+def attend(parts: Sequence[Tensor], bias: Tensor) -> Tensor:
+    """Attention over small sets: plain products, which take half the time of torch's fused kernel with its gradient.
+
+    Args:
+        parts: queries, then keys, then values of every head, [batch, members, width / heads] each
+        bias: added to the scores, [batch, members or 1, members]
+
+    Returns:
+        shape [batch, members, width]
+    """
+    heads = len(parts) // 3
+    scale, bias = parts[0].shape[-1] ** -0.5, bias.expand(-1, parts[0].shape[1], -1)
+    mixed = []
+    for query, key, value in zip(parts[:heads], parts[heads : 2 * heads], parts[2 * heads :], strict=True):
+        mixed.append(torch.baddbmm(bias, query, key.mT, alpha=scale).softmax(-1) @ value)
+    return torch.cat(mixed, dim=-1)
 
 
 class TargetEncoder(nn.Module):
