@@ -35,12 +35,15 @@ def half_seen(height: int = 30, width: int = 40) -> np.ndarray:
         ({"origin": (0, 0, 0, 0, 0, 0, 1)}, "must be x, y"),
         ({"poses": 7}, "poses=7 must be"),
         ({"poses": [1.0, 2.0]}, "poses: 0 has 1.0"),
+        ({"poses": np.zeros((2, 2, 2))}, "poses: 0 has array([[0., 0.], [0., 0.]]), and"),
         ({"poses": {"a": "here"}}, "poses: 'a' has 'here'"),
         ({"robot_radius": -1.0}, "robot_radius: 'a' has -1.0"),
         ({"robot_radius": {"a": 0.3}}, "robot_radius: 'b' has None"),
         ({"robot_radius": [0.3]}, "robot_radius holds 1 values"),
         ({"velocities": [0.3]}, "velocities holds 1 values"),
         ({"radar_range": 0}, "radar_range=0 must be above 0"),
+        ({"radar_range": 1e4}, "radar_range=10000 is 100,000 cells of 0.1 m, too many to plan on: make cells larger"),
+        ({"resolution": 2e-4}, "radar_range=5 is 25,000 cells of 0.0002 m"),
         ({"now": None, "radar_range": "far"}, "radar_range='far' must be a finite number"),
         ({"time_left": float("nan")}, "time_left=nan must be"),
     ],
@@ -164,7 +167,7 @@ def test_robots_that_appear_and_vanish():
     planner, grid = TeamPlanner(), half_seen()
     sizes = []
     for names in ("a", "ab", "b", "", "ab"):
-        plan = planner.plan(grid, 0.1, (0, 0), {name: POSES[name] for name in names}, now=len(sizes))
+        plan = planner.plan(grid, 0.1, (0, 0), {name: POSES[name] for name in names}, now=100.0 * len(sizes))
         assert plan.names == tuple(names) and plan.active.all()
         sizes.append(set(planner.watch.tracks))
     assert sizes == [{"a"}, {"a", "b"}, {"b"}, set(), {"a", "b"}]

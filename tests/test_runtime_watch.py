@@ -150,23 +150,42 @@ def test_a_target_given_up_is_tried_again_after_the_pause():
     assert np.allclose(world.call(planner).goals, first.goals)
 
 
-def test_a_robot_that_goes_back_and_forth_is_sent_to_the_nearest(monkeypatch):
+@pytest.mark.parametrize("round_", [2, 3, 4])
+def test_a_robot_that_goes_back_and_forth_is_sent_to_the_nearest(monkeypatch, round_):
     turn = iter(range(100))
     monkeypatch.setitem(
-        planner_module.CHOICES, "fickle", lambda scene: np.argsort(scene.travel)[:, 1 + next(turn) % 2]
+        planner_module.CHOICES, "fickle", lambda scene: np.argsort(scene.travel)[:, 1 + next(turn) % round_]
     )
     world, planner = World(robots=1), TeamPlanner("fickle", **SETTINGS | {"patience": 60.0})
     goals, said = [], []
-    for _ in range(6):
+    for _ in range(2 * round_ + 2):
         plan = world.call(planner)
         goals.append(plan.goals[0])
         said.append(plan.notes)
         world.now += 1.0
-    assert [bool(one) for one in said] == [False, False, False, True, False, False]
-    assert said[3] == ("robot 0 went back and forth between targets: it goes on to the nearest",)
+    caught = 2 * round_ - 1
+    assert [k for k, one in enumerate(said) if one] == [caught]
+    assert said[caught] == ("robot 0 went back and forth between targets: it goes on to the nearest",)
     nearest = world.call(TeamPlanner("nearest_frontier", **SETTINGS)).goals[0]
-    assert not np.allclose(goals[0], goals[1]) and np.allclose(goals[0], goals[2])
-    assert np.allclose(goals[3:], nearest)
+    assert not np.allclose(goals[0], goals[1]) and np.allclose(goals[0], goals[round_])
+    assert np.allclose(goals[caught:], nearest)
+
+
+@pytest.mark.parametrize("absent", ["without a pose", "not named"])
+def test_a_robot_whose_pose_comes_and_goes_is_watched_while_it_is_there(absent):
+    world, planner = World(robots=1), TeamPlanner("nearest_frontier", **SETTINGS)
+    lost = {0: None} if absent == "without a pose" else {}
+
+    def call(there: bool) -> tuple:
+        poses = {0: world.at[0]} if there else lost
+        plan = planner.plan(world.grid(), CELL, (0.0, 0.0), poses, now=world.now)
+        world.now += 1.0
+        return tuple(one for one in plan.notes if "gave" in one)
+
+    assert not any(call(there=k == 0) for k in range(19))  # nobody could drive it
+    assert not call(there=True)
+    said = [call(there=bool(k % 2)) for k in range(10)]
+    assert [one for one in said if one] == [("robot 0 gave its target up: it did not move for 5 s",)]
 
 
 def test_a_robot_that_comes_no_nearer_gives_its_target_up():

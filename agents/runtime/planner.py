@@ -14,7 +14,7 @@ import numpy as np
 from .choices import CHOICES
 from .features import Motion
 from .folder import Contract, LearnedChoice
-from .grid import FREE, KnownGrid, read_grid
+from .grid import FREE, MAX_CELLS, KnownGrid, read_grid
 from .scene import Scene, look_at
 from .shipped import find_policy
 from .team import Team, read_team
@@ -141,6 +141,7 @@ class TeamPlanner:
         known = read_grid(grid, resolution, origin, self.occupied, notes)
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+        _check_reach(reach, known)
         time_left = min(max(_finite("time_left", time_left), 0.0), 1.0)
         scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
@@ -243,6 +244,16 @@ def _finite(name: str, value) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{name}={value!r} must be a finite number")
     return number
+
+
+def _check_reach(radar_range: float, grid: KnownGrid) -> None:
+    """Robots look over the grid and so far around it: that has to fit the memory."""
+    cells = radar_range / grid.cell
+    if (grid.width + 2.0 * cells) * (grid.height + 2.0 * cells) > 2 * MAX_CELLS:
+        raise ValueError(
+            f"radar_range={radar_range:g} is {cells:,.0f} cells of {grid.cell:g} m, "
+            "too many to plan on: make cells larger"
+        )
 
 
 def _positive(name: str, value, zero: bool = False) -> float:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+FASTEST = 1e3  # speeds above are none [m/s]
+
 
 @dataclass(frozen=True)
 class Team:
@@ -77,7 +79,8 @@ def _pose(name, value) -> np.ndarray:
         return np.full(3, np.nan)
     numbers = _numbers(value)
     if numbers is None or numbers.shape not in ((2,), (3,)):
-        raise ValueError(f"poses: {name!r} has {value!r}, and it must be x, y [m] and, if known, yaw [rad]")
+        told = " ".join(repr(value).split())
+        raise ValueError(f"poses: {name!r} has {told}, and it must be x, y [m] and, if known, yaw [rad]")
     numbers = np.append(numbers, 0.0)[:3]
     known = np.isfinite(numbers[:2]).all() and np.abs(numbers[:2]).max() < 1e9
     return np.where(np.isfinite(numbers), numbers, 0.0) if known else np.full(3, np.nan)
@@ -96,7 +99,7 @@ def _read_speeds(velocities, names: tuple, notes: list[str]) -> np.ndarray:
         return speed
     for row, value in enumerate(_match(velocities, names, "velocities")):
         numbers = None if value is None else _numbers(value)
-        if numbers is None or numbers.size == 0 or not np.isfinite(numbers).all():
+        if numbers is None or numbers.size == 0 or not (np.abs(numbers) < FASTEST).all():
             notes.append(f"velocities: {names[row]!r} has {value!r}, taken as 0 m/s")
         else:
             speed[row] = numbers if numbers.ndim == 0 else np.hypot(*np.append(numbers, 0.0)[:2])

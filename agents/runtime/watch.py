@@ -19,6 +19,7 @@ LOG = logging.getLogger("maexp.runtime")
 FOR_GOOD = 3  # times that a target is given up until it is for good
 PARKED = 3  # targets that a robot has to give up without moving until it no longer stands in others' way
 SLOW = 3.0  # a robot that moves may take so many times the patience to come nearer
+PERIODS = (2, 3, 4)  # targets in turn, twice the same round: back and forth
 STEP = 0.5  # a robot has moved, or come nearer, by so many of its radii
 
 Block = tuple[int, int]
@@ -29,7 +30,8 @@ class Track:
     """What is remembered of a robot.
 
     Attributes:
-        at, since: where it last stood still, and since when.
+        at, since: where it last stood still, and since when; times at which its pose was not known do not count.
+        seen: when its pose was last known.
         block: the target it has; None = none.
         best, best_since: the shortest way left to it so far [m], and since when.
         past: the targets before, and where the robot was when it got them.
@@ -39,6 +41,7 @@ class Track:
 
     at: np.ndarray
     since: float
+    seen: float
     block: Block | None = None
     best: float = math.inf
     best_since: float = 0.0
@@ -82,12 +85,12 @@ class Watch:
         """
         if now < self.now:
             self.forget()
-        self.now = now
+        before, self.now = self.now, now
         blocks = targets.keys()
         notes = self._look_beside(blocks, near.any(0))
         number = {block: k for k, block in enumerate(blocks)}
         for row, robot in enumerate(robots):
-            track = self._follow(team, robot)
+            track = self._follow(team, robot, before)
             k = number.get(track.block)
             if k is not None and np.isfinite(travel[row, k]) and not near[row, k]:
                 notes += self._check(team, robot, track, float(travel[row, k]))
@@ -95,8 +98,7 @@ class Watch:
                 track.since = track.best_since = now
             if track.hold not in number:
                 track.hold = None
-        for name in set(self.tracks) - set(team.names):
-            del self.tracks[name]
+        self.tracks = {name: one for name, one in self.tracks.items() if now - one.seen <= self.pause}
         return notes
 
     def _look_beside(self, blocks: list[Block], beside: np.ndarray) -> list[str]:
@@ -111,10 +113,12 @@ class Watch:
                 notes.append(f"a target was given up: {self.patience:g} s beside it showed nothing new")
         return notes
 
-    def _follow(self, team: Team, robot: int) -> Track:
-        """A robot's track, its place brought up to date."""
+    def _follow(self, team: Team, robot: int, before: float) -> Track:
+        """A robot's track, its place brought up to date; `before` is the time of the last call."""
         name, at = team.names[robot], team.at[robot]
-        track = self.tracks.setdefault(name, Track(at, self.now))
+        track = self.tracks.setdefault(name, Track(at, self.now, self.now))
+        absent = max(before - track.seen, 0.0)
+        track.since, track.best_since, track.seen = track.since + absent, track.best_since + absent, self.now
         if np.linalg.norm(at - track.at) >= STEP * team.radius[robot]:
             if track.parked:  # what held it is over
                 self.given = {key: value for key, value in self.given.items() if key[0] != name}
@@ -187,16 +191,21 @@ class Watch:
                 notes.append(f"{team.title(robot)} went back and forth between targets: it goes on to the nearest")
             if block != track.block:
                 track.best, track.best_since = math.inf, self.now
-                track.past = [*track.past[-2:], (block, team.at[robot])] if block else track.past
+                track.past = [*track.past[2 - 2 * PERIODS[-1] :], (block, team.at[robot])] if block else track.past
             track.block = block
         return chosen, notes
 
     @staticmethod
     def _swings(track: Track, block: Block | None, at: np.ndarray, room: float, present: Container[Block]) -> bool:
-        """Whether a robot, on taking `block`, would go from A to B, back to A and to B again in little room, while
-        both are still there."""
-        if block is None or block == track.block or len(track.past) < 3:
+        """Whether a robot, on taking `block`, would have gone from A to B, back to A and to B again in little room (or
+        round by C, or by D), while all of them are still there."""
+        if block is None or block == track.block:
             return False
-        (first, start), (second, _), (third, _) = track.past
-        again = first == third == track.block and second == block and first in present
-        return again and bool(np.linalg.norm(at - start) < room)
+        taken = [*track.past, (block, at)]
+        blocks = [one for one, _ in taken]
+        for period in PERIODS:
+            round_ = blocks[-period:]
+            again = len(blocks) >= 2 * period and blocks[-2 * period : -period] == round_
+            if again and all(one in present for one in round_):
+                return bool(np.linalg.norm(at - taken[-2 * period][1]) < room)
+        return False

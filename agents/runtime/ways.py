@@ -6,6 +6,8 @@ A step to a straight neighbour weighs 10, to a diagonal one 14, into a tight cel
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_array
@@ -71,35 +73,36 @@ def flood(passable: np.ndarray, sources: np.ndarray) -> np.ndarray:
     used = np.flatnonzero(passable)
     valid = np.flatnonzero(np.asarray(sources) >= 0)
     if len(used) and len(valid):
-        index = np.zeros(passable.size, np.int32)
-        index[used] = np.arange(len(used), dtype=np.int32)
-        found = dijkstra(_graph(passable, used, index), indices=index[np.asarray(sources)[valid]])
+        found = dijkstra(_graph(passable), indices=np.searchsorted(used, np.asarray(sources)[valid]))
         for robot, lengths in zip(valid, found, strict=True):
             distance[robot, used] = np.minimum(lengths, UNREACHED)
     return distance.reshape(-1, *passable.shape)
 
 
-def _graph(passable: np.ndarray, used: np.ndarray, index: np.ndarray) -> csr_array:
-    """Steps between passable cells: row and column = number among `used`, value = weight."""
-    open_to = _neighbours(passable).reshape(-1, len(STEPS))[used]
-    start, step = np.nonzero(open_to)
-    end = used[start] + (STEPS[:, 1] * passable.shape[1] + STEPS[:, 0])[step]
-    weight = np.stack([WEIGHTS, TIGHT_FACTOR * WEIGHTS]).astype(np.float64)
-    first = np.zeros(len(used) + 1, np.int32)
-    np.cumsum(np.bincount(start, minlength=len(used)), out=first[1:])
-    tight = passable.ravel()[end] == TIGHT
-    return csr_array((weight[tight.view(np.int8), step], index[end], first), shape=(len(used),) * 2)
+def _graph(passable: np.ndarray) -> csr_array:
+    """Steps between passable cells, which are numbered row by row: row and column = from and to, value = weight.
 
-
-def _neighbours(passable: np.ndarray) -> np.ndarray:
-    """Whether a step of `STEPS` leads from every cell to a passable one, bool [H, W, 8]."""
-    height, width = passable.shape
-    wide = np.pad(passable != BLOCKED, 1)
-    result = np.empty((height, width, len(STEPS)), bool)
+    Every cell has eight entries; where no step leads, one to itself, which no way takes. It is faster than to leave
+    them out.
+    """
+    wide = np.pad(passable, 1)
+    kind, width = wide.ravel(), wide.shape[1]
+    at = np.flatnonzero(kind)
+    own = np.arange(len(at), dtype=np.int32)
+    number = np.zeros(kind.size, np.int32)
+    number[at] = own
+    ends, weights, beside = np.empty((len(at), 8), np.int32), np.empty((len(at), 8)), []
     for k, (u, v) in enumerate(STEPS):
-        result[..., k] = wide[1 + v : 1 + v + height, 1 + u : 1 + u + width]
-    result[..., 4:] &= result[..., BESIDE[0]] & result[..., BESIDE[1]]
-    return result
+        end = at + (v * width + u)
+        to = kind[end]
+        if k < 4:
+            beside.append(to != BLOCKED)
+        else:
+            to *= beside[BESIDE[0][k - 4]] & beside[BESIDE[1][k - 4]]
+        ends[:, k] = np.where(to != BLOCKED, number[end], own)
+        weights[:, k] = np.array([UNREACHED, WEIGHTS[k], TIGHT_FACTOR * WEIGHTS[k]], np.float64)[to]
+    first = np.arange(0, ends.size + 1, 8, dtype=np.int32)
+    return csr_array((weights.ravel(), ends.ravel(), first), shape=(len(at),) * 2)
 
 
 def cells_ahead(passable: list[np.ndarray], distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
@@ -111,21 +114,24 @@ def cells_ahead(passable: list[np.ndarray], distance: np.ndarray, cells: np.ndar
         cells: int64 [n, k].
     """
     ways = _WayBack(passable, distance)
-    robot = np.repeat(np.arange(len(cells)), cells.shape[1])
-    result = np.where(distance.reshape(len(distance), -1)[robot, cells.ravel()] < UNREACHED, cells.ravel(), -1)
-    going = np.flatnonzero(result >= 0)
-    at = ways.enter(result[going], robot[going])
-    while len(going):  # all robots at once: there are many short steps
-        far = ways.distance[at] > int(STRAIGHT * ahead)
-        result[going[~far]] = ways.leave(at[~far])
-        going, at = going[far], ways.step(at[far])
-    return result.reshape(cells.shape)
+    near, result = int(STRAIGHT * ahead), np.full(cells.shape, -1)
+    for robot, row in enumerate(cells):
+        found: dict[int, int] = {}  # of the cells that ways have led over: they go on alike from there
+        for k in np.flatnonzero(distance[robot].ravel()[row] < UNREACHED):
+            way = []
+            for at in ways.follow(ways.enter(int(row[k]), robot)):
+                if at in found or ways.distance[at] <= near:
+                    break
+                way.append(at)
+            result[robot, k] = end = found.get(at, at)
+            found.update(dict.fromkeys(way, end))
+    return np.where(result >= 0, ways.leave(result), -1)
 
 
 def trace(passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     """The cells of a shortest way from the source to a reached cell, corners and both ends only, int64 [k]."""
     ways = _WayBack([passable], distance[None])
-    way = ways.leave(ways.follow(int(ways.enter(np.array([end]), 0)[0])))[::-1]
+    way = ways.leave(np.array(list(ways.follow(ways.enter(int(end), 0)))))[::-1]
     turn = np.diff(way)
     return way[np.concatenate([[True], turn[1:] != turn[:-1], [True]])] if len(way) > 1 else way
 
@@ -139,40 +145,36 @@ class _WayBack:
         self.height, self.width = distance.shape[1:]
         self.area = (self.height + 2) * (self.width + 2)
         rim = ((0, 0), (1, 1), (1, 1))
-        self.distance = np.pad(distance, rim, constant_values=UNREACHED).ravel()
-        self.tight = np.pad([one == TIGHT for one in passable], rim).ravel()
-        self.steps = STEPS[:, 1] * (self.width + 2) + STEPS[:, 0]
+        # Views of memory: single cells are read faster from them than from arrays.
+        self.distance = memoryview(np.pad(distance, rim, constant_values=UNREACHED).ravel())
+        self.tight = memoryview(np.pad([one == TIGHT for one in passable], rim).ravel())
+        self.steps = (STEPS[:, 1] * (self.width + 2) + STEPS[:, 0]).tolist()
 
-    def enter(self, cells: np.ndarray, robot: np.ndarray | int) -> np.ndarray:
-        """Cells of the grids of robots in the numbers of the rimmed ones."""
-        return (cells // self.width + 1) * (self.width + 2) + cells % self.width + 1 + robot * self.area
+    def enter(self, cell: int, robot: int) -> int:
+        """A cell of the grid of a robot in the numbers of the rimmed ones."""
+        return (cell // self.width + 1) * (self.width + 2) + cell % self.width + 1 + robot * self.area
 
     def leave(self, at: np.ndarray) -> np.ndarray:
         """The way back of `enter`, without the robot."""
         at = at % self.area
         return (at // (self.width + 2) - 1) * self.width + at % (self.width + 2) - 1
 
-    def step(self, at: np.ndarray) -> np.ndarray:
-        """The cell before each, int64 [n]: none of them a source."""
-        near = self.distance[at[:, None] + self.steps]
-        factor = np.where(self.tight[at], TIGHT_FACTOR, 1)
-        fits = near == self.distance[at][:, None] - WEIGHTS * factor[:, None]
-        reached = near < UNREACHED
-        fits[:, 4:] &= reached[:, BESIDE[0]] & reached[:, BESIDE[1]]
-        return at + self.steps[fits.argmax(1)]
-
-    def follow(self, at: int) -> np.ndarray:
-        """All cells from one to the source, int64 [k]: as `step` goes, faster for a single way."""
-        distance, tight, way = memoryview(self.distance), memoryview(self.tight), [at]
-        steps, weights = self.steps.tolist(), WEIGHTS.tolist()
-        sides = list(zip(*BESIDE, strict=True))
+    def follow(self, at: int) -> Iterator[int]:
+        """All cells from one to the source: each time the first step of `STEPS` that fits."""
+        distance, tight = self.distance, self.tight
+        straight = self.steps[:4]
+        diagonal = [(step, straight[a], straight[b]) for step, a, b in zip(self.steps[4:], *BESIDE, strict=True)]
+        yield at
         while (here := distance[at]) > 0:
             factor = TIGHT_FACTOR if tight[at] else 1
-            for k, step in enumerate(steps):
-                if distance[at + step] == here - factor * weights[k] and (
-                    k < 4 or all(distance[at + steps[side]] < UNREACHED for side in sides[k - 4])
-                ):
-                    at += step
+            before = here - STRAIGHT * factor
+            for step in straight:
+                if distance[at + step] == before:
                     break
-            way.append(at)
-        return np.array(way)
+            else:
+                before = here - DIAGONAL * factor
+                for step, a, b in diagonal:
+                    if distance[at + step] == before and distance[at + a] < UNREACHED and distance[at + b] < UNREACHED:
+                        break
+            at += step
+            yield at
