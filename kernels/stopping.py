@@ -2,7 +2,8 @@
 
 Such a robot turns at a limited rate, so the faster it is the wider its circle: while it turns toward a waypoint it
 swings out into what stands there. Here its speed is held to what stops on that circle and on the straight line after
-it. Where it is too fast for the circle but not for the line it drives on, it brakes on the line and turns later.
+it, and before other robots there. Where it is too fast for the circle but not for the line it drives on, it brakes on
+the line and turns later.
 """
 
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ import warp as wp
 from maexp.kernels.dynamics import wrap_angle
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
-from maexp.kernels.pace import nearest_obstacle
+from maexp.kernels.pace import clear_ahead, nearest_obstacle
 from maexp.kernels.types import DIFFERENTIAL, PI, Robots, point_xy
 
 if TYPE_CHECKING:
@@ -122,12 +123,15 @@ def _hold_turns(
         curve = wp.sign(turn) * robots.max_turn[e, i] / wp.max(speed, SLOWEST)
         free = free_way(grids, m, walls, row, at, heading, curve, turn, keep, span)
     fastest = wp.sqrt(2.0 * EASE * accel * wp.max(free - lead_time * speed, 0.0))
+    ahead = wp.vec2(wp.cos(heading), wp.sin(heading))
+    mates = clear_ahead(e, i, ahead, 2.0 * robots.clearance[e, i], False, collided, center)
+    fastest = wp.min(fastest, wp.sqrt(2.0 * EASE * accel * mates))
     soonest = wp.max(lead_time * (speed - 0.5 * accel * (lead_time - dt)), 0.0)
     length = wp.max(wp.min(full, wp.max(lead_time * fastest, NUDGE * robots.clearance[e, i])), soonest)
     if fastest < speed:
         clearance[e, i] = wp.min(clearance[e, i], NARROW * threshold)
         if straight > free:
-            way = wp.vec2(wp.cos(heading), wp.sin(heading))
+            way = ahead
             length = soonest
     target[e, i] = at + length * wp.normalize(way)
 

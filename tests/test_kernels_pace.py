@@ -158,7 +158,8 @@ def test_differential_drives_can_stop_on_the_way_that_they_drive():
                     "x": world.at[e, i, 0], "y": world.at[e, i, 1], "speed": abs(world.speed[e, i]),
                     "heading": world.heading[e, i] + back, "target": world.target[e, i], "keeps": kept[e, i],
                 }  # fmt: skip
-                want = oracle.held_turn(world.known[e], me, p)
+                mates = [(*world.at[e, j], world.collided[e, j]) for j in range(ROBOTS) if j != i]
+                want = oracle.held_turn(world.known[e], me, mates, p)
                 aside = np.linalg.det([np.subtract(want[:2], world.at[e, i]), world.target[e, i] - world.at[e, i]])
                 seen |= {("aside", abs(aside) > 1e-6), ("narrowed", want[2] < kept[e, i])}
             got = (target.numpy()[e, i] - ORIGIN[MAP_OF_ENV[e]]) / world.cell[e]

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from maexp.agents.cli import main
@@ -34,6 +35,40 @@ def test_a_name_that_is_none_is_a_sentence_with_the_near_ones(words, tmp_path, m
     told = capsys.readouterr().err
     assert "universl is " in told and "did you mean universal" in told and told.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def write_floor(path, width: int, height: int) -> None:
+    """A hall with two pillars as map_server has it, cells of 0.25 m."""
+    free = np.full((height, width), 254, np.uint8)
+    free[[0, -1]], free[:, [0, -1]] = 0, 0
+    free[height // 2, width // 3 :: width // 3] = 0
+    path.with_suffix(".pgm").write_bytes(f"P5 {width} {height} 255\n".encode() + free.tobytes())
+    path.write_text(
+        f"image: {path.stem}.pgm\nresolution: 0.25\norigin: [0, 0, 0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+
+
+def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_floor(tmp_path / "hall.yaml", 60, 40)
+    write_floor(tmp_path / "yard.yaml", 48, 56)
+    done = main([
+        "evaluate", "policy=universal,cost_utility", "scenario=pointcloud", "scenario.path=hall.yaml,yard.yaml",
+        "num_robots=2,3,6,8", "episodes=2", "scenario.macro_steps=2", "device=cpu", "hydra.run.dir=all",
+    ])  # fmt: skip
+    found = json.loads((tmp_path / "all" / "results.json").read_text())
+    assert done == 0
+    for size in (2, 3, 6, 8):
+        for policy in ("universal", "cost_utility"):
+            whole, *floors = (
+                found[f"{policy}{place} N={size}"]["exploration_ratio"] for place in ("", " on hall", " on yard")
+            )
+            assert [one["n"] for one in (whole, *floors)] == [4, 2, 2]
+            assert whole["mean"] == pytest.approx((floors[0]["mean"] + floors[1]["mean"]) / 2)
+        assert f"cost_utility N={size}" in found["difference"][f"universal N={size}"]
+    seen = [found[f"universal N={size}"]["exploration_ratio"]["mean"] for size in (2, 8)]
+    assert 0.05 < seen[0] < seen[1] <= 1.0
 
 
 @pytest.mark.parametrize(("file", "change", "part"), [

@@ -79,10 +79,11 @@ def free_way(known, me, heading: float, turn: float, keep: float, span: float, p
     return min(wanted, span)
 
 
-def held_turn(known, me, p) -> tuple[float, float, float]:
+def held_turn(known, me, mates, p) -> tuple[float, float, float]:
     """Where the waypoint of a differential drive lies once it can stop on its way, and what clearance it keeps.
 
-    `me`: x, y, speed (without sign), heading (of the motion), target, keeps (the clearance so far).
+    `me`: x, y, speed (without sign), heading (of the motion), target, keeps (the clearance so far). `mates`: x, y,
+    stopped of each.
     """
     dx, dy = me["target"][0] - me["x"], me["target"][1] - me["y"]
     lead = p["horizon"] * p["dt"]
@@ -94,6 +95,11 @@ def held_turn(known, me, p) -> tuple[float, float, float]:
     if abs(turn) > p["straight_on"]:
         free = free_way(known, me, me["heading"], turn, keep, span, p)
     fastest = math.sqrt(2 * p["ease"] * p["accel"] * max(free - lead * me["speed"], 0))
+    for x, y, stopped in mates:
+        gap = x - me["x"], y - me["y"]
+        if gap[0] * math.cos(me["heading"]) + gap[1] * math.sin(me["heading"]) > 0:
+            room = max(math.hypot(*gap) - 2 * p["clearance"], 0) * (1 if stopped else 0.5)
+            fastest = min(fastest, math.sqrt(2 * p["ease"] * p["accel"] * room))
     soonest = sum(me["speed"] - p["accel"] * k * p["dt"] for k in range(p["horizon"])) * p["dt"]
     length = max(min(math.hypot(dx, dy), max(lead * fastest, p["nudge"] * p["clearance"])), soonest, 0)
     angle, keeps = math.atan2(dy, dx), me["keeps"]
