@@ -120,6 +120,12 @@ def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     names = [one.name for one in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
+    kinds = sorted({one.scenario for one in maps})
+    if len(kinds) > 1:
+        raise UserError(
+            f"scenario.path={scenario.path} names maps of the scenarios {' and '.join(kinds)}, which have robots of "
+            "their own: give the maps of each scenario a run of their own."
+        )
     return maps
 
 

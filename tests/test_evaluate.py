@@ -221,6 +221,15 @@ def test_paths_of_several_maps():
     assert split_paths("[a.yaml, b c.pcd]") == split_paths("a.yaml,b c.pcd,") == ["a.yaml", "b c.pcd"]
 
 
+def test_maps_of_several_scenarios_are_not_played_in_one_run(tmp_path):
+    make_map("maze_small", 70).save(tmp_path / "a.npz")
+    make_map("indoor_small", 70).save(tmp_path / "b.npz")
+    words = [f"scenario.path={tmp_path}/a.npz,{tmp_path}/b.npz", *POINTCLOUD]
+    cfg = compose_config("evaluate", make_overrides("evaluate", words))
+    with pytest.raises(UserError, match="scenarios indoor_small and maze_small, .* a run of their own"):
+        import_files(cfg.scenario)
+
+
 def test_a_comma_in_a_files_name_and_two_maps_of_one_name(tmp_path):
     (tmp_path / "far").mkdir()
     for path in ("a,b.npz", "a.npz", "far/a.npz"):
