@@ -168,7 +168,10 @@ def check_reward(config: RewardConfig) -> RewardConfig:
     if not isinstance(config.charge_rest, bool):
         raise ValueError(f"reward.charge_rest={config.charge_rest!r} must be true or false")
     if config.time_on == "gained" and not config.charge_rest:
-        raise ValueError("reward.charge_rest=False with reward.time_on='gained': nothing is charged, use true")
+        raise ValueError(
+            "reward.charge_rest=False with reward.time_on='gained': nothing is charged, "
+            "use true or reward.time_on=uncovered"
+        )
     for f in fields(config):
         value = getattr(config, f.name)
         number = isinstance(value, int | float) and 0.0 <= value < math.inf

@@ -42,7 +42,7 @@ def half_seen(height: int = 30, width: int = 40) -> np.ndarray:
         ({"robot_radius": [0.3]}, "robot_radius holds 1 values"),
         ({"velocities": [0.3]}, "velocities holds 1 values"),
         ({"radar_range": 0}, "radar_range=0 must be above 0"),
-        ({"radar_range": 1e4}, "radar_range=10000 is 100,000 cells of 0.1 m, too many to plan on: make cells larger"),
+        ({"radar_range": 1e4}, "radar_range=10000 is 100,000 cells of 0.1 m, too many to plan on: lower radar_range"),
         ({"resolution": 2e-4}, "radar_range=5 is 25,000 cells of 0.0002 m"),
         ({"now": None, "radar_range": "far"}, "radar_range='far' must be a finite number"),
         ({"time_left": float("nan")}, "time_left=nan must be"),

@@ -171,6 +171,19 @@ def test_a_robot_that_goes_back_and_forth_is_sent_to_the_nearest(monkeypatch, ro
     assert np.allclose(goals[caught:], nearest)
 
 
+def test_one_target_and_none_in_turn_is_no_back_and_forth(monkeypatch):
+    turn = iter(range(100))
+    monkeypatch.setitem(
+        planner_module.CHOICES,
+        "flickering",
+        lambda scene: np.where(next(turn) % 2, -1, np.argsort(scene.travel)[:, 1]),
+    )
+    world, planner = World(robots=1), TeamPlanner("flickering", **SETTINGS | {"patience": 60.0})
+    for _ in range(14):
+        assert not any("back and forth" in note for note in world.call(planner).notes)
+        world.now += 1.0
+
+
 @pytest.mark.parametrize("absent", ["without a pose", "not named"])
 def test_a_robot_whose_pose_comes_and_goes_is_watched_while_it_is_there(absent):
     world, planner = World(robots=1), TeamPlanner("nearest_frontier", **SETTINGS)

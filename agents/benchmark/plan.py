@@ -285,8 +285,8 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
         listed = ", ".join(f"{name} (was {before[name]}, now {now[name]})" for name in names[:4])
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         raise UserError(
-            f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were, "
-            "or start a benchmark of its own."
+            f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were "
+            "(where a default has changed since, give its old value), or start a benchmark of its own."
         )
 
 

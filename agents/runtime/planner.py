@@ -252,7 +252,7 @@ def _check_reach(radar_range: float, grid: KnownGrid) -> None:
     if (grid.width + 2.0 * cells) * (grid.height + 2.0 * cells) > 2 * MAX_CELLS:
         raise ValueError(
             f"radar_range={radar_range:g} is {cells:,.0f} cells of {grid.cell:g} m, "
-            "too many to plan on: make cells larger"
+            "too many to plan on: lower radar_range or make cells larger"
         )
 
 

@@ -199,13 +199,13 @@ class Watch:
     def _swings(track: Track, block: Block | None, at: np.ndarray, room: float, present: Container[Block]) -> bool:
         """Whether a robot, on taking `block`, would have gone from A to B, back to A and to B again in little room (or
         round by C, or by D), while all of them are still there."""
-        if block is None or block == track.block:
+        if block is None or track.block in (None, block):
             return False
         taken = [*track.past, (block, at)]
         blocks = [one for one, _ in taken]
         for period in PERIODS:
             round_ = blocks[-period:]
-            again = len(blocks) >= 2 * period and blocks[-2 * period : -period] == round_
+            again = len(set(round_)) > 1 and blocks[-2 * period :] == round_ * 2
             if again and all(one in present for one in round_):
                 return bool(np.linalg.norm(at - taken[-2 * period][1]) < room)
         return False

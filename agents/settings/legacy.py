@@ -4,6 +4,8 @@
 that makes one from the row of the scenario (`maexp.envs.scenarios.Scenario`) and the words of the run, where the old
 default depended on these. A new setting goes here too unless its default is what the code did before.
 
+What `action=targets` sets (its reward, `lmbda`) is not here: checkpoints that can have it hold every value.
+
 The list is used for two kinds of checkpoints:
 
 - those of commit 7bfb560 and before, which hold the words of their command line and nothing else: the list stands in
