@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from episodes import actions, play, step
 from oracle.metrics import mean_coverage
 from torchrl.envs.utils import check_env_specs, step_mdp
 
@@ -19,42 +20,11 @@ from maexp.envs import (
     make_map,
 )
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
-from maexp.kernels import shards as stepping
 
 
 @pytest.fixture(scope="module")
 def maps():
     return [make_map("maze_small", 0), make_map("maze_small", 1), make_map("random_obstacles", 0)]
-
-
-def actions(envs: int, robots: int, steps: int, seed: int = 1) -> list[dict]:
-    """Actions of env e that do not depend on how many envs there are."""
-    result = []
-    for t in range(steps):
-        region, offset = [], []
-        for e in range(envs):
-            g = torch.Generator().manual_seed(seed * 1000003 + t * 1009 + e)
-            region.append(torch.randint(64, (robots,), generator=g))
-            offset.append(torch.rand(robots, 2, generator=g) * 2 - 1)
-        result.append({"region": torch.stack(region), "offset": torch.stack(offset)})
-    return result
-
-
-def play(env, plan, reset=True):
-    """Step through a plan with resets of finished envs; returns the list of stepped tensordicts."""
-    td = env.reset() if reset else reset
-    out = []
-    for action in plan:
-        td = td.clone()
-        for name, value in action.items():
-            td["agents", "action", name] = value
-        stepped, td = env.step_and_maybe_reset(td)
-        out.append(stepped.clone())
-    return out
-
-
-def equal(a, b) -> bool:
-    return all(torch.equal(x, b[k]) for k, x in a.items(include_nested=True, leaves_only=True))
 
 
 @pytest.mark.parametrize("robots", [1, 3])
@@ -106,108 +76,6 @@ def test_history_is_not_aliased(maps):
         assert torch.equal(now[:, 1:], then[:, :-1]), key
         assert key == "alive" or not torch.equal(now[:, 0], now[:, 1]), key
     assert not torch.equal(td["next", "agents", "reward"][:, 0], td["next", "agents", "reward"][:, 1])
-
-
-def test_same_bits_for_any_number_of_envs_and_threads(maps):
-    plan = actions(6, 3, 4)
-    many = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=2, macro_steps=3), plan)
-    few = play(ExplorationEnv(maps, num_envs=2, seed=3, num_threads=1, macro_steps=3),
-               [{k: v[:2] for k, v in a.items()} for a in plan])  # fmt: skip
-    again = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=1, macro_steps=3), plan)
-    other = play(ExplorationEnv(maps, num_envs=6, seed=4, num_threads=1, macro_steps=3), plan)
-    for a, b, c in zip(many, few, again, strict=True):
-        assert equal(b, a[:2]) and equal(c, a)
-    assert not equal(many[0], other[0])
-
-
-@pytest.mark.parametrize("planner", ["dwa", "wavefront"])
-def test_same_bits_in_blocks_of_any_size(maps, planner, monkeypatch):
-    """Blocks of one env, taken by two threads as they get free, against all envs at once."""
-    plan = actions(5, 3, 4)
-    settings = {"num_envs": 5, "seed": 3, "macro_steps": 3, "planner": PlannerConfig(name=planner)}
-    whole = ExplorationEnv(maps, num_threads=1, **settings)
-    monkeypatch.setattr(stepping, "BLOCK_BYTES", 1)
-    monkeypatch.setattr(stepping, "BLOCK_ROBOTS", 1)
-    cut = ExplorationEnv(maps, num_threads=2, **settings)
-    assert [len(env.simulation.blocks) for env in (whole, cut)] == [1, 4]
-    for a, b in zip(play(whole, plan), play(cut, plan), strict=True):
-        assert equal(a, b)
-
-
-def test_episodes_of_an_env_differ_and_resets_are_partial(maps):
-    env = ExplorationEnv(maps[0], num_envs=3, seed=0)
-    first = env.reset()
-    before = env.state_dict()
-    mask = torch.tensor([[False], [True], [False]])
-    env.reset(first.clone().set("_reset", mask))
-    after = env.state_dict()
-    for name in before:
-        if name == "seed":
-            continue
-        assert torch.equal(before[name][[0, 2]], after[name][[0, 2]]), name
-    assert not torch.equal(before["pose"][1], after["pose"][1])
-
-
-def test_evaluation_episodes_depend_on_their_number_alone(maps):
-    small, large = ExplorationEnv(maps, num_envs=2, seed=5), ExplorationEnv(maps, num_envs=4, seed=5)
-    large.rollout(2)
-    large.set_episodes(torch.tensor([9, 4, 7, 2]))
-    small.set_episodes(torch.tensor([4, 2]))
-    a, b = large.reset(), small.reset()
-    assert equal(a[[1, 3]], b)
-    assert torch.equal(large.simulation.tensors["map_id"][[1, 3]], small.simulation.tensors["map_id"])
-    large.set_episodes(torch.arange(4))
-    pose = ("agents", "observation", "pose")
-    training = ExplorationEnv(maps, num_envs=4, seed=5).reset()
-    assert not torch.equal(large.reset()[pose][0], training[pose][0]), "training must not meet the evaluation's starts"
-
-
-def test_evaluation_plays_every_map_as_often_as_the_others():
-    """Seven episodes on three maps, in any batch and where an env goes on after its first; seeds start elsewhere."""
-    three = [make_map("maze_small", index) for index in range(3)]
-    orders = set()
-    for seed in range(8):
-        large, small = (ExplorationEnv(three, num_envs=count, num_robots=1, seed=seed) for count in (7, 1))
-        large.set_episodes(torch.arange(7))
-        large.reset()
-        played = large.simulation.tensors["map_id"].tolist()
-        assert sorted(played.count(index) for index in range(3)) == [2, 2, 3]
-        orders.add(tuple(played))
-        for number in (6, 2):
-            small.set_episodes(torch.tensor([number]))
-            small.reset()
-            assert small.simulation.tensors["map_id"].item() == played[number]
-        small.reset()
-        assert small.simulation.tensors["map_id"].item() == played[3]
-    assert len(orders) == 3
-
-
-def test_state_continues_bit_for_bit(maps):
-    plan = actions(3, 3, 6)
-    env = ExplorationEnv(maps, num_envs=3, macro_steps=4)
-    td = env.reset()
-    for a in plan[:2]:
-        td = step(env, td, a)
-    saved = {k: v.clone() for k, v in env.state_dict().items()}
-    rest = [td := step(env, td, a) for a in plan[2:4]]
-    other = ExplorationEnv(maps, num_envs=3, macro_steps=4, seed=77)
-    other.reset()
-    other.load_state_dict(saved)
-    td = rest[0].clone()
-    again = []
-    for a in plan[2:4]:
-        td = step(other, td, a)
-        again.append(td)
-    assert all(equal(x, y) for x, y in zip(rest, again, strict=True))
-    with pytest.raises(ValueError, match="num_envs"):
-        ExplorationEnv(maps, num_envs=2).load_state_dict(saved)
-
-
-def step(env, td, action):
-    td = td.clone()
-    for name, value in action.items():
-        td["agents", "action", name] = value
-    return step_mdp(env.step(td)).clone()
 
 
 def test_rewards_are_the_sum_of_their_terms_and_coverage_grows(maps):
