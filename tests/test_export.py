@@ -191,11 +191,12 @@ def test_from_a_run_to_a_plan(folder, tmp_path, monkeypatch, capsys):
     small = ("scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]", "scenario.held_out=[1]")
     train = ("total_frames=8", "num_envs=2", "episodes=2", "classical=[]", "device=cpu", "hydra.run.dir=run")
     assert main(["train", "action=targets", *small, *train]) == 0
-    assert main(["export", "run", "out=made"]) == 0
+    assert main(["export", "run", "out=made", "note=The first of three."]) == 0
     told = capsys.readouterr().out
     assert "Written to made: card.md" in told and "policy.onnx (" in told
     card = (tmp_path / "made" / "card.md").read_text()
     assert card.startswith("# made\n") and "| trained | " in card and "| random | " in card and "maze_small" in card
+    assert "\n\nThe first of three.\n\n## Results" in card
     grid = np.full((60, 80), -1)
     grid[:, :40], grid[:, 0] = 0, 100
     poses = {"a": (1.0, 1.0, 0.0), "b": (1.0, 3.0, 1.5)}

@@ -50,7 +50,7 @@ def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
         policy = load_policy(cfg, env, [])  # it is not played: no map of its training need still be there
         find_chooser(policy)
         name, trained = cfg.name or out.absolute().name, describe_training(cfg, saved)
-        card = write_card(name, trained, result_files(cfg, path))
+        card = write_card(name, trained, result_files(cfg, path), cfg.note)
         export_policy(policy, env, out, name, card, trained)
     remove_if_empty(where)
     files = ", ".join(f"{file.name} ({file.stat().st_size / 1024:.0f} kB)" for file in sorted(out.iterdir()))

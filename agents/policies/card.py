@@ -18,12 +18,13 @@ RESULTS = ("results.json", "summary.json")  # of maexp evaluate, of maexp train
 NEXT = "coverage_auc"  # differences are told in it
 
 
-def write_card(name: str, trained: dict[str, Any], files: list[Path]) -> str:
+def write_card(name: str, trained: dict[str, Any], files: list[Path], note: str | None = None) -> str:
     """The card.
 
     Args:
         trained: how it was trained, as in the contract, with the names of its scenarios.
         files: results of its evaluations.
+        note: what else is to be known of the training.
     """
     places = ", ".join(f"`{one}`" for one in trained["scenarios"])
     teams = ", ".join(map(str, trained["num_robots"]))
@@ -34,6 +35,7 @@ def write_card(name: str, trained: dict[str, Any], files: list[Path]) -> str:
         "## Training", "",
         f"`{trained['algorithm']}` on {places}, teams of {teams}, {trained['frames']:,} macro steps of teams, seed "
         f"{trained['seed']}, commit {trained['commit']}.", "",
+        *([note, ""] if note else []),
         "## Results", "",
     ]  # fmt: skip
     for file in files:

@@ -233,6 +233,7 @@ class ExportSettings(LearnerSettings):
     out: str | None = setting(None, "folder to write, new or empty")
     name: str | None = setting(None, "of the policy; default: the folder's")
     results: str | None = setting(None, "evaluations for its card: results=FOLDER,FOLDER; default: the run's own")
+    note: str | None = setting(None, "for its card, below the training: what else is to be known")
     num_robots: Any = setting(3, "robots in a team")
 
 
