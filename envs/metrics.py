@@ -3,11 +3,17 @@
 from functools import lru_cache
 
 import numpy as np
+import torch
 from scipy.stats import bootstrap
 from tensordict import TensorDictBase
 
 RESAMPLES = 5000
 GROUPED_RESAMPLES = 2000  # of maps, seeds and episodes: each takes a weight for every episode
+
+
+def succeeded(coverage: torch.Tensor, success_coverage: float) -> torch.Tensor:
+    """Whether episodes that ended with `coverage`, float32, are successes: rounded as in the kernels."""
+    return coverage >= coverage.new_tensor(success_coverage)
 
 
 def episode_metrics(
@@ -32,7 +38,7 @@ def episode_metrics(
         "coverage_auc": info["coverage_auc"][:, 0],
         "reward_variance": info["episode_reward_raw"].std(axis=1),
         "reward_variance_scaled": info["episode_reward"].std(axis=1),
-        "success_rate": (info["coverage"][:, 0] >= np.float32(success_coverage)).astype(np.float64),
+        "success_rate": succeeded(final["coverage"][:, 0], success_coverage).double().cpu().numpy(),
         "collisions": info["collided"].sum(axis=1),
         "path_length": info["path_length"].mean(axis=1),
     }

@@ -23,6 +23,7 @@ from maexp.agents.training.collect import Teams, WorkerLost, batch_statistics, d
 from maexp.agents.training.logs import read_metrics
 from maexp.agents.training.train import make_both
 from maexp.envs import ExplorationEnv, make_map
+from maexp.envs.metrics import episode_metrics
 
 ROBOTS, STEPS = 2, 5
 
@@ -93,6 +94,20 @@ def test_statistics_of_several_sizes_are_those_of_all_robots_and_episodes():
         ("path_length", lambda end: float(end["info", "path_length"].mean())),
     ):
         assert found[name] == pytest.approx(sum(map(value, ends)) / len(ends), rel=1e-5)
+
+
+def test_a_team_whose_last_robot_collides_in_the_step_of_success_has_succeeded():
+    """The log of a training counts as the evaluation does: what was covered, whatever became of the robots."""
+    env = ExplorationEnv(make_map("maze_small", 0), 2, 2, local_steps=4, macro_steps=2, success_coverage=0.3)
+    torch.manual_seed(0)
+    batch = env.rollout(2)
+    info = batch["next", "info"]
+    info["coverage"][:, -1, 0] = torch.tensor([0.3, 0.29])  # float32: 0.3 as the kernels round it
+    info["collided"][:, -1] = True
+    batch["next", "terminated"][:, -1] = True
+    final = episode_metrics(info[:, -1], success_coverage=0.3)["success_rate"]
+    assert final.tolist() == [1.0, 0.0]
+    assert batch_statistics(batch, success_coverage=0.3)["success_rate"] == 0.5
 
 
 def grid(*sizes: int) -> list[tuple]:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from maexp.agents.errors import UserError
+from maexp.envs.metrics import succeeded
 from maexp.envs.specs import REWARD_TERMS
 
 _SEPARATOR = "/"
@@ -186,7 +187,7 @@ class Stopwatch:
         self.seconds += time.perf_counter() - self._begun
 
 
-def batch_statistics(*batches: TensorDictBase) -> dict[str, float]:
+def batch_statistics(*batches: TensorDictBase, success_coverage: float = 0.95) -> dict[str, float]:
     """What the log says about batches [envs, steps]: rewards per decision, and how the episodes in them ended.
 
     A robot that has collided decides nothing, yet goes on paying: what it earns counts, over the decisions of the
@@ -195,7 +196,7 @@ def batch_statistics(*batches: TensorDictBase) -> dict[str, float]:
     """
     decisions = sum(int(batch["agents", "observation", "alive"].sum()) for batch in batches)
     earned = [_earned(batch) for batch in batches]
-    ends = [_ends(batch) for batch in batches]
+    ends = [_ends(batch, success_coverage) for batch in batches]
     return {
         **{name: sum(one[name] for one in earned) / max(decisions, 1) for name in earned[0]},
         "episodes": sum(len(one["coverage"]) for one in ends),
@@ -211,13 +212,12 @@ def _earned(batch: TensorDictBase) -> dict[str, float]:
     return {name: value.sum(dtype=torch.float64).item() for name, value in rewards.items()}
 
 
-def _ends(batch: TensorDictBase) -> dict[str, torch.Tensor]:
+def _ends(batch: TensorDictBase, success_coverage: float) -> dict[str, torch.Tensor]:
     """What became of every episode that ended, [m]."""
     after, info = batch["next"], batch["next", "info"]
     ends = {
         "coverage": info["coverage"].squeeze(-1),
-        # as in envs/metrics.py, but for a team whose last robot collides in the very step of success
-        "success_rate": after["terminated"].squeeze(-1) & ~info["collided"].all(-1),
+        "success_rate": succeeded(info["coverage"].squeeze(-1), success_coverage),
         "collisions": info["collided"].sum(-1),
         "path_length": info["path_length"].mean(-1),
     }

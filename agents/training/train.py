@@ -69,7 +69,7 @@ def train(run: "TrainingRun") -> None:
             with name_iteration(run):
                 begin = time.perf_counter()
                 batches = experience.next()
-                row = batch_statistics(*batches)
+                row = batch_statistics(*batches, success_coverage=cfg.scenario.success_coverage)
                 row |= learner.updater.update(*batches, progress=run.iteration / run.iterations)
                 experience.update_policy_weights_()
                 run.iteration += 1
