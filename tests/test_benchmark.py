@@ -15,11 +15,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from maexp.agents.benchmark.cell import CellResult, read_result
 from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
-from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, compose_settings, list_cells
+from maexp.agents.benchmark.plan import (
+    Cell,
+    cell_config,
+    cell_folder,
+    check_unchanged,
+    compose_settings,
+    list_cells,
+    write_plan,
+)
 from maexp.agents.benchmark.pool import WorkerPool
 from maexp.agents.benchmark.table import (
     ROWS,
@@ -33,6 +42,7 @@ from maexp.agents.benchmark.table import (
 )
 from maexp.agents.cli import main
 from maexp.agents.commands.benchmark import prepare
+from maexp.agents.errors import UserError
 from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.logs import read_metrics
 
@@ -99,6 +109,18 @@ def test_every_setting_reaches_every_cell():
     assert run.robot.team[0].radar.range == 3
 
 
+def test_benchmark_json_holds_no_null_and_yet_all_that_must_stay(tmp_path):
+    usual, other = settings("scenario=maze"), settings("scenario=maze", "radar.range=7")
+    (tmp_path / "cells" / "maze" / "random" / "seed_0").mkdir(parents=True)
+    for before, after, change in ((usual, other, "was left open, now 7.0"), (other, usual, "was 7.0, now left open")):
+        write_plan(tmp_path, before, [])
+        written = json.loads((tmp_path / "benchmark.json").read_text())
+        assert None not in written["settings"].values() and "robot.length" in written["left_open"]
+        check_unchanged(tmp_path, before)
+        with pytest.raises(UserError, match=rf"radar.range \({change}\)"):
+            check_unchanged(tmp_path, after)
+
+
 # A benchmark from end to end
 
 
@@ -115,6 +137,9 @@ def test_files_and_summaries(whole):
     assert coverage["n"] == 6 == len(pooled)
     np.testing.assert_allclose([coverage["mean"], coverage["std"]], [pooled.mean(), pooled.std()])
     assert coverage["ci95"][0] < coverage["mean"] < coverage["ci95"][1]
+    for cell in CELLS:  # each says what it ran
+        shown = OmegaConf.load(cell_folder(whole, cell) / "config.yaml")
+        assert shown.radar.range == 10.0 and ("algorithm" in shown) == cell.trains
     run = flat["run"]
     assert (run["scenario"], run["seeds"], run["episodes"]) == ("maze_small", [0, 1], 3)
     assert run["maps"] == ["maze_small_64", "maze_small_65"] and run["cells"] == {"done": 6, "all": 6}

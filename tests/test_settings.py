@@ -83,6 +83,16 @@ def test_a_map_of_ones_own_tells_its_scenario_and_the_length_of_an_episode(tmp_p
     assert "range" not in resolve(cfg)["radar"], "who has not read the map does not know"
 
 
+def test_classical_planners_have_no_algorithm_and_a_benchmark_no_scenario_of_its_own():
+    for verb, words in (("evaluate", ["policy=random"]), ("view", ["policy=random", "checkpoint=null"])):
+        shown = resolve(compose_config(verb, words))
+        assert not {"algorithm", "tuning", "model"} & shown.keys() and shown["radar"]["range"] == 10.0
+        learned = resolve(compose_config(verb, [*words, "checkpoint=x"]))
+        assert shown.keys() == learned.keys() - {"algorithm", "tuning", "model", "checkpoint"}
+    shown = resolve(compose_config("benchmark", ["scenarios=[maze,outdoor]"]))
+    assert "name" not in shown["scenario"] and "name" not in shown["algorithm"] and None not in flatten(shown).values()
+
+
 def test_yaml_holds_the_same_values():
     settings = resolve(compose_config("train", ["comm.range=inf"]))
     assert OmegaConf.to_container(OmegaConf.create(to_yaml(settings))) == settings

@@ -20,13 +20,19 @@ from maexp.agents.evaluation.results import describe_run
 from maexp.agents.files import short, write_file, write_json
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
+from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
-from maexp.agents.training.train import TrainingRun, train, write_config
+from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
+PLAYED = (
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "num_envs", "num_robots", "seed",
+    "num_threads",
+)  # fmt: skip
+"""Settings that matter to who only plays."""
 CURVE = ("curve_seconds", "curve_coverage")
 TRAINED = "training.json"
 """Written last where a training has come to its end."""
@@ -131,21 +137,34 @@ def play_suite(
         size = min(cfg.num_envs, episodes)
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
         policy = POLICIES[cell.policy](env) if team is None else restore_policy(env, model_settings(settings), team)
+        if not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
+            write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:
         with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
-            result = evaluate(
-                policy, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance
-            )
+            result = evaluate(policy, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance)
     seconds, coverage = recorder.curves(episodes)
     arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
     arrays["maps"] = result.maps
     described = describe_run(settings, maps, time.perf_counter() - begin)
     described |= {} if team is None else {"training_seconds": team["training_seconds"]}
-    described |= {"algorithm": cell.policy if cell.trains else None, "episodes": episodes, "maps_are": suite}
+    described |= {"algorithm": cell.policy} if cell.trains else {}
+    described |= {"episodes": episodes, "maps_are": suite}
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
+
+
+def played_settings(settings: TrainSettings, maps: list) -> dict:
+    """The settings of a cell's env with all their values."""
+    values = resolve(settings, maps)
+    return {name: values[name] for name in PLAYED if name in values}
+
+
+def who_played(cfg: BenchmarkSettings, cell: Cell, episodes: int) -> dict:
+    """The policy of a cell, and where it was trained."""
+    trained = {"checkpoint": f"cells/{training_cell(cfg, cell).name}"} if cell.trains else {}
+    return {"policy": cell.policy, "episodes": episodes} | trained
 
 
 _ATTRIBUTE = {"held_out": "held_out", "trained": "train", VALIDATION: "validation"}

@@ -25,6 +25,7 @@ from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 PLAN = "benchmark.json"
+OPEN = "left_open"
 TOGETHER = "together"
 """In place of a scenario's name: all of them at once."""
 SUITES = {"held_out": "held-out maps", "trained": "training maps"}
@@ -243,8 +244,11 @@ def cell_folder(where: Path, cell: Cell) -> Path:
 
 
 def write_plan(where: Path, cfg: DictConfig, overrides: list[str]) -> None:
-    """benchmark.json: the words of the command line, and the settings that all cells share."""
-    write_json(where / PLAN, {"overrides": overrides, "settings": shared_settings(cfg)})
+    """benchmark.json: the words of the command line, the settings that all cells share, and the names of those that
+    each cell has from its scenario or algorithm (its own config.yaml holds them)."""
+    shared = shared_settings(cfg)
+    fixed = {name: value for name, value in shared.items() if value is not None}
+    write_json(where / PLAN, {"overrides": overrides, "settings": fixed, OPEN: [n for n in shared if n not in fixed]})
 
 
 def read_plan(place: str | Path) -> dict:
@@ -259,13 +263,14 @@ def read_plan(place: str | Path) -> dict:
         raise UserError(f"{place} {found}: give the folder of a maexp benchmark that was started before.")
     try:
         content = json.loads(path.read_text())
-        return {"overrides": list(content["overrides"]), "settings": dict(content["settings"])}
+        left_open = dict.fromkeys(content.get(OPEN, []))
+        return {"overrides": list(content["overrides"]), "settings": content["settings"] | left_open}
     except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is damaged: start the benchmark anew in another folder.") from error
 
 
 def shared_settings(cfg: DictConfig) -> dict[str, Any]:
-    """What must stay as it is for cells to be comparable."""
+    """What must stay as it is for cells to be comparable; None: left open, see `write_plan`."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
     shared = {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
     return {name: "inf" if value == math.inf else value for name, value in shared.items()}  # JSON has no infinity
@@ -282,7 +287,8 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
     before, now = read_plan(where)["settings"], json.loads(json.dumps(shared_settings(cfg)))
     names = [name for name in now if name in before and before[name] != now[name]]  # others came or went with the code
     if names:
-        listed = ", ".join(f"{name} (was {before[name]}, now {now[name]})" for name in names[:4])
+        told = [["left open" if one[name] is None else one[name] for one in (before, now)] for name in names[:4]]
+        listed = ", ".join(f"{name} (was {was}, now {to})" for name, (was, to) in zip(names, told, strict=False))
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         raise UserError(
             f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were "

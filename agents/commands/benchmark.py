@@ -33,6 +33,7 @@ from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.training.train import stop_on_signals, write_config
 
+NOTE = "What is absent here each cell has from its scenario and its algorithm: see cells/*/*/*/config.yaml."
 FAILED, STOPPED = 1, 130
 SHOWN = 2  # running cells in the line of progress
 LONG = 24.0  # hours that need confirm=true
@@ -105,7 +106,7 @@ def run_locked(cfg: BenchmarkSettings, where: Path, overrides: list[str]) -> int
     confirm(cfg, expected)
     kept = without(overrides, "workers", "confirm", "report", "estimate")
     write_plan(where, cfg, kept)
-    write_config(resolve(cfg), where, "benchmark", overrides)
+    write_config(resolve(cfg), where, "benchmark", overrides, note=NOTE)
     pool = WorkerPool(where, kept, suites, workers, gpus)
     print(f"everything goes to {short(where)}", flush=True)
     with stop_on_signals() as stop, BenchmarkProgress(where, cells, todo, expected) as progress:

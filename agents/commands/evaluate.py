@@ -167,6 +167,7 @@ def report(
     seconds = sum(one.seconds for one in results)
     known = {str(size): name for size, name in best.items() if name is not None}
     extra |= {"held_out": suite.is_held_out} | ({"best_classical": known} if known else {})
+    extra |= {"algorithm": cfg.algorithm.name} if "checkpoint" not in cfg or cfg.checkpoint else {}
     write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
     for sentence in describe_differences(results, best):

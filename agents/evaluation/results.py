@@ -28,10 +28,9 @@ COLUMNS = {
 
 
 def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
-    """What was run: scenario, maps, seed, commit, versions."""
+    """What was run: scenario, maps, seed, episodes, commit, versions, seconds."""
     return {
         "scenario": cfg.scenario.name,
-        "algorithm": cfg.algorithm.name,
         "maps": [one.name for one in maps],
         "seed": cfg.seed,
         "episodes": cfg.episodes,

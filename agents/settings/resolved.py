@@ -50,7 +50,9 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         ValueError: a value out of its range.
     """
     settings = plain(cfg)
-    if "scenario" in settings and "scenarios" not in settings:  # a benchmark has many; each cell writes its own
+    if "scenarios" in settings:  # a benchmark: its cells have one each, and write what that comes to
+        del settings["scenario"]["name"], settings["algorithm"]["name"]
+    elif "scenario" in settings:
         row = find_scenario(maps[0].scenario if maps else cfg.scenario.name)
         known = maps is not None or row.build is not None
         settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
@@ -61,8 +63,11 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         settings["reward"] = asdict(RewardConfig(**given(cfg.reward)))
         settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
         settings["comm"] = asdict(CommConfig(**given(cfg.comm)))
-        settings["algorithm"] = {"name": cfg.algorithm.name} | asdict(algorithm_settings(cfg))
-        settings["model"] = asdict(model_settings(cfg))
+        if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
+            settings |= dict.fromkeys(("algorithm", "tuning", "model"))
+        else:
+            settings["algorithm"] = {"name": cfg.algorithm.name} | asdict(algorithm_settings(cfg))
+            settings["model"] = asdict(model_settings(cfg))
         if "collector" in settings and settings["collector"]["steps"] is None:  # one whole episode
             settings["collector"]["steps"] = settings["scenario"]["macro_steps"]
     return _without_null(settings)

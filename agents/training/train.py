@@ -46,6 +46,7 @@ from maexp.agents.training.logs import MetricsLog
 from maexp.agents.versions import find_commit
 from maexp.envs import PointCloudMap
 
+CONFIG = "config.yaml"
 BACKENDS = ("single", "processes", "ray")
 
 
@@ -374,8 +375,9 @@ def stop_on_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def write_config(settings: dict, folder: Path, verb: str, overrides: list[str], **others: Any) -> None:
-    """config.yaml: the command and the commit as comments, then all settings with their values, then `others`."""
+def write_config(settings: dict, folder: Path, verb: str, overrides: list[str], note: str = "", **others: Any) -> None:
+    """config.yaml: command, commit and a note as comments, then all settings with their values, then `others`."""
     command = f"# maexp {verb} {' '.join(overrides)}".rstrip()
     commit = f"# commit {find_commit()}\n" if find_commit() else ""
-    write_text(folder / "config.yaml", f"{command}\n{commit}{to_yaml(settings | others)}")
+    note = f"# {note}\n" if note else ""
+    write_text(folder / CONFIG, f"{command}\n{commit}{note}{to_yaml(settings | others)}")
