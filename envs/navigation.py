@@ -46,7 +46,8 @@ class Rows:
 class Navigation:
     """Known grids, distances and targets of all envs of an `ExplorationEnv`.
 
-    Inside `only` everything is about some envs: E below then counts those.
+    Inside `only` everything is about some envs: E below then counts those. `grow_trees`, `waypoints` and
+    `leads_through_open_ground` need all envs and are errors there.
 
     R rows per env hold what is known: 1 where all communicate, else N (a robot knows what it has heard). K is
     the number of blocks of the largest map, T the most blocks with a target that an env has now. Attributes below are
@@ -138,6 +139,11 @@ class Navigation:
     def put(self, values: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
         """`values` [E, ...] with `rows` [S, ...] for the envs looked at."""
         return rows if self.envs is None else values.index_copy_(0, self.envs, rows)
+
+    def _need_all(self, name: str) -> None:
+        """Raise RuntimeError inside `only`: what is asked for looks at all envs."""
+        if self.envs is not None:
+            raise RuntimeError(f"{name} is about all envs: call it outside of `only`")
 
     def _spread(self, rows: torch.Tensor) -> torch.Tensor:
         """[S, ...] -> int32 [E, ...], -1 for envs not looked at."""
@@ -263,6 +269,7 @@ class Navigation:
             samples: random points a tree grows toward.
             branch: length of the longest branch [m].
         """
+        self._need_all("grow_trees")
         found = torch.zeros_like(self._target).flatten(0, 1)
         items = self.num_envs * self.num_robots
         node = torch.empty((items, samples, 2), device=self.device)
@@ -333,6 +340,7 @@ class Navigation:
         Returns:
             float32 [E, N, 2]: waypoints [m].
         """
+        self._need_all("waypoints")
         a = self.arrays
         goal = torch.where((cells >= 0).unsqueeze(-1), self.points(cells.clamp_min(0)), points).contiguous()
         self._stop.copy_(cells)
@@ -354,6 +362,7 @@ class Navigation:
         Returns:
             bool [E, N].
         """
+        self._need_all("leads_through_open_ground")
         share = torch.linspace(0.0, 1.0, OPEN_SAMPLES, device=self.device).view(1, 1, -1, 1)
         at = self.centers().unsqueeze(2)
         m = self.state["map_id"].long().view(-1, 1, 1)

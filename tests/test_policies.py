@@ -403,6 +403,21 @@ def test_open_ground_is_where_no_known_obstacle_is_near():
     assert found.any() and not found.all()
 
 
+def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
+    env = make_env(2)
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    place, reach = nav.centers(), torch.ones(2, env.num_robots)
+    nowhere = torch.full((2, env.num_robots), -1)
+    for name, values in (
+        ("grow_trees", (5, 2.0)), ("waypoints", (nowhere, place, reach)), ("leads_through_open_ground", (place,)),
+    ):  # fmt: skip
+        getattr(nav, name)(*values)
+        with nav.only(torch.tensor([1])), pytest.raises(RuntimeError, match=f"{name} is about all envs"):
+            getattr(nav, name)(*values)
+
+
 @pytest.mark.parametrize("scenario, drive", [("outdoor", 16.0), ("maze_small", 0.0)])
 def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, drive):
     """Four seconds from standstill at 2 m/s^2 outdoors; corridors of a maze are no open ground."""
