@@ -23,8 +23,7 @@ from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, keyed_uniform, plan_in_turn, value_targets
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-
-REGION_COUNT = 64
+from maexp.kernels.types import REGIONS
 
 
 def choose_nearest(scene: Scene) -> torch.Tensor:
@@ -155,7 +154,7 @@ class RandomPolicy:
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         draw = keyed_uniform(self.env, 3)
-        region = (draw[..., 0] * REGION_COUNT).long()
+        region = (draw[..., 0] * REGIONS**2).long()
         return region, 2.0 * draw[..., 1:] - 1.0
 
 

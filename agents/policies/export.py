@@ -138,7 +138,7 @@ def numbers_of(row: Scenario) -> dict[str, float]:
         "robot_radius": row.collision_threshold,
         "max_speed": row.max_speed,
         "max_accel": row.max_accel,
-        "seconds": 0.1 * row.local_steps,
+        "seconds": DT * row.local_steps,
         "resolution": row.resolution,
     }
 

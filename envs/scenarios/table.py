@@ -43,9 +43,7 @@ class Scenario:
 
 
 _CAR = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)
-_MAZE = dict(
-    _CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20
-)
+_MAZE = dict(_CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20)
 _RANDOM = dict(
     _CAR, count=32, resolution=1.0, size=125.0, radar_range=10.0, max_speed=6.0, clearance_factor=3.0,
     local_steps=40, macro_steps=15,
@@ -121,6 +119,8 @@ def cut_last_fifth(indices: range) -> tuple[range, range]:
 
 def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
     """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
+    from maexp.kernels.types import DT  # here: settings and help wait for no Warp
+
     area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
-    swept = 3 * scenario.max_speed * 0.1 * scenario.local_steps * scenario.radar_range
+    swept = 3 * scenario.max_speed * DT * scenario.local_steps * scenario.radar_range
     return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * area / swept))
