@@ -207,7 +207,7 @@ class ExplorationEnv(EnvBase):
     def observe(self, mask: torch.Tensor | None = None) -> TensorDict:
         """What the teams see now, and info of the step just made.
 
-        Fresh tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures and
+        New tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures and
         targets of these envs only, the others' are black and 0.
         """
         e, n, r = self.num_envs, self.num_robots, REGIONS

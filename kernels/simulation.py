@@ -109,7 +109,7 @@ class Simulation:
         self.threads.each(self.blocks, lambda block: step.run_steps(block, start, count))
 
     def observe(self, picture, team, pose, grid, mask: torch.Tensor | None = None) -> None:
-        """Fill the observation tensors, fresh ones: what leaves the env is never used again.
+        """Fill the observation tensors, new ones: what leaves the env is never used again.
 
         Args:
             picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125]; None: no pictures.

@@ -212,7 +212,7 @@ class Watch:
         cfg, total = env.reward_config, life.place.weight.sum()
         before = life.covered / total
         team = life.seen.any(0)
-        fresh = (visible & ~team) @ weight
+        found = (visible & ~team) @ weight
         overlap = (visible & (visible.sum(0) > 1)) @ weight
         life.seen |= visible
         reached = life.coverage
@@ -229,8 +229,8 @@ class Watch:
             lapse = rest * (after - before + over * (1.0 - after + cfg.unfinished))
         won = reached < np.float32(env.success_coverage) <= life.coverage
         life.terms += np.stack([
-            w * cfg.explore * fresh, -w * cfg.overlap * overlap * (1 + left), np.full(len(fresh), v * cfg.time * lapse),
-            np.full(len(fresh), v * cfg.success * won), -v * cfg.collision * (now["crashed"] != 0),
+            w * cfg.explore * found, -w * cfg.overlap * overlap * (1 + left), np.full(len(found), v * cfg.time * lapse),
+            np.full(len(found), v * cfg.success * won), -v * cfg.collision * (now["crashed"] != 0),
         ], axis=1)  # fmt: skip
         self.successes += int(won)
         for k, mark in enumerate((0.85, 0.95)):

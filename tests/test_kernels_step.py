@@ -185,12 +185,12 @@ def test_collisions(episode):
         if mode == "footprint":
             thresholds = [0.0] * env.num_robots
         want, margin = motion.collided(states, lengths, widths, thresholds, after.map.boundary, mode=mode)
-        fresh = want & (before.collided == 0)
+        first = want & (before.collided == 0)
         sure = (margin > 1e-5) | (before.collided != 0)
         if before.active:
-            np.testing.assert_array_equal(after.crashed[sure] != 0, fresh[sure])
+            np.testing.assert_array_equal(after.crashed[sure] != 0, first[sure])
             np.testing.assert_array_equal(after.collided != 0, (before.collided != 0) | (after.crashed != 0))
-        hits += int(fresh.sum())
+        hits += int(first.sum())
     if episode[0].planner_config.name == "direct":
         assert hits > 0
 

@@ -1,4 +1,4 @@
-"""docs/notebook.ipynb: its cells run from top to bottom in a fresh interpreter, made small."""
+"""docs/notebook.ipynb: its cells run from top to bottom in an interpreter of its own, made small."""
 
 import json
 import os

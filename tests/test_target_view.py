@@ -132,13 +132,13 @@ def test_a_reset_of_some_envs_looks_at_these_alone(planner, reach):
 
 @pytest.mark.parametrize("planner", ["wavefront", "dwa"])
 def test_a_saved_state_goes_on_bit_for_bit(planner):
-    env, fresh = (make_env(planner=PlannerConfig(name=planner)) for _ in range(2))
+    env, other = (make_env(planner=PlannerConfig(name=planner)) for _ in range(2))
     td = play(env, 3)[-1]
-    fresh.load_state_dict(env.state_dict())
-    for a, b in zip(play(env, 3, td.clone()), play(fresh, 3, td.clone()), strict=True):
+    other.load_state_dict(env.state_dict())
+    for a, b in zip(play(env, 3, td.clone()), play(other, 3, td.clone()), strict=True):
         assert torch.equal(a[TARGETS], b[TARGETS])
     with pytest.raises(ValueError, match="target"):
-        fresh.load_state_dict(ExplorationEnv(MAPS, num_envs=4, num_threads=1).state_dict())
+        other.load_state_dict(ExplorationEnv(MAPS, num_envs=4, num_threads=1).state_dict())
 
 
 def test_robots_that_hear_nobody_know_of_no_plans():

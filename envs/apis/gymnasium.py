@@ -126,7 +126,7 @@ class TeamVectorEnv(VectorEnv):
         self.env.close(raise_if_closed=False)
 
     def _restart(self, mask: np.ndarray) -> TensorDictBase:
-        """A fresh episode for the teams in ``mask``; what all of them see then.
+        """A new episode for the teams in ``mask``; what all of them see then.
 
         The env observes these teams alone: the others go on seeing what they saw.
         """
@@ -139,10 +139,10 @@ class TeamVectorEnv(VectorEnv):
         return now
 
     def _start_anew(self, now: TensorDictBase, before: np.ndarray) -> TensorDictBase:
-        """``now`` with a fresh episode for the teams that were done before; the env lets such teams rest and earn 0."""
-        fresh = self._restart(before)
-        fresh["agents", "reward"] = now["agents", "reward"]
-        return fresh
+        """``now`` with a new episode for the teams that were done before; the env lets such teams rest and earn 0."""
+        begun = self._restart(before)
+        begun["agents", "reward"] = now["agents", "reward"]
+        return begun
 
     def _end_and_start(self, observation: dict, info: dict) -> tuple[dict, dict]:
         """What the next episodes look like; how the last ones ended is told under ``final_obs`` and ``final_info``."""
@@ -150,11 +150,11 @@ class TeamVectorEnv(VectorEnv):
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
             final[i] = _row(observation, i)
-        fresh = self._restart(done)
+        begun = self._restart(done)
         told = {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
         told |= self._told("robot_reward", info["robot_reward"])
         self._done = np.zeros_like(done)
-        return self._observation(fresh), self._info(fresh) | told
+        return self._observation(begun), self._info(begun) | told
 
     def _observation(self, now: TensorDictBase) -> dict[str, np.ndarray]:
         robots = to_numpy(now["agents", "observation"], self._robots)

@@ -132,7 +132,7 @@ def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportR
     for message in _messages(bag, [one for one in bag.connections if one.msgtype == TF]):
         tree.add(message)
     voxel = min(options.voxel or VOXEL, VOXEL)
-    kept, fresh, count, lost, frame = np.empty((0, 3)), [], 0, 0, ""
+    kept, added, count, lost, frame = np.empty((0, 3)), [], 0, 0, ""
     for message in _messages(bag, [chosen]):
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         placed = tree.find(message.header.frame_id, stamp)
@@ -144,10 +144,10 @@ def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportR
         points = to_points(path, message)
         points = points[np.isfinite(points).all(axis=1)] @ rotation.T + translation
         if len(points):
-            fresh.append(points[thin(points, voxel)])
-        if sum(map(len, fresh)) > len(kept) + 1_000_000:
-            kept, fresh = _joined(path, kept, fresh, voxel), []
-    kept = _joined(path, kept, fresh, voxel)
+            added.append(points[thin(points, voxel)])
+        if sum(map(len, added)) > len(kept) + 1_000_000:
+            kept, added = _joined(path, kept, added, voxel), []
+    kept = _joined(path, kept, added, voxel)
     if not len(kept):
         raise MapError(
             f"{path}: of {count} clouds on {chosen.topic} {lost} had no transform at their time and the others no "
@@ -162,8 +162,8 @@ def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportR
     return Cloud(kept, metres_per_unit=1.0, up="z")
 
 
-def _joined(path: Path, kept: np.ndarray, fresh: list[np.ndarray], voxel: float) -> np.ndarray:
-    points = np.concatenate([kept, *fresh])
+def _joined(path: Path, kept: np.ndarray, added: list[np.ndarray], voxel: float) -> np.ndarray:
+    points = np.concatenate([kept, *added])
     points = points[thin(points, voxel)] if len(points) else points
     if len(points) > MAX_POINTS:
         raise MapError(f"{path} gives more than {MAX_POINTS} points at voxels of {voxel:g} m; cut the bag")
