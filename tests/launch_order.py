@@ -104,7 +104,7 @@ def setups() -> dict:
     dwa, wavefront = (PlannerConfig(name=name) for name in ("dwa", "wavefront"))
     return {
         "dwa": (dict(planner=dwa), "cost_utility"),
-        "wavefront": (dict(planner=wavefront), "potential_field"),
+        "wavefront": (dict(planner=wavefront, observation=ObservationConfig(targets=6)), "potential_field"),
         "wavefront, near": (dict(planner=wavefront, comm=near), "rrt_frontiers"),
         "dwa, sight": (
             dict(planner=dwa, comm=sight, collision="footprint", observation=ObservationConfig(map="known")),

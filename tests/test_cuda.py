@@ -3,10 +3,12 @@
 import pytest
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import step_mdp
 from worlds import room
 
 import maexp.kernels as mk
+from maexp.agents.training.collect import make_collector
 from maexp.envs import ExplorationEnv, PlannerConfig
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
@@ -54,3 +56,45 @@ def test_the_radar_agrees(device):
         there = mk.visible_points(*(one.to(device) for one in (free, obstacles, origin)), **arguments)
         assert there.device.type == device and 0 < here.sum() < len(free)
         assert (there.cpu() != here).sum() <= 1  # a point within 1e-6 of a threshold may fall either way
+
+
+class FixedActions(TensorDictModuleBase):
+    """Takes the same actions on every device, and adds up the pictures that it is shown."""
+
+    in_keys = [("agents", "observation", "map")]
+    out_keys = [("agents", "action", "region"), ("agents", "action", "offset"), ("agents", "brightness")]
+
+    def __init__(self, device: torch.device):
+        super().__init__()
+        self.device, self.generator = device, torch.Generator().manual_seed(1)
+
+    def forward(self, state: TensorDictBase) -> TensorDictBase:
+        region = torch.randint(64, (4, 2), generator=self.generator)
+        offset = torch.rand(4, 2, 2, generator=self.generator) * 2 - 1
+        brightness = state["agents", "observation", "map"].sum((-2, -1), dtype=torch.int32)
+        for key, value in zip(self.out_keys, (region, offset, brightness), strict=True):
+            state[key] = value.to(self.device)
+        return state
+
+
+def collect(device: str) -> TensorDictBase:
+    """Two batches of a Collector, one after the other in time: [4 envs, 8 steps]. On a GPU it has its own stream."""
+    env = ExplorationEnv([room(30, 22)], num_envs=4, num_robots=2, device=device, seed=4, local_steps=5, macro_steps=5)
+    collector = make_collector(env, FixedActions(env.device), steps=4)
+    batches = [collector.next().cpu() for _ in range(2)]
+    collector.shutdown()
+    return torch.cat(batches, dim=1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_collector_gathers_the_same(device):
+    """Pictures are emptied, drawn and read in this order there, too: what was read is what the batch holds."""
+    here, there = collect("cpu"), collect(device)
+    assert here.shape == (4, 8) and here["next", "done"].any() and here["agents", "brightness"].sum(-1).min() > 0
+    for batch in (here, there):
+        pictures = batch["agents", "observation", "map"]
+        assert torch.equal(pictures.sum((-2, -1), dtype=torch.int32), batch["agents", "brightness"])
+    for key in (("agents", "observation", "pose"), ("next", "agents", "reward"), ("next", "info", "coverage")):
+        torch.testing.assert_close(there[key], here[key], rtol=1e-3, atol=2e-3)
+    seen = [batch["agents", "observation", "map"].int() for batch in (here, there)]
+    assert ((seen[0] - seen[1]).abs() > 2).float().mean() < 1e-3

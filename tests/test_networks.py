@@ -237,13 +237,26 @@ def test_resampling_keeps_constants_and_positions():
     torch.testing.assert_close((source @ weights).unflatten(0, (4, 4)).mean(1), centres[0], atol=2e-3, rtol=0)
 
 
-def test_pooled_pictures_serve_in_place_of_pictures(env):
-    policy = awake(make_policy(env))
+def test_compact_pictures_serve_in_place_of_pictures(env):
+    """Of a policy that hears some, of a critic that sees all and of one that sees itself; gradients too."""
     td = states(4, 3)
-    before = logits(policy, td)
     observation = td["agents", "observation"]
-    observation["map"] = compact(observation["map"], observation["pose"], observation["grid"])
-    torch.testing.assert_close(logits(policy, td), before)
+    observation["comm"] = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(3)) < 0.5
+    pooled = td.clone()
+    parts = (observation[name] for name in ("map", "pose", "grid", "comm"))
+    pooled["agents", "observation", "map"] = compact(*parts)
+    heads = [("agents", "params", "region", "logits"), VALUE, VALUE]
+    networks = [make_policy(env).module[0], *(build_critic(kind, env) for kind in ("team", "local"))]
+    for network, head in zip(networks, heads, strict=True):
+        awake(network)
+        plain, found = (network(one.clone())[head] for one in (td, pooled))
+        torch.testing.assert_close(found, plain)
+        slopes = [torch.autograd.grad(value.square().mean(), [*network.parameters()], allow_unused=True)
+                  for value in (plain, found)]  # fmt: skip
+        for one, other in zip(*slopes, strict=True):
+            assert (one is None) == (other is None)
+            if one is not None:
+                torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-5 * float(one.abs().max()))
 
 
 def test_heads_of_the_paper_preset():

@@ -15,7 +15,7 @@ from torch import Tensor
 from maexp.agents.algorithms.advantages import write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.networks.actor import ALIVE, GRID, MAP, PARAMS, POSE
+from maexp.agents.networks.actor import ALIVE, COMM, GRID, MAP, PARAMS, POSE
 from maexp.agents.networks.encoder import compact, pools_pictures
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
@@ -123,10 +123,10 @@ class Updater:
         return steps
 
     def _compact(self, batch: TensorDictBase) -> TensorDictBase:
-        """Pool the pictures once, where all networks that look at them would do so in every pass."""
+        """Pool and merge the pictures once, where all networks that look at them would do so in every pass."""
         readers = [net for net in (self.loss.actor_network, self.loss.critic_network) if MAP in net.in_keys]
         if readers and all(pools_pictures(net) for net in readers):
-            parts = [part.flatten(0, 1) for part in (batch[MAP], batch[POSE], batch[GRID])]
+            parts = [part.flatten(0, 1) for part in (batch[MAP], batch[POSE], batch[GRID], batch[COMM])]
             chunks = zip(*(part.split(CHUNK) for part in parts), strict=True)
             batch[MAP] = torch.cat([compact(*chunk) for chunk in chunks]).unflatten(0, batch.shape)
         return batch

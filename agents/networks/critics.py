@@ -45,8 +45,7 @@ class RobotEncoder(nn.Module):
 
     def __init__(self, config: ModelConfig, channels: int, side: int, team: bool):
         super().__init__()
-        self.team = team
-        self.cells = CellEncoder(config, channels, merge=team)
+        self.cells = CellEncoder(config, channels, merge="all" if team else None)
         self.side = side
         self.narrow = nn.Sequential(
             nn.Conv2d(config.width, config.width, 3, stride=2, padding=1), nn.ReLU(), nn.Flatten()
@@ -56,8 +55,7 @@ class RobotEncoder(nn.Module):
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor, *state: Tensor) -> Tensor:
         """Batch of teams [batch, robots, ...] to [batch, robots, critic_hidden]; `state` as in `add_state`."""
         pose = add_state(pose, *state)
-        heard = torch.full_like(comm, self.team)
-        cells = self.cells(picture, pose, grid, heard).transpose(-1, -2).unflatten(-1, (self.side, self.side))
+        cells = self.cells(picture, pose, grid, comm).transpose(-1, -2).unflatten(-1, (self.side, self.side))
         return self.wide(self.narrow(cells.flatten(0, 1))).unflatten(0, comm.shape[:2])
 
 

@@ -2,11 +2,13 @@
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from maexp.agents.settings.model import ModelConfig
 
 STRIDE = 4  # both stems shrink the picture by this factor
 SUBCELLS = 4  # cells a side that the CNN sees of one region
+MERGED = 2  # channels of a picture that may be merged with those of other robots: the explored and the walls
 
 
 def add_rows(picture: Tensor) -> Tensor:
@@ -112,12 +114,13 @@ class CellEncoder(nn.Module):
     Args:
         config: sizes
         channels: channels of the picture
-        merge: add what the robots in contact have explored together (channels 0 and 1 of their pictures)
+        merge: add what others and the robot have explored together (channels 0 and 1 of pictures): those "heard",
+            or "all"; None adds nothing
     """
 
-    def __init__(self, config: ModelConfig, channels: int, merge: bool):
+    def __init__(self, config: ModelConfig, channels: int, merge: str | None):
         super().__init__()
-        self.merge = merge
+        self.channels, self.merge = channels, merge
         width = config.channels
         self.stem = None
         if config.stem == "conv":
@@ -125,7 +128,7 @@ class CellEncoder(nn.Module):
                 nn.Conv2d(channels, width // 2, 3, stride=2, padding=1), nn.ReLU(),
                 nn.Conv2d(width // 2, width, 3, stride=2, padding=1), nn.ReLU(),
             )  # fmt: skip
-        inputs = (channels if self.stem is None else width) + 2 * merge
+        inputs = (channels if self.stem is None else width) + (MERGED if merge else 0)
         self.cnn = nn.Sequential(  # kernels of 4: with 3, a region would see its neighbours on one side only
             nn.Conv2d(inputs, width, 4, stride=2, padding=1), nn.ReLU(),
             nn.Conv2d(width, width, 4, stride=2, padding=1), nn.ReLU(),
@@ -144,22 +147,40 @@ class CellEncoder(nn.Module):
         Returns:
             shape [batch, robots, L * L, features]
         """
-        team = comm.shape[:2]
+        team, side = comm.shape[:2], grid.shape[-1]
         picture, pose, grid = picture.flatten(0, 1), pose.flatten(0, 1), grid.flatten(0, 1)
         along_x, along_y = region_centres(pose, grid)
         if picture.is_floating_point():
-            cells = pooled = picture  # pooled before (`compact`)
-        elif self.stem is None:
+            features = self._look_at_compact(picture)
+        else:
+            features = self.cnn(self._look_at(picture, along_x, along_y, comm))
+        told = self.grid(grid_inputs(pose, grid, along_x, along_y)).unflatten(1, (side, side))
+        return torch.cat((features.permute(0, 3, 2, 1), told), dim=-1).flatten(1, 2).unflatten(0, team)
+
+    def _look_at(self, picture: Tensor, along_x: Tensor, along_y: Tensor, comm: Tensor) -> Tensor:
+        """What the CNN is given of pictures: shape [batch * robots, inputs, y, x]."""
+        if self.stem is None:
             cells = pooled = pool_regions(picture, along_x, along_y)
         else:
             cells = self._convolve(picture, along_x, along_y)
-            pooled = pool_regions(picture[:, :2], along_x, along_y) if self.merge else None
-        if self.merge:
-            merged = merged_maps(pooled[:, :2].unflatten(0, team), comm)
-            cells = torch.cat((cells, merged.flatten(0, 1)), dim=1)
-        features = self.cnn(cells).transpose(2, 3).flatten(2).transpose(1, 2)
-        features = torch.cat((features, self.grid(grid_inputs(pose, grid, along_x, along_y))), dim=-1)
-        return features.unflatten(0, team)
+            pooled = pool_regions(picture[:, :MERGED], along_x, along_y) if self.merge else None
+        if self.merge is None:
+            return cells
+        heard = comm if self.merge == "heard" else torch.ones_like(comm)
+        merged = merged_maps(pooled[:, :MERGED].unflatten(0, comm.shape[:2]), heard)
+        return torch.cat((cells, merged.flatten(0, 1)), dim=1)
+
+    def _look_at_compact(self, cells: Tensor) -> Tensor:
+        """The CNN's features of what `compact` made: weights of 0 for what it does not read cost less than a copy."""
+        first, *rest = self.cnn
+        own, merged = first.weight.split((self.channels, first.in_channels - self.channels), dim=1)
+        nothing = own.new_zeros(own.shape[0], MERGED, *own.shape[2:])
+        heard, everyone = (merged if self.merge == kind else nothing for kind in ("heard", "all"))
+        weight = torch.cat((own, heard, everyone), dim=1)
+        features = F.conv2d(cells.permute(0, 3, 1, 2), weight, first.bias, first.stride, first.padding)
+        for layer in rest:
+            features = layer(features)
+        return features
 
     def _convolve(self, picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
         """The learned stem, resampled to the regions; strided convolutions sit on every 4th pixel."""
@@ -178,13 +199,28 @@ def pool_regions(picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
     return resample(lines, by_row, resampling(along_y, 1 / columns - 1, 2 / columns, columns))
 
 
-def compact(picture: Tensor, pose: Tensor, grid: Tensor) -> Tensor:
-    """Pictures pooled once for all passes over a batch, a quarter of the size; encoders with the "pool" stem
-    take them in place of the pictures. Shapes [*, robots, ...]; returns float32 [*, robots, channels, y, x]."""
-    lead = picture.shape[:-3]
-    parts = (value.flatten(0, len(lead) - 1) for value in (picture, pose, grid))
-    picture, pose, grid = parts
-    return pool_regions(picture, *region_centres(pose, grid)).unflatten(0, lead)
+def compact(picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
+    """Pictures pooled, and merged, once for all passes over a batch: half their size.
+
+    Encoders with the "pool" stem take them in place of the pictures. Channels come last: convolutions of few channels
+    are a quarter faster so.
+
+    Args:
+        picture: uint8, shape [*, robots, channels, pixels, pixels]
+        pose: shape [*, robots, 4]
+        grid: shape [*, robots, 4, L, L]
+        comm: who hears whom, bool [*, robots, robots]
+
+    Returns:
+        float32, shape [*, robots, y, x, channels + 4]: each robot's picture, then MERGED channels with those of the
+        robots it hears, then as many with those of all
+    """
+    lead = comm.shape[:-1]
+    picture, pose, grid = (value.flatten(0, len(lead) - 1) for value in (picture, pose, grid))
+    pooled = pool_regions(picture, *region_centres(pose, grid)).unflatten(0, (-1, lead[-1]))
+    comm, maps = comm.flatten(0, -3), pooled[:, :, :MERGED]
+    parts = (pooled, merged_maps(maps, comm), merged_maps(maps, torch.ones_like(comm)))
+    return torch.cat(parts, dim=2).permute(0, 1, 3, 4, 2).contiguous().unflatten(0, lead[:-1])
 
 
 def merged_maps(maps: Tensor, comm: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ class TargetGenerator(nn.Module):
     def __init__(self, config: ModelConfig, channels: int, side: int, regions: bool = True):
         super().__init__()
         self.regions = regions
-        self.encoder = CellEncoder(config, channels, merge=config.merge_maps)
+        self.encoder = CellEncoder(config, channels, merge="heard" if config.merge_maps else None)
         self.blocks = nn.ModuleList(TeamFormerBlock(config) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.width)
         self.merge = TeamAttention(config.width, config.heads)
