@@ -158,7 +158,7 @@ def run_verb(name: str, words: list[str]) -> int:
     composed = compose_recipe(name, recipe)
     cfg = without_hydra(composed)
     if {"-c", "--cfg"} & set(flags):
-        print_settings(cfg)
+        print_settings(cfg, name)
         return 0
     home.check(cfg)
     chosen = find_override(overrides, "hydra.run.dir") is not None
@@ -170,13 +170,13 @@ def run_verb(name: str, words: list[str]) -> int:
         raise
 
 
-def print_settings(cfg: "DictConfig") -> None:
-    """All settings with the values that they come to, as --cfg job asks for."""
+def print_settings(cfg: "DictConfig", verb: str) -> None:
+    """All settings of a verb with the values that they come to, as --cfg job asks for."""
     from maexp.agents.errors import blame_input
     from maexp.agents.settings.resolved import resolve, to_yaml
 
     with blame_input():
-        print(to_yaml(resolve(cfg)), end="")
+        print(to_yaml(resolve(cfg), verb), end="")
 
 
 def _check_flags(name: str, flags: list[str]) -> None:

@@ -32,6 +32,8 @@ from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERROR
 
 LATER = {"starts": math.inf, "covered_sum": 0}
 """State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
+EARLIER = {"target": "waypoint", "raw": "unscaled"}
+"""What saved states of earlier versions call some arrays."""
 
 
 def _setting(name: str, meaning: str) -> property:
@@ -250,7 +252,7 @@ class ExplorationEnv(EnvBase):
             "collided": s["collided"] != 0,
             "path_length": s["path_length"].clone(),
             "episode_reward": s["episode_reward"].clone(),
-            "episode_reward_raw": s["raw"].sum(-1),
+            "episode_reward_unscaled": s["unscaled"].sum(-1),
         }
         for k, mark in enumerate(("85", "95")):
             info[f"coverage_step_{mark}"] = s["milestone_step"][:, k : k + 1].clone()
@@ -318,7 +320,7 @@ class ExplorationEnv(EnvBase):
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
         earlier = {name: torch.full_like(own[name], value) for name, value in LATER.items()}
-        state_dict = earlier | dict(state_dict)
+        state_dict = earlier | {EARLIER.get(name, name): value for name, value in state_dict.items()}
         wanted = {name: own[name] for name in STATE}
         wanted |= {} if self.target_view is None else self.target_view.state_dict()
         wrong = [n for n, one in wanted.items() if n not in state_dict or state_dict[n].shape != one.shape]

@@ -36,7 +36,7 @@ def episode_metrics(
     metrics = {
         "exploration_ratio": info["coverage"][:, 0],
         "coverage_auc": info["coverage_auc"][:, 0],
-        "reward_variance": info["episode_reward_raw"].std(axis=1),
+        "reward_variance": info["episode_reward_unscaled"].std(axis=1),
         "reward_variance_scaled": info["episode_reward"].std(axis=1),
         "success_rate": succeeded(final["coverage"][:, 0], success_coverage).double().cpu().numpy(),
         "collisions": info["collided"].sum(axis=1),

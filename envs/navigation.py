@@ -85,7 +85,7 @@ class Navigation:
             sim.maps, self.grids, self.arrays["map_id"], self.arrays[f"{prefix}_free"],
             self.arrays[f"{prefix}_boundary"], self.rows, cells,
         )  # fmt: skip
-        threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("threshold", "clearance"))
+        threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("collision_threshold", "clearance"))
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
         self.paths = PathSearch(self.passable, mask_of_robot)

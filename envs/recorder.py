@@ -43,7 +43,7 @@ class CoverageRecorder:
             return  # every team is done and stands still
         batch["step"].append(step)
         batch["coverage"].append((state["covered"] / totals[state["map_id"].long()]).cpu().numpy())
-        batch["explored"] = state["raw"][:, :, 0].cpu().numpy().copy()
+        batch["explored"] = state["unscaled"][:, :, 0].cpu().numpy().copy()
 
     def curves(self, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Times [s], shape (records,), and coverage (episodes, records) of the first ``episodes`` episodes.

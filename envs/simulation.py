@@ -56,7 +56,7 @@ def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
         "max_speed": [r.max_speed for r in robots],
         "max_accel": [r.max_accel for r in robots],
         "max_turn": [r.max_steer if r.kind == "ackermann" else r.max_yaw_rate for r in robots],
-        "threshold": [r.collision_threshold for r in robots],
+        "collision_threshold": [r.collision_threshold for r in robots],
         "clearance": [factor * r.collision_threshold for r in robots],
         "radar_range": [r.range for r in radars],
         "radar_cos_fov": [math.cos(0.5 * r.fov) if r.fov < 2.0 * math.pi - 1e-6 else -2.0 for r in radars],

@@ -38,7 +38,7 @@ def take_snapshot(env: ExplorationEnv, index: int) -> dict:
         "center": s["center"][index, :, :2].cpu().numpy().copy(),
         "body": np.array([[r.length, r.width] for r in env.robot_configs], dtype=np.float32),
         "goal": s["goal"][index].cpu().numpy().copy(),
-        "target": s["target"][index].cpu().numpy().copy(),
+        "waypoint": s["waypoint"][index].cpu().numpy().copy(),
         "radar_range": np.array([r.range for r in env.radar_configs], dtype=np.float32),
         "seen_free": flags("seen_free", env.bank.order_free[m]),
         "seen_boundary": flags("seen_boundary", env.bank.order_boundary[m]),

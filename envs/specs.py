@@ -29,9 +29,9 @@ INFO_ROBOT = {
     "path_length_85": torch.float32,
     "path_length_95": torch.float32,
     "episode_reward": torch.float32,
-    "episode_reward_raw": torch.float32,
+    "episode_reward_unscaled": torch.float32,
 }
-"""Entries of ``info`` of shape [E, N]; ``episode_reward_raw`` is the sum of terms before scaling by w and v."""
+"""Entries of ``info`` of shape [E, N]; ``episode_reward_unscaled`` is the sum of terms before scaling by w and v."""
 
 
 def observation_spec(

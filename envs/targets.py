@@ -218,7 +218,7 @@ class TargetTracker:
         beyond = target + toward * left.unsqueeze(-1)
         if self.env.planner_config.name == "wavefront":
             return beyond
-        threshold = self.env.simulation.robot_tensors["threshold"]
+        threshold = self.env.simulation.robot_tensors["collision_threshold"]
         far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
         near = (self.drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
         near = nav.waypoints(goal_cell, target, near)

@@ -21,7 +21,7 @@ def hits_boundary(
     """Whether a boundary point is nearer to the centre than the threshold, or inside the footprint."""
     length = robots.length[e, i]
     width = robots.width[e, i]
-    radius = robots.threshold[e, i]
+    radius = robots.collision_threshold[e, i]
     if footprint != 0:
         radius = 0.5 * wp.sqrt(length * length + width * width)
     rows = row_range(maps, m, at, radius)
@@ -84,7 +84,7 @@ def _detect_collisions(
                 )  # fmt: skip
                 hit = gap == 0.0
             else:
-                hit = wp.length(there - at) < robots.threshold[e, i]
+                hit = wp.length(there - at) < robots.collision_threshold[e, i]
     if hit:
         crashed[e, i] = 1
         collided[e, i] = 1

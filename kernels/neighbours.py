@@ -66,7 +66,7 @@ def _list_near(
     if active[e] == 0:
         return
     here = place[e, i]
-    reach = here[2] + wp.max(robots.radar_range[e, i], robots.threshold[e, i])
+    reach = here[2] + wp.max(robots.radar_range[e, i], robots.collision_threshold[e, i])
     count = int(0)
     for other in range(place.shape[1]):
         there = place[e, other]

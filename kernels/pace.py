@@ -145,7 +145,7 @@ def _fit_clearance(
         point = nav_center(grids, m, path[item, path_slot(j, total)])
         if wp.length(point - at) <= AHEAD * full:
             gap = wp.min(gap, nearest_obstacle(grids, m, walls, row, point))
-    least = wp.min(LEAST * robots.threshold[e, i], full)
+    least = wp.min(LEAST * robots.collision_threshold[e, i], full)
     clearance[e, i] = wp.clamp(FIT * gap, least, full)
 
 
@@ -169,12 +169,12 @@ def _hold_back(
     # In:
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     # State in and out:
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Draw waypoints nearer, so that robots drive no faster than they can brake: before other robots, before what
     stands where they are moving, and before the goal.
 
-    DWA brakes only for a target that it would pass in its `lead_time` [s], three steps: a target at
+    DWA brakes only for a waypoint that it would pass in its `lead_time` [s], three steps: a waypoint at
     lead_time * v holds it at about the speed v. At least `CREEP` clearances, or it would not get going.
     """
     e, i = wp.tid()
@@ -183,17 +183,17 @@ def _hold_back(
     m = map_id[e]
     row = e * rows_per_env + i % rows_per_env
     at = point_xy(center[e, i])
-    way = target[e, i] - at
+    way = waypoint[e, i] - at
     full = wp.length(way)
     clearance = robots.clearance[e, i]
-    threshold = robots.threshold[e, i]
+    threshold = robots.collision_threshold[e, i]
     accel = robots.max_accel[e, i]
     p = pose[e, i]
     c = wp.cos(p[3])
     s = wp.sin(p[3])
     velocity = wp.vec2(p[2] * c - slip[e, i] * s, p[2] * s + slip[e, i] * c)
     span = 0.5 * wp.dot(velocity, velocity) / accel + clearance
-    stops = wp.length(target[e, i] - goal[e, i]) == 0.0
+    stops = wp.length(waypoint[e, i] - goal[e, i]) == 0.0
     room = clear_ahead(e, i, way, 2.0 * clearance, stops, collided, center)
     room = wp.min(room, room_ahead(grids, m, walls, row, at, velocity, threshold, span))
     gap = nearest_obstacle(grids, m, walls, row, at)
@@ -202,7 +202,7 @@ def _hold_back(
     slack = SLACK * spare * wp.min(spare / (SLACK_GAP * threshold), 1.0)
     length = wp.max(lead_time * wp.sqrt(2.0 * accel * room) + slack, CREEP * clearance)
     if full > length:
-        target[e, i] = at + way * (length / full)
+        waypoint[e, i] = at + way * (length / full)
 
 
 def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
@@ -220,7 +220,7 @@ def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     """Draw waypoints nearer, so that robots can brake."""
     known, settings = wavefront.known, shard.settings
     shard.call(
-        launch, _hold_back, "target",
+        launch, _hold_back, "waypoint",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
         lead_time=settings.horizon * settings.dt,
     )  # fmt: skip

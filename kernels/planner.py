@@ -191,7 +191,7 @@ def _plan_dwa(
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
     slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
     known_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
     # Scratch in:
     facing: wp.array2d(dtype=wp.vec2),  # [env, robot]
@@ -209,7 +209,7 @@ def _plan_dwa(
 
     Candidates are numbered with accelerations outside and turns inside; the first maximum wins.
 
-    score = -distance(target) + clearance_weight * log(d / clearance) where d < clearance, d the distance of the
+    score = -distance(waypoint) + clearance_weight * log(d / clearance) where d < clearance, d the distance of the
     predicted body to what is known to be in the way.
     """
     e, i = wp.tid()
@@ -274,7 +274,7 @@ def _plan_dwa(
                 c = wp.cos(theta)
                 s = wp.sin(theta)
             p = wp.vec2(x + offset * c, y + offset * s)
-            score = -wp.length(target[e, i] - p)
+            score = -wp.length(waypoint[e, i] - p)
             if not score < best:  # what is in the way can only lower it
                 d = obstacle_distance(count, e, i, p, theta, length, width, footprint, nearby)
                 d = wp.min(d, body_distance(
@@ -326,7 +326,7 @@ def _set_goal(
     error: wp.array(dtype=wp.int32),  # [env]
     # State out:
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
     """Goal = region centre + offset * half a region (region = ix * REGIONS + iy); out of bounds is clamped."""
     e, i = wp.tid()
@@ -342,13 +342,13 @@ def _set_goal(
     x = maps.lower[m][0] + half[0] * (float(2 * (r / REGIONS) + 1) + wp.clamp(o[0], -1.0, 1.0))
     y = maps.lower[m][1] + half[1] * (float(2 * (r % REGIONS) + 1) + wp.clamp(o[1], -1.0, 1.0))
     goal[e, i] = wp.vec2(x, y)
-    target[e, i] = wp.vec2(x, y)
+    waypoint[e, i] = wp.vec2(x, y)
 
 
 def set_goals(launch: Launch, shard: "Shard") -> None:
     """Turn the policy's regions and offsets into goals."""
     if shard.settings.planner != "direct":
-        shard.call(launch, _set_goal, "error goal target")
+        shard.call(launch, _set_goal, "error goal waypoint")
 
 
 def plan(launch: Launch, shard: "Shard") -> None:

@@ -25,11 +25,11 @@ def start_is_free(
     maps: Maps, robots: Robots, e: int, i: int, point: int, p: wp.vec3, center: wp.array2d(dtype=wp.vec3)
 ) -> bool:
     """Whether robot i may start at free point ``point``, robots 0 .. i - 1 being placed."""
-    need = START_CLEARANCE * robots.threshold[e, i]
+    need = START_CLEARANCE * robots.collision_threshold[e, i]
     if maps.free_clearance[point] < need:
         return False
     for other in range(i):
-        room = wp.max(need, START_CLEARANCE * robots.threshold[e, other])
+        room = wp.max(need, START_CLEARANCE * robots.collision_threshold[e, other])
         if wp.length(center[e, other] - p) < room:
             return False
     return True
@@ -169,12 +169,12 @@ def _clear_robots(
     slip: wp.array2d(dtype=wp.float32),  # [env, robot]
     control: wp.array2d(dtype=wp.vec2),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
     milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
     terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
-    raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
+    unscaled: wp.array3d(dtype=wp.float32),  # [env, robot, term]
     episode_reward: wp.array2d(dtype=wp.float32),  # [env, robot]
     # Scratch out:
     crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
@@ -185,7 +185,7 @@ def _clear_robots(
     slip[e, i] = 0.0
     control[e, i] = wp.vec2(0.0, 0.0)
     goal[e, i] = point_xy(center[e, i])
-    target[e, i] = point_xy(center[e, i])
+    waypoint[e, i] = point_xy(center[e, i])
     collided[e, i] = 0
     crashed[e, i] = 0
     path_length[e, i] = 0.0
@@ -194,7 +194,7 @@ def _clear_robots(
         milestone_path[e, i, k] = 0.0
     for k in range(terms.shape[2]):
         terms[e, i, k] = 0.0
-        raw[e, i, k] = 0.0
+        unscaled[e, i, k] = 0.0
 
 
 @wp.kernel
@@ -238,8 +238,8 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     shard.call(launch, _place_team, "error map_id pose center", shard.shape[0])
     shard.call(
         launch, _clear_robots,
-        "slip control goal target collided "
-        "path_length milestone_path terms raw episode_reward crashed",
+        "slip control goal waypoint collided "
+        "path_length milestone_path terms unscaled episode_reward crashed",
     )  # fmt: skip
 
 

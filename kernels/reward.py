@@ -18,7 +18,7 @@ TIME = 2
 SUCCESS = 3
 COLLISION = 4
 TERMS = 5
-"""Number of reward terms; the names above index the last axis of ``terms`` and ``raw``."""
+"""Number of reward terms; the names above index the last axis of ``terms`` and ``unscaled``."""
 UNCOVERED = 0
 COVERED = 1
 GAINED = 2
@@ -46,7 +46,7 @@ class RewardWeights:
 @wp.func
 def add_term(
     terms: wp.array3d(dtype=wp.float32),
-    raw: wp.array3d(dtype=wp.float32),
+    unscaled: wp.array3d(dtype=wp.float32),
     e: int,
     i: int,
     term: int,
@@ -54,7 +54,7 @@ def add_term(
     scale: float,
 ):
     terms[e, i, term] = terms[e, i, term] + scale * value
-    raw[e, i, term] = raw[e, i, term] + value
+    unscaled[e, i, term] = unscaled[e, i, term] + value
 
 
 @wp.func
@@ -85,11 +85,11 @@ def _reward_robots(
     crashed: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State in and out:
     terms: wp.array3d(dtype=wp.float32),  # [env, robot, term]
-    raw: wp.array3d(dtype=wp.float32),  # [env, robot, term]
+    unscaled: wp.array3d(dtype=wp.float32),  # [env, robot, term]
 ):
-    """Add this local step's reward terms of robot (e, i): weighted in ``terms``, plain in ``raw``.
+    """Add this local step's reward terms of robot (e, i): weighted in ``terms``, plain in ``unscaled``.
 
-    ``terms`` is summed over the macro step, ``raw`` over the episode. When the last robot has collided, the steps
+    ``terms`` is summed over the macro step, ``unscaled`` over the episode. When the last robot has collided, the steps
     that are left are charged at once, as if the wrecks stayed there until the end: no team gains by crashing.
     """
     e, i = wp.tid()
@@ -115,13 +115,13 @@ def _reward_robots(
         lapse = (after - before) * rest
         if done:
             lapse = lapse + (1.0 - after + weights.unfinished) * rest
-    add_term(terms, raw, e, i, EXPLORE, weights.explore * float(discovered[e, i]), w)
-    add_term(terms, raw, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
-    add_term(terms, raw, e, i, TIME, weights.time * lapse, v)
+    add_term(terms, unscaled, e, i, EXPLORE, weights.explore * float(discovered[e, i]), w)
+    add_term(terms, unscaled, e, i, OVERLAP, -weights.overlap * float(overlap[e, i]) * (1.0 + left), w)
+    add_term(terms, unscaled, e, i, TIME, weights.time * lapse, v)
     if done:
-        add_term(terms, raw, e, i, SUCCESS, weights.success, v)
+        add_term(terms, unscaled, e, i, SUCCESS, weights.success, v)
     if crashed[e, i] != 0:
-        add_term(terms, raw, e, i, COLLISION, -weights.collision, v)
+        add_term(terms, unscaled, e, i, COLLISION, -weights.collision, v)
 
 
 @wp.kernel
@@ -177,7 +177,7 @@ def _close_step(
 
 def reward_robots(launch: Launch, shard: "Shard") -> None:
     """Add this local step's reward."""
-    shard.call(launch, _reward_robots, "terms raw")
+    shard.call(launch, _reward_robots, "terms unscaled")
 
 
 def close_step(launch: Launch, shard: "Shard") -> None:

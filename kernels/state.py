@@ -95,7 +95,7 @@ STATE = {
     "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it",
         "_place_team _move_robots"),
     "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
-    "target": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
+    "waypoint": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
         "_clear_robots _set_goal _pick_waypoint _hold_back _hold_turns"),
     "control": Field(wp.vec2, "E N", "m/s^2, rad", "acceleration, then steering [rad], yaw rate [rad/s] or sideways"
         " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct"),
@@ -136,7 +136,7 @@ STATE = {
     # What it earns.
     "terms": Field(wp.float32, "E N R", "", "terms of the reward, scaled and summed over the macro step",
         "_clear_robots _reward_robots host"),
-    "raw": Field(wp.float32, "E N R", "", "the same without the scales w and v, summed over the episode",
+    "unscaled": Field(wp.float32, "E N R", "", "the same without the scales w and v, summed over the episode",
         "_clear_robots _reward_robots"),
     "episode_reward": Field(wp.float32, "E N", "", "reward of the episode up to the last macro step",
         "_clear_robots host"),

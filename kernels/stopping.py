@@ -88,7 +88,7 @@ def _hold_turns(
     # In:
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     # State in and out:
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # In and out:
     clearance: wp.array2d(dtype=wp.float32),  # [env, robot], what DWA keeps now [m]
 ):
@@ -104,11 +104,11 @@ def _hold_turns(
     m = map_id[e]
     row = e * rows_per_env + i % rows_per_env
     at = point_xy(center[e, i])
-    way = target[e, i] - at
+    way = waypoint[e, i] - at
     full = wp.length(way)
     accel = robots.max_accel[e, i]
     top = robots.max_speed[e, i]
-    threshold = robots.threshold[e, i]
+    threshold = robots.collision_threshold[e, i]
     speed = wp.abs(pose[e, i][2])
     heading = pose[e, i][3] + wp.where(pose[e, i][2] < 0.0, PI, 0.0)
     lead_time = float(horizon) * dt
@@ -133,14 +133,14 @@ def _hold_turns(
         if straight > free:
             way = ahead
             length = soonest
-    target[e, i] = at + length * wp.normalize(way)
+    waypoint[e, i] = at + length * wp.normalize(way)
 
 
 def hold_turns(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     """Draw the waypoints of differential drives to where they can stop on the way that they will drive."""
     known = wavefront.known
     shard.call(
-        launch, _hold_turns, "target clearance",
+        launch, _hold_turns, "waypoint clearance",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
         clearance=wavefront.narrowed.clearance,
     )  # fmt: skip

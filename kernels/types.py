@@ -116,8 +116,8 @@ class Robots:
     max_speed: wp.array2d(dtype=wp.float32)  # [m/s]
     max_accel: wp.array2d(dtype=wp.float32)  # [m/s^2]
     max_turn: wp.array2d(dtype=wp.float32)  # steering angle [rad] or yaw rate [rad/s]
-    threshold: wp.array2d(dtype=wp.float32)  # collision threshold [m]
-    clearance: wp.array2d(dtype=wp.float32)  # distance at which DWA begins to care, k * threshold [m]
+    collision_threshold: wp.array2d(dtype=wp.float32)  # [m]
+    clearance: wp.array2d(dtype=wp.float32)  # clearance_factor * collision_threshold [m]
     radar_range: wp.array2d(dtype=wp.float32)  # [m]
     radar_cos_fov: wp.array2d(dtype=wp.float32)  # cosine of half the field of view; -2 sees all round
     radar_cos_beam: wp.array2d(dtype=wp.float32)  # 1 - alpha1

@@ -47,7 +47,7 @@ def _start_search(
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # In:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
     row_of_item: wp.array(dtype=wp.int32),  # [item]
@@ -73,8 +73,8 @@ def _start_search(
     w = grids.width[m]
     h = grids.height[m]
     row = row_of_item[item]
-    # A goal just set is its own target: then nothing is kept.
-    moved = target[e, i] - goal[e, i]
+    # A goal just set is the waypoint, too: then nothing is kept.
+    moved = waypoint[e, i] - goal[e, i]
     just_set = moved[0] == 0.0 and moved[1] == 0.0
     total = path_total[item]
     used = path_used[item]
@@ -155,7 +155,7 @@ def _pick_waypoint(
     path_total: wp.array(dtype=wp.int32),  # [item]
     path_ends: wp.array(dtype=wp.int32),  # [item]
     # State out:
-    target: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # Out:
     path_used: wp.array(dtype=wp.int32),  # [item]
 ):
@@ -189,9 +189,9 @@ def _pick_waypoint(
     if chosen < 0:
         chosen = nearest
     if chosen < 0 or (chosen == total - 1 and path_ends[item] == 1):
-        target[e, i] = goal[e, i]
+        waypoint[e, i] = goal[e, i]
     else:
-        target[e, i] = nav_center(grids, m, path[item, path_slot(chosen, total)])
+        waypoint[e, i] = nav_center(grids, m, path[item, path_slot(chosen, total)])
 
 
 class PathSearch:
@@ -223,9 +223,9 @@ class PathSearch:
             "grids": known.grids, "map_id": known.map_id, "passable": masks.passable,
         }  # fmt: skip
 
-    def find(self, launch: Launch, active, collided, center, goal, target) -> None:
+    def find(self, launch: Launch, active, collided, center, goal, waypoint) -> None:
         """New paths for the robots that need one."""
-        given = {"active": active, "collided": collided, "center": center, "goal": goal, "target": target}
+        given = {"active": active, "collided": collided, "center": center, "goal": goal, "waypoint": waypoint}
         launch_named(launch, _start_search, self.shape, "sources stop", self.values() | given)
         self.flood(launch)
         self.trace(launch, goal)
@@ -242,11 +242,11 @@ class PathSearch:
         writes = "path path_total path_used path_ends"
         launch_named(launch, _trace_path, self.shape, writes, self.values() | {"goal": goal})
 
-    def pick(self, launch: Launch, active, collided, center, goal, reach, target) -> None:
-        """Waypoints into `target`."""
+    def pick(self, launch: Launch, active, collided, center, goal, reach, waypoint) -> None:
+        """The waypoint of every robot on its path."""
         given = {"active": active, "collided": collided, "center": center, "goal": goal, "reach": reach}
         launch_named(
-            launch, _pick_waypoint, self.shape, "target path_used", self.values() | given | {"target": target}
+            launch, _pick_waypoint, self.shape, "waypoint path_used", self.values() | given | {"waypoint": waypoint}
         )
 
 
@@ -273,7 +273,7 @@ class Wavefront:
 
     def __init__(self, sim: "Simulation", shard: "Shard"):
         limited = shard.settings.limited
-        threshold, clearance = shard.robots.threshold.numpy(), shard.robots.clearance.numpy()
+        threshold, clearance = shard.robots.collision_threshold.numpy(), shard.robots.clearance.numpy()
         robots = threshold.shape[1]
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.known = KnownGrids(
@@ -292,14 +292,14 @@ def find_paths(launch: Launch, shard: "Shard") -> None:
         s, own = shard.view, shard.wavefront
         own.known.paint(launch)
         own.passable.paint(launch)
-        own.paths.find(launch, s.active, s.collided, s.center, s.goal, s.target)
+        own.paths.find(launch, s.active, s.collided, s.center, s.goal, s.waypoint)
 
 
 def pick_waypoints(launch: Launch, shard: "Shard") -> None:
-    """Bring `target` and the clearances up to date, if the planner is `wavefront`: every local step."""
+    """Bring `waypoint` and the clearances up to date, if the planner is `wavefront`: every local step."""
     if shard.wavefront is not None:
         s, own = shard.view, shard.wavefront
-        own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.target)
+        own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.waypoint)
         fit_clearance(launch, shard, own)
         hold_back(launch, shard, own)
         hold_turns(launch, shard, own)

@@ -47,7 +47,7 @@ def moment(env: ExplorationEnv, nav: Navigation) -> Moment:
     width, height = (int(v[0]) for v in (nav.width, nav.height))
     known = nav.known[0, 0, : width * height].cpu().numpy().reshape(height, width)
     robots = env.simulation.robot_tensors
-    radius = robots["threshold"][0].tolist()
+    radius = robots["collision_threshold"][0].tolist()
     pose = np.concatenate([nav.centers()[0].numpy(), nav.state["pose"][0, :, 3:].numpy()], axis=1)
     poses = [row if alive else None for row, alive in zip(pose.tolist(), nav.alive()[0].tolist(), strict=True)]
     return Moment(
@@ -56,7 +56,7 @@ def moment(env: ExplorationEnv, nav: Navigation) -> Moment:
         settings={
             "radar_range": nav.radar_range,
             "robot_radius": radius,
-            "clearance_factor": float(robots["clearance"][0, 0] / robots["threshold"][0, 0]),
+            "clearance_factor": float(robots["clearance"][0, 0] / robots["collision_threshold"][0, 0]),
             "bounded": True,
             "least_area": 0.0,
         },

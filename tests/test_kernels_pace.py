@@ -70,7 +70,8 @@ class World:
 
     def robots(self) -> Robots:
         robots = Robots()
-        for name, field in (("max_accel", self.accel), ("threshold", self.threshold), ("clearance", self.clearance)):
+        lengths = {"collision_threshold": self.threshold, "clearance": self.clearance}
+        for name, field in ({"max_accel": self.accel} | lengths).items():
             setattr(robots, name, array(field * self.cell, wp.float32))
         return robots
 

@@ -155,7 +155,7 @@ def test_dwa_takes_the_best_candidate(episode):
             turn = turn_limit(config)
             controls = dwa.candidates(config.max_accel, turn, env.planner_config.num_steering)
             values = dwa.scores(
-                (before.pose[i], before.slip[i]), after.target[i], controls,
+                (before.pose[i], before.slip[i]), after.waypoint[i], controls,
                 move=lambda s, u, config=config: move(config, *s, u, False),
                 middle=lambda s, i=i, config=config: motion.center(body(env, i, s[0])[0], config.length),
                 gap=gap, clearance=factor * config.collision_threshold,
@@ -163,7 +163,7 @@ def test_dwa_takes_the_best_candidate(episode):
             chosen = int(np.argmin(np.abs(controls - after.control[i]).sum(1)))
             np.testing.assert_allclose(controls[chosen], after.control[i], atol=1e-5)
             assert values[chosen] >= values.max() - 2e-3, (i, chosen, dwa.first_best(values))
-            avoided += values.min() < -radar.distance(here, after.target[i]) - 5.0
+            avoided += values.min() < -radar.distance(here, after.waypoint[i]) - 5.0
     assert avoided > 0
 
 

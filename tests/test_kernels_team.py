@@ -43,7 +43,7 @@ def place(env: ExplorationEnv, pose: torch.Tensor, target: torch.Tensor) -> None
                  "shared", "viewers_free", "viewers_boundary"):
         s[name].zero_()
     s["goal"].copy_(target)
-    s["target"].copy_(target)
+    s["waypoint"].copy_(target)
 
 
 PER_ROBOT = ("pose", "control", "collided", "crashed", "discovered", "overlap", "terms", "seen_free", "seen_boundary",
@@ -174,7 +174,7 @@ def test_all_collided_ends_the_episode_and_pays_once():
         env.simulation.step(0, 1)
     s = env.simulation.tensors
     assert (s["collided"] != 0).all() and (s["terminated"] != 0).all() and (s["active"] == 0).all()
-    paid = s["raw"][..., 4]
+    paid = s["unscaled"][..., 4]
     assert torch.equal(paid, torch.full_like(paid, -200.0))
 
 

@@ -448,6 +448,6 @@ def test_wavefront_holds_nothing_that_a_saved_state_lacks():
     td_other = td.clone()
     for _ in range(3):
         td, td_other = env.step(policy(td))["next"], other.step(resumed(td_other))["next"]
-        for name in ("pose", "target", "seen_free"):
+        for name in ("pose", "waypoint", "seen_free"):
             assert torch.equal(env.simulation.tensors[name], other.simulation.tensors[name])
     assert (env.simulation.tensors["pose"][..., 2] != 0).any()

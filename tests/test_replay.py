@@ -35,7 +35,7 @@ def replay(recorded, **robot) -> tuple[np.ndarray, np.ndarray]:
     state, rear = env.simulation.tensors, []
     np.testing.assert_allclose(state["pose"][0, :, :2], np.stack([x, y], axis=1), atol=1e-4)
     for goal in episode["g_goal"]:  # some lie beyond the extent, where no action gets
-        for name in ("goal", "target"):
+        for name in ("goal", "waypoint"):
             state[name][0] = torch.from_numpy(goal)
         for k in range(20):
             env.simulation.step(k, 1)

@@ -95,7 +95,11 @@ def test_classical_planners_have_no_algorithm_and_a_benchmark_no_scenario_of_its
 
 def test_yaml_holds_the_same_values():
     settings = resolve(compose_config("train", ["comm.range=inf"]))
-    assert OmegaConf.to_container(OmegaConf.create(to_yaml(settings))) == settings
+    settings |= {"resume": " ".join(["a run"] * 30)}  # more than a line
+    written = to_yaml(settings, "train")
+    assert OmegaConf.to_container(OmegaConf.create(written)) == settings
+    assert "  range: 10.0  # [m]\n" in written and "  lr: 0.002  # learning rate of the policy\n" in written
+    assert "num_robots: 3  # robots in a team" in written and "  max_speed: 8.0  # [m/s]\n" in written
 
 
 # A checkpoint and new words

@@ -102,15 +102,15 @@ def make_critic(algorithm: str, env, model: "str | ModelConfig" = "small", **set
     return row.make_critic(env, model, row.configure(**settings))
 
 
-def make_loss(algorithm: str, policy, critic, preset: str = "default", **settings):
+def make_loss(algorithm: str, policy, critic, tuning: str = "default", **settings):
     """A TorchRL LossModule fed by one Collector batch [envs, T]; estimates advantages that are absent.
 
     Args:
         algorithm: a name of the table
         policy: from make_policy
         critic: from make_critic with the same name
-        preset: the tuning, default or reference
+        tuning: default or reference
         settings: replace those of the tuning
     """
     row = find_algorithm(algorithm)
-    return row.make_loss(policy, critic, row.configure(preset, **settings))
+    return row.make_loss(policy, critic, row.configure(tuning, **settings))

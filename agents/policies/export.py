@@ -123,7 +123,7 @@ def numbers_of_env(env: ExplorationEnv) -> dict[str, float]:
     robots = env.simulation.robot_tensors
     return {
         "radar_range": max(one.range for one in env.radar_configs),
-        "robot_radius": float(robots["threshold"].max()),
+        "robot_radius": float(robots["collision_threshold"].max()),
         "max_speed": float(robots["max_speed"].max()),
         "max_accel": float(robots["max_accel"].max()),
         "seconds": DT * env.local_steps,

@@ -7,9 +7,10 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.settings.algorithms import Settings, find_tunings
+from maexp.agents.settings.comments import with_comments
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, given
+from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, describe, given, schema
 from maexp.envs.config import (
     CommConfig,
     ObservationConfig,
@@ -153,6 +154,7 @@ _Dumper.add_representer(
 )
 
 
-def to_yaml(settings: dict) -> str:
-    """Resolved settings as the text of a config.yaml."""
-    return yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+def to_yaml(settings: dict, verb: str) -> str:
+    """Resolved settings of a verb as the text of a config.yaml, with units and meanings as comments."""
+    text = yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
+    return with_comments(text, settings, {name: meaning for name, _, meaning in describe(schema(verb))})

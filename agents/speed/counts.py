@@ -34,7 +34,7 @@ class Cost:
 
 
 def set_goal(c: Counts) -> Cost:
-    """Region and offset in, goal and target out; two products and sums a coordinate."""
+    """Region and offset in, goal and waypoint out; two products and sums a coordinate."""
     return Cost(c["active"] * (8 + VEC2 + 2 * WORD + 2 * VEC2 + 2 * VEC2), c["active"] * 14)
 
 
@@ -50,7 +50,7 @@ def list_near(c: Counts) -> Cost:
 
 def plan_dwa(c: Counts) -> Cost:
     """List the known points in reach, then score turns x accelerations after `horizon` steps."""
-    body = VEC4 + WORD + VEC3 + VEC2 + 9 * WORD  # pose, slip, centre, target, parameters
+    body = VEC4 + WORD + VEC3 + VEC2 + 9 * WORD  # pose, slip, centre, waypoint, parameters
     moved = c["plan_rows"] * ROW + c["plan_near"] * VEC3 + c["plan_known"] * (WORD * c["words"] + 2 * VEC2)
     moved += c["near"] * (WORD + VEC3) + c["mates"] * (VEC2 + 2 * WORD) + VEC2
     step = 10 + 2 * TRIG + 4  # position, heading's sine and cosine, speed

@@ -380,4 +380,4 @@ def write_config(settings: dict, folder: Path, verb: str, overrides: list[str], 
     command = f"# maexp {verb} {' '.join(overrides)}".rstrip()
     commit = f"# commit {find_commit()}\n" if find_commit() else ""
     note = f"# {note}\n" if note else ""
-    write_text(folder / CONFIG, f"{command}\n{commit}{note}{to_yaml(settings | others)}")
+    write_text(folder / CONFIG, f"{command}\n{commit}{note}{to_yaml(settings | others, verb)}")

@@ -13,10 +13,10 @@ from maexp.kernels.types import DT
 
 _FORMAT = "maexp-episode-1"
 _KINDS = {
-    "step": "iu", "pose": "f", "center": "f", "goal": "f", "target": "f", "collided": "b", "coverage": "f", "body": "f",
-    "radar_range": "f", "free_seen_at": "iu", "boundary_seen_at": "iu", "visible": "u",
+    "step": "iu", "pose": "f", "center": "f", "goal": "f", "waypoint": "f", "collided": "b", "coverage": "f",
+    "body": "f", "radar_range": "f", "free_seen_at": "iu", "boundary_seen_at": "iu", "visible": "u",
 }  # fmt: skip
-_MAY_BE_NAN = ("goal", "target")  # before the first goal
+_MAY_BE_NAN = ("goal", "waypoint")  # before the first goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Episode:
         map: where.
         policy: who decided.
         step: local steps since the start, [T], rising.
-        pose, center, goal, target: as in ``ExplorationEnv.snapshot``, [T, N, 4] and [T, N, 2].
+        pose, center, goal, waypoint: as in ``ExplorationEnv.snapshot``, [T, N, 4] and [T, N, 2].
         collided: [T, N]; coverage: [T].
         body, radar_range: [N, 2] and [N] [m].
         free_seen_at, boundary_seen_at: record in which a robot first saw a point, -1: never; [N, F], [N, B].
@@ -41,7 +41,7 @@ class Episode:
     pose: np.ndarray
     center: np.ndarray
     goal: np.ndarray
-    target: np.ndarray
+    waypoint: np.ndarray
     collided: np.ndarray
     coverage: np.ndarray
     body: np.ndarray
@@ -69,7 +69,7 @@ class Episode:
         ways = self.center[: record + 1].reshape(record + 1, -1).T
         trail = np.stack([np.interp(steps, past, way) for way in ways], axis=-1).reshape(len(steps), -1, 2)
         visible = np.unpackbits(self.visible[record], axis=-1, count=len(self.map.free)).astype(bool)
-        fields = ("pose", "center", "goal", "target", "collided")
+        fields = ("pose", "center", "goal", "waypoint", "collided")
         return {name: getattr(self, name)[record] for name in fields} | {
             "map": self.map,
             "policy": self.policy,
@@ -102,6 +102,8 @@ class Episode:
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], path: str | os.PathLike) -> Episode:
         """The episode among the arrays that `path` held; raises MapError as `load` does."""
+        if "target" in arrays:  # what earlier versions called the waypoint
+            arrays = {"waypoint": arrays["target"]} | arrays
         missing = {"episode_format", "policy", *_KINDS} - arrays.keys()
         if missing:
             raise MapError(f"{path} is not an episode of MAexp (no {', '.join(sorted(missing))}); record it again")
@@ -120,7 +122,7 @@ class Episode:
         count, robots = self.step.shape[:1] + (0,), self.radar_range.shape[:1] + (0,)
         t, n, f, b = count[0], robots[0], len(self.map.free), len(self.map.boundary)
         shapes = {
-            "step": (t,), "pose": (t, n, 4), "center": (t, n, 2), "goal": (t, n, 2), "target": (t, n, 2),
+            "step": (t,), "pose": (t, n, 4), "center": (t, n, 2), "goal": (t, n, 2), "waypoint": (t, n, 2),
             "collided": (t, n), "coverage": (t,), "body": (n, 2), "radar_range": (n,), "free_seen_at": (n, f),
             "boundary_seen_at": (n, b), "visible": (t, n, -(-f // 8)),
         }  # fmt: skip
@@ -162,7 +164,7 @@ class EpisodeRecorder:
             first = self._seen.setdefault(name, np.full(seen.shape, -1, dtype=np.int32))
             first[seen & (first < 0)] = record
         self._last = {name: snapshot[name] for name in ("map", "body", "radar_range")}
-        moment = {name: snapshot[name] for name in ("pose", "center", "goal", "target", "collided")}
+        moment = {name: snapshot[name] for name in ("pose", "center", "goal", "waypoint", "collided")}
         moment |= {"step": np.int32(snapshot["local_step"]), "coverage": np.float32(snapshot["coverage"])}
         self._moments.append(moment | {"visible": np.packbits(snapshot["visible"], axis=-1)})
 
