@@ -40,7 +40,10 @@ FADE = 0.99  # of the trajectory, a local step
 
 
 def picture_shapes(envs: int, robots: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Shapes of the pictures of every robot and of every team: [E, N, 4, 125, 125] and [E, 3, 125, 125]."""
+    """Shapes of the pictures of every robot and of every team.
+
+    [E, N, PICTURE_CHANNELS, 125, 125] and [E, TEAM_CHANNELS, 125, 125].
+    """
     side = PIXELS
     return (envs, robots, PICTURE_CHANNELS, side, side), (envs, TEAM_CHANNELS, side, side)
 

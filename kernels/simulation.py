@@ -112,7 +112,7 @@ class Simulation:
         """Fill the observation tensors, new ones: what leaves the env is never used again.
 
         Args:
-            picture, team: zeros, uint8 [E, N, 4, 125, 125] and [E, 3, 125, 125]; None: no pictures.
+            picture, team: zeros, uint8, of `observe.picture_shapes`; None: no pictures.
             pose, grid: float32 [E, N, 4] and [E, N, 4, 8, 8].
             mask: int32 [E], the envs whose pictures are drawn; None: all.
         """

@@ -4,7 +4,9 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -12,12 +14,24 @@ from tensordict.nn import set_composite_lp_aggregate
 from tensordict.nn.probabilistic import composite_lp_aggregate
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.envs import SCENARIOS
+from maexp.envs import SCENARIOS, PlannerConfig, RobotConfig
+from maexp.envs.config import ROBOT_KINDS
+from maexp.envs.specs import REWARD_TERMS
+from maexp.envs.target_view import FEATURES
+from maexp.kernels.state import STATE
+from maexp.kernels.types import PICTURE_CHANNELS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs").rglob("*.md")) + [ROOT / "README.md"]
 SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
 """The README shows sizes that people use; here they would take too long."""
+PLANNERS = get_args(PlannerConfig.__dataclass_fields__["name"].type)
+SHIPPED = {
+    "reward terms": (len(REWARD_TERMS), 5), "parameters of robots": (len(fields(RobotConfig)), 9),
+    "kinds of robots": (len(ROBOT_KINDS), 3), "planners": (len(PLANNERS), 3), "features": (len(FEATURES), 32),
+    "channels": (PICTURE_CHANNELS, 4), "arrays of the state": (len(STATE), 37),
+}  # fmt: skip
+"""What docs/extending.md adds to: how many there are, and how many it is written for."""
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -75,7 +89,8 @@ def test_other_interfaces(page, capsys):
     if page == "pettingzoo":
         assert names["picture"].shape[1:] == (512, 3) and "% of the place seen" in told and not names["env"].agents
     else:
-        assert names["observations"]["map"].shape == (4, 3, 4, 125, 125) and told.count("returns of the teams") == 2
+        assert names["observations"]["map"].shape == (4, 3, PICTURE_CHANNELS, 125, 125)
+        assert told.count("returns of the teams") == 2
 
 
 def test_episode_files_and_recorders(tmp_path, monkeypatch):
@@ -108,11 +123,15 @@ def test_every_block_of_extending_is_tested():
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is absent: diffs are not checked")
 @pytest.mark.parametrize("number", range(6))
 def test_diffs_apply(number):
+    """To the tree as it ships. Where something was added, lines beside it have moved: that is no fault of the page."""
     patches = blocks("docs/extending.md", "diff")
     assert len(patches) == 6
     done = subprocess.run(
         ["git", "apply", "--check", "-"], input=patches[number], text=True, capture_output=True, cwd=ROOT
     )
+    own = [f"{count - shipped} {what}" for what, (count, shipped) in SHIPPED.items() if count > shipped]
+    if done.returncode and own:
+        pytest.skip(f"DIFF {number} OF docs/extending.md IS FOR THE TREE AS IT SHIPS; here are more: {', '.join(own)}")
     assert done.returncode == 0, f"write this diff of docs/extending.md anew:\n{done.stderr}"
 
 

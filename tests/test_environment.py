@@ -20,6 +20,7 @@ from maexp.envs import (
     make_map,
 )
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
+from maexp.kernels.types import PICTURE_CHANNELS
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_specs_direct_planner(maps):
 def test_keys_shapes_and_types(maps):
     td = ExplorationEnv(maps, num_envs=5, num_robots=2).rollout(3)
     expected = {
-        ("agents", "observation", "map"): ((5, 3, 2, 4, 125, 125), torch.uint8),
+        ("agents", "observation", "map"): ((5, 3, 2, PICTURE_CHANNELS, 125, 125), torch.uint8),
         ("team", "map"): ((5, 3, 3, 125, 125), torch.uint8),
         ("agents", "observation", "pose"): ((5, 3, 2, 4), torch.float32),
         ("agents", "observation", "grid"): ((5, 3, 2, 4, 8, 8), torch.float32),

@@ -6,7 +6,9 @@ from kernel_source import arguments, kernels, uses
 from worlds import act, room
 
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.envs.specs import REWARD_TERMS
 from maexp.kernels import step
+from maexp.kernels.observe import picture_shapes
 from maexp.kernels.planner import set_goals
 from maexp.kernels.state import AXES, SCRATCH, STATE
 from maexp.kernels.wavefront import find_paths, pick_waypoints
@@ -33,7 +35,7 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
         def launch(kernel, dim, inputs, outputs, fields=fields):
             found.append((kernel, [fields.get(id(one)) for one in (*inputs, *outputs)], len(inputs)))
 
-        pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in ((e, n, 4, 125, 125), (e, 3, 125, 125))]
+        pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in picture_shapes(e, n)]
         for stage in (set_goals, find_paths, pick_waypoints, step.local_step, step.reset):
             stage(launch, shard)
         step.observe(launch, shard, *pictures, torch.zeros(e, n, 4), torch.zeros(e, n, 4, 8, 8))
@@ -55,7 +57,8 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
     free, boundary = max(len(m.free) for m in env.maps), max(len(m.boundary) for m in env.maps)
     lengths = {
         "E": envs, "N": robots, "W": words, "F": free, "B": boundary, "H": words if limited else 1,
-        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 2, "R": 5, "1": 1,
+        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 2, "1": 1,
+        "R": len(REWARD_TERMS),
         "V": bank.free_in_range, "O": bank.boundary_in_range, "T": 3 * env.macro_steps + 1, "D": 384,
     }  # fmt: skip
     vectors = {"vec2f": (2,), "vec3f": (3,), "vec4f": (4,)}

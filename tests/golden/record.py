@@ -27,7 +27,8 @@ REWARD = RewardConfig(
 def settings(case: str) -> dict:
     """What the env of a case is told besides maps, sizes and seed."""
     scenario, planner = CASES[case]
-    clearance = 2.0 if planner == "wavefront" else CLEARANCE[scenario.split("_")[0]]
+    clearance = CLEARANCE.get(scenario.split("_")[0], SCENARIOS[scenario].clearance_factor)
+    clearance = 2.0 if planner == "wavefront" else clearance
     planning = PlannerConfig(name=planner, horizon=3, clearance_factor=clearance, clearance_weight=100.0)
     robot = RobotConfig(kind="ackermann", wheelbase="length")
     return {"planner": planning, "robot": robot, "reward": REWARD}
