@@ -108,7 +108,7 @@ class CommConfig:
 
 
 MOST_TARGETS = 256  # that a robot is shown
-WAVEFRONT_CLEARANCE = 2.0  # clearance factor of the wavefront planner (measured in docs/notes.md)
+CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
 
 
@@ -152,10 +152,8 @@ def complete_radar(config: RadarConfig, scenario: Scenario) -> RadarConfig:
 
 
 def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig:
-    """Fill in the scenario's candidates and clearance and check every value."""
-    clearance = scenario.clearance_factor
-    if config.name == "wavefront":  # its paths keep clear of walls; more would stall DWA where walls are near
-        clearance = min(clearance, WAVEFRONT_CLEARANCE)
+    """Fill in the scenario's candidates and the planner's clearance and check every value."""
+    clearance = CLEARANCE.get(config.name, scenario.clearance_factor)
     config = _complete(config, num_steering=scenario.num_steering, clearance_factor=clearance)
     _check_choice("planner.name", config.name, ("dwa", "wavefront", "direct"))
     _check_positive("planner", config, skip=("name",))

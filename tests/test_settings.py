@@ -216,6 +216,16 @@ def test_old_defaults_compose_for_every_scenario():
         assert settings["planner"]["clearance_factor"] == SCENARIOS[scenario].clearance_factor
 
 
+def test_dwas_clearance_was_the_scenarios():
+    saved = {"overrides": ["scenario=indoor_small"]}
+    with pytest.warns(UserWarning, match="an earlier version"):
+        assert play(saved)["planner.clearance_factor"] == 4.2
+        assert play(saved, "scenario=maze")["planner.clearance_factor"] == 4.0
+        assert play(saved, "planner=wavefront")["planner.clearance_factor"] == 2.0
+        assert play({"overrides": ["planner=wavefront"]})["planner.clearance_factor"] == 2.0
+        assert "planner.clearance_factor" not in play({"overrides": ["planner=direct"]})
+
+
 # Through the command line
 
 

@@ -26,6 +26,12 @@ def _wheelbase(row: Scenario, words: list[str]) -> str:
     return f"robot.wheelbase={find_override(words, 'robot.length') or row.body_length}"
 
 
+def _clearance(row: Scenario, words: list[str]) -> str:
+    """That of DWA, in collision thresholds; it alone had the scenario's."""
+    name = find_override(words, "planner") or "dwa"
+    return f"planner.clearance_factor={row.clearance_factor}" if name == "dwa" else "planner=dwa"
+
+
 OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     f"scenario={OLD_SCENARIO}",
     "algorithm=mappo",
@@ -33,6 +39,7 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     "action=regions",
     "reward.overlap=0.01",
     _wheelbase,
+    _clearance,
     "collector.steps=15",
     "scenario.validation=[]",
     "reward.charge_rest=false",

@@ -34,7 +34,7 @@ class Scenario:
     body_length: float  # [m]
     body_width: float  # [m]
     collision_threshold: float  # centre to boundary point or to another centre [m]
-    clearance_factor: float  # DWA's k: it keeps clearance_factor * collision_threshold away
+    clearance_factor: float  # the paper's k: its DWA keeps k * collision_threshold away (preset=paper)
     local_steps: int  # control steps in one decision of the policy
     macro_steps: int | None  # decisions in one episode; None: from the free area
     num_steering: int = 25  # DWA candidates over the steering angle
