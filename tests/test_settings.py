@@ -159,7 +159,7 @@ def test_older_names_of_groups():
     assert saved["settings"]["algorithm"]["lr"] == 0.0001 and saved["settings"]["model"]["channels"] == 32
     del saved["settings"], saved["followers"]
     with pytest.warns(UserWarning, match="an earlier version"):
-        assert play(saved)["model.channels"] == 32
+        assert play(saved, "checkpoint=run.pt")["model.channels"] == 32
 
 
 def test_the_wheelbase_follows_the_body():
@@ -267,6 +267,9 @@ def test_the_papers_set_up_is_the_same_for_every_verb():
     assert algorithm_settings(cfg) == ALGORITHMS["vda2c"].reference
     cfg = compose_config("train", ["preset=paper", "planner=wavefront", "algorithm.lr=0.5"])
     assert (cfg.planner.name, model_settings(cfg).channels, algorithm_settings(cfg).lr) == ("wavefront", 32, 0.5)
+    assert (cfg.planner.clearance_factor, compose_config("train", ["planner=dwa"]).planner.clearance_factor) == (2, 3)
+    paper = compose_config("train", ["preset=paper", "scenario=indoor_large"]).planner
+    assert (paper.name, paper.clearance_factor) == ("dwa", 4.2)
     assert model_settings(compose_config("train", ["preset=paper", "model=small"])).channels == 16
 
 
