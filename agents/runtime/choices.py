@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from .frontiers import STRIDE
-from .grid import FREE, UNKNOWN, KnownGrid
+from .grid import FREE, UNKNOWN
 from .scene import Scene
 from .values import LEAST_GAIN, plan_in_turn, value_targets
 from .ways import cells_ahead
@@ -85,7 +85,7 @@ def choose_by_force(scene: Scene) -> np.ndarray:
 
 def choose_by_tree(scene: Scene) -> np.ndarray:
     """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
-    ends = np.concatenate([_grow_tree(scene, robot) for robot in range(len(scene.at))])
+    ends = _grow_trees(scene)
     shift = scene.targets.block_of(ends % scene.grid.width, ends // scene.grid.width)
     found = (scene.targets.block[:, None] == shift).all(-1).any(1) & np.isfinite(scene.travel)
     found |= ~found.any(-1, keepdims=True)  # no tree of the team found any: all frontiers count
@@ -95,40 +95,43 @@ def choose_by_tree(scene: Scene) -> np.ndarray:
     return _choose_in_turn(scene, gain, np.where(found, value, -np.inf))
 
 
-def _grow_tree(scene: Scene, robot: int) -> np.ndarray:
-    """Free cells where the branches of a robot's tree left what is known, int64 [n]."""
-    grid, ends = scene.grid, []
+def _grow_trees(scene: Scene) -> np.ndarray:
+    """Free cells where the branches of the robots' trees left what is known, int64 [n].
+
+    All trees grow at once, and x + iy stands for a place in cells: what this takes is mostly the number of calls.
+    """
+    grid, robots = scene.grid, len(scene.at)
     size = np.array([grid.width, grid.height])
+    draw = np.minimum(scene.rng.random((robots, RRT_SAMPLES, 2)) * size, size - 1e-6)
     branch = 0.5 * scene.radar_range / grid.cell
-    node = np.empty((RRT_SAMPLES + 1, 2))
-    node[0] = scene.at[robot] / grid.cell
-    count = 1
-    for point in scene.rng.random((RRT_SAMPLES, 2)) * size:
-        gap = np.linalg.norm(node[:count] - point, axis=-1)
-        start = node[gap.argmin()]
-        point = start + (point - start) * min(1.0, branch / max(gap.min(), 1e-9))
-        end = _walk_branch(grid, start, point)
-        if end == -1:
-            node[count] = point
-            count += 1
-        elif end >= 0:
-            ends.append(end)
+    node = np.full((robots, RRT_SAMPLES + 1), np.inf, complex)
+    node[:, 0] = (scene.at / grid.cell) @ (1, 1j)
+    flat, known, first_node = node.ravel(), grid.known.ravel(), np.arange(robots) * node.shape[1]
+    half_cells, row, count, ends = _half_cells(int(2.0 * branch) + 1), np.arange(robots), [1] * robots, []
+    for point in (draw @ (1, 1j)).T:
+        away = node[:, : max(count)] - point[:, None]
+        gap = away.real**2 + away.imag**2
+        start = flat.take(gap.argmin(1) + first_node)
+        length = np.sqrt(gap.min(1))
+        way = (point - start) * np.minimum(1.0, branch / np.maximum(length, 1e-9))
+        steps = np.minimum(2.0 * length, 2.0 * branch).astype(np.int64)
+        at = start[:, None] + way[:, None] * half_cells.take(steps, axis=0)
+        cells = at.imag.astype(np.int64) * grid.width + at.real.astype(np.int64)
+        state = known.take(cells)
+        first = (state != FREE).argmax(1)
+        for robot, (k, end) in enumerate(zip(first.tolist(), state[row, first].tolist(), strict=True)):
+            if end == FREE:  # all along
+                node[robot, count[robot]] = start[robot] + way[robot]
+                count[robot] += 1
+            elif end == UNKNOWN and k > 0:
+                ends.append(cells[robot, k - 1])
     return np.array(ends, np.int64)
 
 
-def _walk_branch(grid: KnownGrid, start: np.ndarray, end: np.ndarray) -> int:
-    """Walks a segment in half cells: -1 = known and free all along, -2 = blocked, else the last free cell before the
-    unknown."""
-    steps = 1 + int(2.0 * np.linalg.norm(end - start))
-    at = np.floor(start + (end - start) * (np.arange(steps + 1) / steps)[:, None]).astype(np.int64)
-    at = np.clip(at, 0, (grid.width - 1, grid.height - 1))
-    state = grid.known[at[:, 1], at[:, 0]]
-    first = int((state != FREE).argmax())
-    if state[first] == FREE:
-        return -1
-    if first == 0 or state[first] != UNKNOWN:
-        return -2
-    return int(at[first - 1, 1] * grid.width + at[first - 1, 0])
+def _half_cells(most: int) -> np.ndarray:
+    """Shares of a branch where it is looked at, in row k for one of k to k + 1 half cells; its end fills the rest of
+    the row, float64 [most + 1, most + 2]."""
+    return np.minimum(np.arange(most + 2) / np.arange(1, most + 2)[:, None], 1.0)
 
 
 def choose_any(scene: Scene) -> np.ndarray:
