@@ -143,6 +143,7 @@ def test_the_contract_gives_the_defaults(folder):
         ("policy.onnx", None, "is not the folder of a policy: No such file"),
         ("contract.json", lambda data: data[:50], "is not JSON"),
         ("contract.json", lambda data: b"[]", "is not a contract of the kind"),
+        ("contract.json", lambda data: b"[" * 100_000, "is not JSON"),
         ("contract.json", lambda data: data.replace(b'"detour"', b'"other"'), "was made for other features"),
         ("contract.json", lambda data: data.replace(b'"seconds"', b'"hours"'), "lacks one of"),
         ("contract.json", lambda data: data.replace(b'"candidates": 24', b'"candidates": -1'), "lacks one of"),
@@ -160,13 +161,23 @@ def test_a_damaged_folder_is_a_sentence(folder, tmp_path, file, change, part):
     assert part in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_network_that_is_none_is_a_sentence(folder, tmp_path):
+def give_network(folder, data: bytes) -> None:
+    """Another network, with the checksum that belongs to it."""
+    (folder / "policy.onnx").write_bytes(data)
+    contract = json.loads((folder / "contract.json").read_text())
+    contract["sha256"]["policy.onnx"] = hashlib.sha256(data).hexdigest()
+    (folder / "contract.json").write_text(json.dumps(contract))
+
+
+def test_a_foreign_network_is_a_sentence(folder, tmp_path):
     broken = shutil.copytree(folder, tmp_path / "broken")
-    (broken / "policy.onnx").write_bytes(b"nothing")
-    contract = json.loads((broken / "contract.json").read_text())
-    contract["sha256"]["policy.onnx"] = hashlib.sha256(b"nothing").hexdigest()
-    (broken / "contract.json").write_text(json.dumps(contract))
+    give_network(broken, b"nothing")
     with pytest.raises(ValueError, match="is not a network that onnxruntime runs"):
+        TeamPlanner(broken)
+    whole = (folder / "policy.onnx").read_bytes()
+    assert whole.count(b"logits")
+    give_network(broken, whole.replace(b"logits", b"values"))
+    with pytest.raises(ValueError, match="gives values, and no logits: export the policy again"):
         TeamPlanner(broken)
 
 

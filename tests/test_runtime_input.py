@@ -44,6 +44,8 @@ def half_seen(height: int = 30, width: int = 40) -> np.ndarray:
         ({"radar_range": 0}, "radar_range=0 must be above 0"),
         ({"radar_range": 1e4}, "radar_range=10000 is 100,000 cells of 0.1 m, too many to plan on: lower radar_range"),
         ({"resolution": 2e-4}, "radar_range=5 is 25,000 cells of 0.0002 m"),
+        ({"resolution": 50}, "radar_range=5 m is less than a cell of 50 m: give both in metres"),
+        ({"radar_range": 1e-3}, "radar_range=0.001 m is less than a cell of 0.1 m"),
         ({"now": None, "radar_range": "far"}, "radar_range='far' must be a finite number"),
         ({"time_left": float("nan")}, "time_left=nan must be"),
     ],
@@ -59,6 +61,12 @@ def test_what_cannot_be_used_at_all_is_a_sentence(change, part):
     "settings, part",
     [
         ({"policy": "best"}, "policy=best is unknown: choose one of"),
+        ({"policy": ""}, "policy= is unknown: choose one of"),
+        ({"policy": "x" * 5000}, "policy=x{100} is unknown: choose one of"),
+        ({"policy": ["cost_utility"]}, "is unknown: did you mean cost_utility"),
+        ({"seed": "first"}, "seed='first' must be a whole number, 0 or more"),
+        ({"seed": -1}, "seed=-1 must be a whole number"),
+        ({"occupied": 650}, "occupied=650 must be at most 100"),
         ({"radar_range": -1}, "radar_range=-1 must be above 0"),
         ({"patience": float("inf")}, "patience=inf must be a finite number"),
         ({"least_area": -0.1}, "least_area=-0.1 must be 0 or more"),
@@ -124,6 +132,13 @@ def test_a_robot_on_ground_that_it_does_not_see_or_near_a_wall_still_drives():
     for pose in ((1.0, 1.0), (0.15, 2.0)):
         plan = TeamPlanner(robot_radius=0.3).plan(grid, 0.1, (0, 0), [pose], now=0.0)
         assert plan.active.all() and not plan.notes
+
+
+def test_a_robot_in_a_wall_drives_from_beside_it_and_it_is_said():
+    grid = half_seen()
+    grid[10:20, 10] = 100
+    plan = TeamPlanner(robot_radius=0.15).plan(grid, 0.1, (0, 0), [(1.05, 1.55, 0.0)], now=0.0)
+    assert plan.notes == ("robot 0 is in a wall at (1.05, 1.55): its way starts beside it",) and plan.active.all()
 
 
 def test_a_grid_that_grows_and_shifts_its_origin_changes_nothing():
@@ -202,7 +217,7 @@ def test_no_goal_in_a_wall_on_random_grids(seed):
     if rng.random() < 0.2:
         poses[0] = np.nan
     planner = TeamPlanner(
-        str(rng.choice(list(CHOICES))), radar_range=rng.uniform(0.3, 12.0), robot_radius=radius,
+        str(rng.choice(list(CHOICES))), radar_range=max(cell, rng.uniform(0.3, 12.0)), robot_radius=radius,
         bounded=bool(rng.random() < 0.3), least_area=rng.choice([None, 0.0]), patience=1.5,
     )  # fmt: skip
     for now in range(3):

@@ -74,6 +74,8 @@ class LearnedChoice:
         taken = {one.name: one.shape for one in self.session.get_inputs()}
         if tuple(taken) != INPUTS or taken["features"][3:] != [len(FEATURES)]:
             raise ValueError(f"{folder / NETWORK} takes {taken}, not {len(FEATURES)} features a candidate: {AGAIN}")
+        if "logits" not in (given := [one.name for one in self.session.get_outputs()]):
+            raise ValueError(f"{folder / NETWORK} gives {', '.join(given)}, and no logits: {AGAIN}")
 
     def logits(self, candidates: Candidates) -> np.ndarray:
         """What speaks for every candidate, float32 [n, M]."""
@@ -100,9 +102,7 @@ def read_contract(folder: Path) -> Contract:
     """
     try:
         content = json.loads(_read(folder, CONTRACT))
-    except ValueError as error:
-        if not isinstance(error, json.JSONDecodeError | UnicodeDecodeError):
-            raise
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
         raise ValueError(f"{folder / CONTRACT} is not JSON: {AGAIN}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{folder / CONTRACT} is not a contract of the kind {FORMAT}: {AGAIN}")

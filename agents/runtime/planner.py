@@ -85,8 +85,9 @@ class TeamPlanner:
         seconds: float | None = None,
         seed: int = 0,
     ):
-        self.learned = None if policy in CHOICES else LearnedChoice(find_policy(policy, CHOICES))
-        self.policy, self.bounded, self.seed = policy, bounded, seed
+        known = isinstance(policy, str) and policy in CHOICES
+        self.learned = None if known else LearnedChoice(find_policy(policy, CHOICES))
+        self.policy, self.bounded, self.seed = policy, bounded, _whole("seed", seed)
         defaults = DEFAULTS if self.learned is None else self.learned.contract
         self.radar_range = _positive("radar_range", defaults.radar_range if radar_range is None else radar_range)
         self.robot_radius = defaults.robot_radius if robot_radius is None else robot_radius
@@ -95,6 +96,8 @@ class TeamPlanner:
         self.motion = replace(defaults.motion, **given)
         self.clearance_factor = _positive("clearance_factor", clearance_factor)
         self.occupied = _positive("occupied", occupied)
+        if self.occupied > 100.0:
+            raise ValueError(f"occupied={occupied!r} must be at most 100, as the cells of a grid are")
         self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
         self.watch = Watch(_positive("patience", patience), _positive("pause", pause))
         self.reset()
@@ -247,8 +250,10 @@ def _finite(name: str, value) -> float:
 
 
 def _check_reach(radar_range: float, grid: KnownGrid) -> None:
-    """Robots look over the grid and so far around it: that has to fit the memory."""
+    """Robots look over the grid and so far around it: farther than a cell, and no farther than the memory reaches."""
     cells = radar_range / grid.cell
+    if cells < 1.0:
+        raise ValueError(f"radar_range={radar_range:g} m is less than a cell of {grid.cell:g} m: give both in metres")
     if (grid.width + 2.0 * cells) * (grid.height + 2.0 * cells) > 2 * MAX_CELLS:
         raise ValueError(
             f"radar_range={radar_range:g} is {cells:,.0f} cells of {grid.cell:g} m, "
@@ -261,3 +266,9 @@ def _positive(name: str, value, zero: bool = False) -> float:
     if number < 0.0 or (number == 0.0 and not zero):
         raise ValueError(f"{name}={value!r} must be {'0 or more' if zero else 'above 0'}")
     return number
+
+
+def _whole(name: str, value) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+        raise ValueError(f"{name}={value!r} must be a whole number, 0 or more")
+    return int(value)

@@ -140,6 +140,8 @@ def _find_start(grid: KnownGrid, passable: np.ndarray, team: Team, robot: int, n
         start = _snap_far(grid, passable, cell, 4.0 * team.radius[robot])
     if start < 0:
         notes.append(f"{team.title(robot)} is in a wall or on unknown ground at ({x:.2f}, {y:.2f}) and was left out")
+    elif grid.known.flat[cell] == OBSTACLE:
+        notes.append(f"{team.title(robot)} is in a wall at ({x:.2f}, {y:.2f}): its way starts beside it")
     return start
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -27,11 +28,13 @@ def find_policy(policy: str | Path, others: Iterable[str] = (), setting: str = "
     """
     if str(policy) in shipped_names():
         return SHIPPED / str(policy)
-    if isinstance(policy, str | Path) and Path(policy).is_dir():
-        return Path(policy)
-    if isinstance(policy, str | Path) and Path(policy).exists():
+    place = Path(policy) if isinstance(policy, str | Path) and policy != "" else None
+    if place is not None and os.path.isdir(place):  # unlike Path.is_dir it takes names that are too long for any file
+        return place
+    if place is not None and os.path.exists(place):
         raise ValueError(f"{setting}={policy} is a file: give the folder that maexp export wrote")
-    raise ValueError(f"{setting}={policy} is unknown: {advise(str(policy), [*others, *shipped_names()])}")
+    word = str(policy)[:100]
+    raise ValueError(f"{setting}={word} is unknown: {advise(word, [*others, *shipped_names()])}")
 
 
 def advise(word: str, names: list[str]) -> str:
