@@ -19,7 +19,7 @@ from maexp.agents.networks.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
-from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings
+from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, planner_config
 from maexp.agents.settings.schema import (
     SUPPLIED,
     CommonSettings,
@@ -32,7 +32,6 @@ from maexp.envs import (
     CommConfig,
     ExplorationEnv,
     ObservationConfig,
-    PlannerConfig,
     PointCloudMap,
     RadarConfig,
     RewardConfig,
@@ -148,7 +147,7 @@ def make_env(
         seed=cfg.seed,
         robot=robot,
         radar=radar,
-        planner=PlannerConfig(**given(cfg.planner)),
+        planner=planner_config(cfg, find_scenario(maps[0].scenario)),
         reward=RewardConfig(**given(cfg.reward)),
         observation=ObservationConfig(**given(cfg.observation)),
         comm=CommConfig(**given(cfg.comm)),

@@ -224,6 +224,10 @@ def test_dwas_clearance_was_the_scenarios():
         assert play(saved, "planner=wavefront")["planner.clearance_factor"] == 2.0
         assert play({"overrides": ["planner=wavefront"]})["planner.clearance_factor"] == 2.0
         assert "planner.clearance_factor" not in play({"overrides": ["planner=direct"]})
+    for saved in (save("preset=paper", "scenario=maze"), save("planner=paper", "scenario=maze")):
+        assert play(saved)["planner.clearance_factor"] == 4.0
+        assert play(saved, "scenario=indoor_small")["planner.clearance_factor"] == 4.2
+        assert play(saved, "planner=wavefront")["planner.clearance_factor"] == 2.0
 
 
 # Through the command line

@@ -137,7 +137,7 @@ def play_suite(
         size = min(cfg.num_envs, episodes)
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
         policy = POLICIES[cell.policy](env) if team is None else restore_policy(env, model_settings(settings), team)
-        if not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
+        if suite != VALIDATION and not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
             write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:

@@ -265,7 +265,7 @@ def read_plan(place: str | Path) -> dict:
         content = json.loads(path.read_text())
         left_open = dict.fromkeys(content.get(OPEN, []))
         return {"overrides": list(content["overrides"]), "settings": content["settings"] | left_open}
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} is damaged: start the benchmark anew in another folder.") from error
 
 
@@ -292,7 +292,8 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         raise UserError(
             f"The cells in {where} were run with other settings: {listed}{more}. Leave these as they were "
-            "(where a default has changed since, give its old value), or start a benchmark of its own."
+            "(where a default has changed since, give its old value; NAME=null for what was left open), or start a "
+            "benchmark of its own."
         )
 
 

@@ -156,6 +156,8 @@ class Report:
         length = f"{cfg.total_frames:,} macro steps" if cfg.iterations is None else f"{cfg.iterations:,} iterations"
         seeds = ", ".join(str(one) for one in as_list(cfg.seeds))
         text = f"maexp benchmark, preset {cfg.preset}: {cfg.num_robots} robots, planner {cfg.planner.name}, "
+        if cfg.planner.name == "dwa":
+            text += f"clearance factor {cfg.planner.clearance_factor or 'of the scenario'}, "
         all_at_once = " on all scenarios at once" if cfg.together else ""
         text += f"{length} of training for each algorithm{all_at_once}, seeds {seeds}, {cfg.episodes} episodes each, "
         text += f"commit {find_commit()}."

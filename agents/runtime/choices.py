@@ -107,7 +107,7 @@ def _grow_trees(scene: Scene) -> np.ndarray:
     node = np.full((robots, RRT_SAMPLES + 1), np.inf, complex)
     node[:, 0] = (scene.at / grid.cell) @ (1, 1j)
     flat, known, first_node = node.ravel(), grid.known.ravel(), np.arange(robots) * node.shape[1]
-    half_cells, row, count, ends = _half_cells(int(2.0 * branch) + 1), np.arange(robots), [1] * robots, []
+    numbers, row, count, ends = np.arange(int(2.0 * branch) + 3), np.arange(robots), [1] * robots, []
     for point in (draw @ (1, 1j)).T:
         away = node[:, : max(count)] - point[:, None]
         gap = away.real**2 + away.imag**2
@@ -115,7 +115,8 @@ def _grow_trees(scene: Scene) -> np.ndarray:
         length = np.sqrt(gap.min(1))
         way = (point - start) * np.minimum(1.0, branch / np.maximum(length, 1e-9))
         steps = np.minimum(2.0 * length, 2.0 * branch).astype(np.int64)
-        at = start[:, None] + way[:, None] * half_cells.take(steps, axis=0)
+        shares = np.minimum(numbers / (steps[:, None] + 1), 1.0)  # where a branch is looked at; its end fills the row
+        at = start[:, None] + way[:, None] * shares
         cells = at.imag.astype(np.int64) * grid.width + at.real.astype(np.int64)
         state = known.take(cells)
         first = (state != FREE).argmax(1)
@@ -126,12 +127,6 @@ def _grow_trees(scene: Scene) -> np.ndarray:
             elif end == UNKNOWN and k > 0:
                 ends.append(cells[robot, k - 1])
     return np.array(ends, np.int64)
-
-
-def _half_cells(most: int) -> np.ndarray:
-    """Shares of a branch where it is looked at, in row k for one of k to k + 1 half cells; its end fills the rest of
-    the row, float64 [most + 1, most + 2]."""
-    return np.minimum(np.arange(most + 2) / np.arange(1, most + 2)[:, None], 1.0)
 
 
 def choose_any(scene: Scene) -> np.ndarray:

@@ -62,7 +62,7 @@ def settings_of(saved: dict) -> dict[str, Any]:
     """The values of a run of `maexp train` by their full names, however old its checkpoint is."""
     if "settings" in saved:
         return flatten(saved["settings"])
-    words = without(saved["overrides"], "hydra")
+    words = rename(without(saved["overrides"], "hydra"))
     return flatten(plain(compose_config("train", [*old_defaults(words), *words])))
 
 

@@ -28,8 +28,10 @@ def _wheelbase(row: Scenario, words: list[str]) -> str:
 
 def _clearance(row: Scenario, words: list[str]) -> str:
     """That of DWA, in collision thresholds; it alone had the scenario's."""
-    name = find_override(words, "planner") or "dwa"
-    return f"planner.clearance_factor={row.clearance_factor}" if name == "dwa" else "planner=dwa"
+    if (find_override(words, "planner") or "dwa") != "dwa":
+        return "planner=dwa"
+    factor = row.clearance_factor if row.build else "null"  # null: that of the map's own scenario
+    return f"planner.clearance_factor={factor}"
 
 
 OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [

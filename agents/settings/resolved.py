@@ -101,8 +101,16 @@ def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     return asdict(complete_robot(RobotConfig(**robot), row)) | {"team": team or None}
 
 
+def planner_config(cfg: CommonSettings, row: Scenario) -> PlannerConfig:
+    """The planner's settings; without a clearance DWA takes that of the map's scenario (`planner=paper`)."""
+    own = given(cfg.planner)
+    if cfg.planner.name == "dwa":
+        own.setdefault("clearance_factor", row.clearance_factor)
+    return PlannerConfig(**own)
+
+
 def _resolve_planner(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
-    planner = asdict(complete_planner(PlannerConfig(**given(cfg.planner)), row))
+    planner = asdict(complete_planner(planner_config(cfg, row), row))
     return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(cfg.planner.name, ())}
 
 

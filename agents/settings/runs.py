@@ -70,6 +70,9 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         _warn_of_old_defaults(path, old)
         return Recipe([*kept, *new], old)
     unknown_then = [word for word in old if word.partition("=")[0] not in (*values, *GROUPS)]
+    followed = "planner.clearance_factor" in saved.get("followers", []) and values.get("planner.name") == "dwa"
+    if followed and "planner" not in chosen:  # the paper's DWA: of a new scenario, too, that scenario's clearance
+        unknown_then.append("planner.clearance_factor=${scenario.clearance_factor}")
     gone = {*left_out, *_gone_with_the_scenario(saved, values, new, verb)}
     if verb != "train":
         gone |= {name for name in values if name.partition(".")[0] not in (*GROUPS, *SHARED)}
