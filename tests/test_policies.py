@@ -30,9 +30,10 @@ MAPS = [make_map("maze_small", k) for k in (0, 3)]
 REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
 
 
-def make_env(num_envs=4, planner="wavefront", **settings) -> ExplorationEnv:
+def make_env(num_envs=4, planner="wavefront", clearance=None, **settings) -> ExplorationEnv:
     settings = {"maps": MAPS, "seed": 11, "macro_steps": 80} | settings
-    return ExplorationEnv(num_envs=num_envs, planner=PlannerConfig(name=planner), num_threads=1, **settings)
+    planning = PlannerConfig(name=planner, clearance_factor=clearance)
+    return ExplorationEnv(num_envs=num_envs, planner=planning, num_threads=1, **settings)
 
 
 def play(env, name: str, steps: int):
@@ -160,10 +161,10 @@ def test_actions_mean_the_points_they_came_from():
 
 
 def test_goals_under_dwa_are_in_sight_and_in_reach():
-    env = make_env(4, planner="dwa")
+    env = make_env(4, planner="dwa", clearance=4.0)  # no place of these corridors is open ground then
     td = env.reset()
     planner = FrontierPlanner(env, choose_nearest)
-    reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill; no place of these corridors is open ground
+    reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill
     for _ in range(3):
         td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
         centers = planner.tracker.nav.centers().clone()
@@ -390,7 +391,7 @@ def test_open_ground_is_where_no_known_obstacle_is_near():
     nav.update()
     ends = nav.centers() + 2.0 * (keyed_uniform(env, 2) - 0.5)
     found = nav.leads_through_open_ground(ends)
-    width, radius = int(nav.width[0]), 1.2 * 4.2 * 0.06
+    width, radius = int(nav.width[0]), 1.2 * 3.0 * 0.06
     for e in range(12):
         at = (nav.known[e, 0] == OBSTACLE).nonzero()[:, 0].numpy()
         walls = np.stack([at % width, at // width], -1)
@@ -418,10 +419,12 @@ def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
             getattr(nav, name)(*values)
 
 
-@pytest.mark.parametrize("scenario, drive", [("outdoor", 16.0), ("maze_small", 0.0)])
-def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, drive):
-    """Four seconds from standstill at 2 m/s^2 outdoors; corridors of a maze are no open ground."""
-    env = make_env(2, planner="dwa", maps=[make_map(scenario, 0)])
+@pytest.mark.parametrize(
+    "scenario, clearance, drive", [("outdoor", 3.0, 16.0), ("maze_small", 3.0, 4.0), ("maze_small", 4.0, 0.0)]
+)
+def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, clearance, drive):
+    """Four seconds from standstill at 2 m/s^2 outdoors, two in a maze, whose corridors are open to small clearances."""
+    env = make_env(2, planner="dwa", clearance=clearance, maps=[make_map(scenario, 0)])
     env.reset()
     planner = FrontierPlanner(env, choose_nearest)
     nav = planner.tracker.nav
