@@ -18,7 +18,8 @@ import pytest
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from maexp.agents.benchmark.cell import CellResult, read_result
+from maexp.agents.benchmark import cell as cells
+from maexp.agents.benchmark.cell import CellResult, EnvShelf, read_result, run_cell
 from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
 from maexp.agents.benchmark.plan import (
     Cell,
@@ -143,6 +144,15 @@ def test_files_and_summaries(whole):
     run = flat["run"]
     assert (run["scenario"], run["seeds"], run["episodes"]) == ("maze_small", [0, 1], 3)
     assert run["maps"] == ["maze_small_64", "maze_small_65"] and run["cells"] == {"done": 6, "all": 6}
+
+
+def test_a_planners_cell_says_the_episodes_of_its_result(tmp_path, monkeypatch):
+    """It is chosen by fewer episodes on validation maps first: `CHOOSING`."""
+    monkeypatch.setattr(cells, "CHOOSING", 1)
+    cell = Cell("maze_small", "voronoi", 0)
+    assert run_cell(settings(*TINY), tmp_path, cell, EnvShelf(), ["held_out"])
+    assert len(read_result(tmp_path, cell, "validation").episodes["path_length"]) == 1
+    assert OmegaConf.load(cell_folder(tmp_path, cell) / "config.yaml").episodes == 3
 
 
 def test_every_policy_meets_the_same_maps_and_starts(whole):
