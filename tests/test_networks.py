@@ -9,9 +9,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_policy
+from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.networks.actor import CELLS, MAP
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE, build_critic
 from maexp.agents.networks.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
 from maexp.agents.settings.model import SIZES, model_config
+from maexp.agents.training.collect import make_collector
 
 PIXELS, SIDE = 29, 3
 CONV = ModelConfig(stem="conv", channels=8, grid_features=8, depth=2, heads=2, merge_maps=False, critic_hidden=16)
@@ -257,6 +260,19 @@ def test_compact_pictures_serve_in_place_of_pictures(env):
             assert (one is None) == (other is None)
             if one is not None:
                 torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-5 * float(one.abs().max()))
+
+
+def test_a_policy_hands_on_what_it_pooled(env):
+    """An updater learns from these cells, which are what it would make of the pictures; no pooling, no cells."""
+    policy, row = make_policy(env), find_algorithm("mappo")
+    updater = row.make_updater(row.make_loss(policy, build_critic("team", env)))
+    batch = make_collector(env, policy, 5).next()
+    found, plain = updater.prepare(batch), updater.prepare(batch.exclude(CELLS))
+    torch.testing.assert_close(found[MAP], plain[MAP], rtol=0, atol=1e-6)
+    assert found[MAP].is_floating_point() and found[MAP].std() > 0.01
+    batch[CELLS] += 1
+    assert (updater.prepare(batch)[MAP] > 0.9).all(), "these were not used"
+    assert CELLS not in make_policy(env, CONV)(states(2, 3)).keys(True)
 
 
 def test_heads_of_the_paper_preset():

@@ -15,7 +15,7 @@ from torch import Tensor
 from maexp.agents.algorithms.advantages import write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.networks.actor import ALIVE, COMM, GRID, MAP, PARAMS, POSE
+from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE
 from maexp.agents.networks.encoder import compact, pools_pictures
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
@@ -123,9 +123,13 @@ class Updater:
         return steps
 
     def _compact(self, batch: TensorDictBase) -> TensorDictBase:
-        """Pool and merge the pictures once, where all networks that look at them would do so in every pass."""
+        """Pooled and merged pictures in place of pictures, where all networks that look at them would make the same."""
         readers = [net for net in (self.loss.actor_network, self.loss.critic_network) if MAP in net.in_keys]
-        if readers and all(pools_pictures(net) for net in readers):
+        if not readers or not all(pools_pictures(net) for net in readers):
+            return batch
+        if CELLS in batch.keys(True):
+            batch[MAP] = batch[CELLS]
+        else:  # another policy acted
             parts = [part.flatten(0, 1) for part in (batch[MAP], batch[POSE], batch[GRID], batch[COMM])]
             chunks = zip(*(part.split(CHUNK) for part in parts), strict=True)
             batch[MAP] = torch.cat([compact(*chunk) for chunk in chunks]).unflatten(0, batch.shape)

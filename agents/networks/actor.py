@@ -8,6 +8,7 @@ from torch import Tensor, distributions, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from maexp.agents.networks.distributions import ACTION, Heads, RegionHeads
+from maexp.agents.networks.encoder import compact, pools_pictures
 from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.networks.target_generator import TargetGenerator
 from maexp.agents.settings.model import ModelConfig, model_config
@@ -22,6 +23,7 @@ TARGETS = ("agents", "observation", "targets")
 TARGETS_MASK = ("agents", "observation", "targets_mask")
 COVERAGE = ("info", "coverage")
 PARAMS = ("agents", "params")
+CELLS = ("agents", "cells")  # what `compact` made of the pictures: who learns from them need not pool them again
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
 TARGET_HEADS = {"target": distributions.Categorical}
 CONTROL_HEADS = {"control": IndependentNormal}
@@ -77,17 +79,28 @@ class ActionParams(nn.Module):
     """Puts what a network returns under the names that the distributions expect.
 
     One tensordict rather than one key each: else the actor would count ("agents", "params") as its input.
+
+    Attributes:
+        pools: the network looks at pooled pictures, which are then returned as well
     """
 
     def __init__(self, network: nn.Module, heads: dict[str, type]):
         super().__init__()
         self.network = network
         self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
+        self.pools = pools_pictures(network)
 
-    def forward(self, *observation: Tensor) -> TensorDict:
+    @property
+    def out_keys(self) -> list[tuple[str, ...]]:
+        return [PARAMS, *([CELLS] if self.pools else [])]
+
+    def forward(self, *observation: Tensor) -> TensorDict | tuple[TensorDict, Tensor]:
+        if self.pools and not observation[0].is_floating_point():
+            observation = (compact(*observation[:4]), *observation[1:])
         values = self.network(*observation)
         lead = observation[0].shape[: values[0].ndim - 2]
-        return TensorDict(dict(zip(self.names, values, strict=True)), batch_size=lead)
+        params = TensorDict(dict(zip(self.names, values, strict=True)), batch_size=lead)
+        return (params, observation[0]) if self.pools else params
 
 
 def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Module, dict[str, type]]:
@@ -103,6 +116,7 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
 
     It reads ("agents", "observation", ...) and writes ("agents", "params", ...), ("agents", "action", ...)
     and one log-probability per robot and head, ("agents", "action", "<head>_log_prob") of shape [*, robots].
+    Where it pools pictures, it writes them too, ("agents", "cells").
     Offsets are stored as drawn, so that their probability can be computed again; the environment clamps them.
 
     Collectors draw actions. Elsewhere, where no `set_exploration_type` is in force, regions are drawn as well, and of
@@ -116,7 +130,8 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
     shape = observation_shape(env, config)
     network, heads = build_network(config, shape)
     joint = heads is REGION_HEADS and config.offsets == "per_region"
-    module = TensorDictModule(ActionParams(network, heads), in_keys=observation_keys(config), out_keys=[PARAMS])
+    named = ActionParams(network, heads)
+    module = TensorDictModule(named, in_keys=observation_keys(config), out_keys=named.out_keys)
     actor = ProbabilisticActor(
         module,
         in_keys=[PARAMS],

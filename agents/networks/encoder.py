@@ -200,7 +200,7 @@ def pool_regions(picture: Tensor, along_x: Tensor, along_y: Tensor) -> Tensor:
 
 
 def compact(picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:
-    """Pictures pooled, and merged, once for all passes over a batch: half their size.
+    """Pictures pooled, and merged, once for all who look at them: half their size.
 
     Encoders with the "pool" stem take them in place of the pictures. Channels come last: convolutions of few channels
     are a quarter faster so.
@@ -216,11 +216,12 @@ def compact(picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor
         robots it hears, then as many with those of all
     """
     lead = comm.shape[:-1]
-    picture, pose, grid = (value.flatten(0, len(lead) - 1) for value in (picture, pose, grid))
+    picture, pose, grid = (value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid))
     pooled = pool_regions(picture, *region_centres(pose, grid)).unflatten(0, (-1, lead[-1]))
-    comm, maps = comm.flatten(0, -3), pooled[:, :, :MERGED]
+    comm, maps = comm.reshape(-1, *comm.shape[-2:]), pooled[:, :, :MERGED]
     parts = (pooled, merged_maps(maps, comm), merged_maps(maps, torch.ones_like(comm)))
-    return torch.cat(parts, dim=2).permute(0, 1, 3, 4, 2).contiguous().unflatten(0, lead[:-1])
+    cells = torch.cat(parts, dim=2).permute(0, 1, 3, 4, 2).contiguous()
+    return cells.reshape(*lead, *cells.shape[2:])
 
 
 def merged_maps(maps: Tensor, comm: Tensor) -> Tensor:
