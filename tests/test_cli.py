@@ -207,7 +207,7 @@ def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
     for name in ("picture.png", "coverage.png", "metrics.png", "shares.png"):
         assert (tmp_path / "e" / name).stat().st_size > 5000
     printed = capsys.readouterr().out
-    assert "results.json, coverage.png, metrics.png, shares.png, picture.png, config.yaml" in printed
+    assert "results.json, episodes.csv, coverage.png, metrics.png, shares.png, picture.png, config.yaml" in printed
     assert "nearest_frontier N=2" in printed and "maze_small: 3 held-out episodes, for each team size" in printed
 
 

@@ -12,11 +12,19 @@ from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.evaluation.baseline import (
+    CHANGES_FILE,
+    EPISODES_FILE,
+    Baseline,
+    describe_changes,
+    load_baseline,
+    write_episodes,
+)
 from maexp.agents.evaluation.comparison import choose_best, describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
-from maexp.agents.files import short
+from maexp.agents.files import short, write_json
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.load import check_policies, load_policy_folder, policy_name, show_targets
 from maexp.agents.progress import Progress
@@ -68,6 +76,7 @@ def policy_names(cfg: EvaluateSettings) -> list[str]:
 def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with blame_input():
+        baseline = None if cfg.baseline is None else load_baseline(cfg.baseline)
         suite = load_maps(cfg.scenario, train=False)
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
@@ -78,14 +87,21 @@ def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0], maps)}
         policies |= {policy_name(word): open_player(word, envs[0][0]) for word in policy_names(cfg)}
+        steps = [env.local_steps * env.macro_steps for env in envs[0]]
+        if baseline is not None:
+            run_here = describe_run(cfg, maps, 0.0) | {"steps": steps}
+            baseline.check(run_here, [(name, size) for name in policies for size in team_sizes(cfg.num_robots)])
         best = {}
         if not all(isinstance(one, str) for one in policies.values()):  # somebody has learned
             best = {size: choose_best(cfg, suite, policy_names(cfg), size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
     results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
-    report(cfg, results, suite, best, where / "results.json")
+    report(cfg, results, suite, best, where / "results.json", steps=steps)
+    write_episodes(where / EPISODES_FILE, results)
     draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
-    written = ["results.json", *draw_results(results, where), "picture.png", "config.yaml"]
+    written = ["results.json", EPISODES_FILE, *draw_results(results, where), "picture.png", "config.yaml"]
+    if baseline is not None:
+        written += [compare_with(baseline, results, where)]
     if cfg.render:
         films = [film for team in envs for film in film_all(cfg, team[0], maps, policies, where)]
         written += [film.name for film in films] + [f"{EPISODES}/"]
@@ -172,6 +188,15 @@ def report(
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
     for sentence in describe_differences(results, best):
         print(sentence)
+
+
+def compare_with(baseline: Baseline, results: list[EvaluationResult], where: Path) -> str:
+    """Print and write how far the results are from an earlier evaluation; the file's name."""
+    changes = baseline.changes(results)
+    write_json(where / CHANGES_FILE, changes | {"baseline": {"folder": str(baseline.folder), "run": baseline.run}})
+    for sentence in describe_changes(changes, baseline.folder):
+        print(sentence)
+    return CHANGES_FILE
 
 
 def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:

@@ -191,6 +191,7 @@ class EvaluateSettings(LearnerSettings):
     policy: Any = setting(None, f"random, {', '.join(CHOICES)}, oracle, or a trained one or its folder; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
+    baseline: str | None = setting(None, "an earlier evaluation of the same episodes, to compare with: its folder")
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
     render_envs: int = setting(1, "teams in a film, side by side, each in a held-out episode of its own")
     render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")
