@@ -45,6 +45,10 @@ START_CLEARANCE = 3.0
 
 PI = 3.14159265358979
 
+LANES = 8
+"""Items that a CPU's vector unit takes at once where a kernel says so; on a GPU a thread takes them in turn."""
+Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
+
 ERROR_ACTION = 1
 """Bit of the error word: an action was NaN or infinite."""
 ERROR_START = 2

@@ -53,8 +53,8 @@ STAGES = ("goal", "plan path", "local step", "observe", "reset")
 COPY_BYTES = 2**28
 MATRIX = 1536
 MODULES = (
-    "collision", "dynamics", "geodesic", "known_grid", "merge", "neighbours", "observe", "pace", "passable", "planner",
-    "reset", "reward", "stopping", "visibility", "wavefront",
+    "collision", "dwa", "dynamics", "geodesic", "known_grid", "merge", "neighbours", "observe", "pace", "passable",
+    "planner", "reset", "reward", "stopping", "visibility", "wavefront",
 )  # fmt: skip
 KEY = ("scenario", "planner", "num_envs", "num_robots", "radar_range", "stage", "kernel")
 
