@@ -3,10 +3,13 @@
 Every pair of an acceleration and a turn is rolled out for a few local steps and scored, `LANES` turns at once.
 """
 
+import torch
 import warp as wp
 
 from maexp.kernels.dynamics import curvature, heading_change
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
+from maexp.kernels.launches import launch_on
+from maexp.kernels.state import robots_struct
 from maexp.kernels.types import (
     ERROR_CAPACITY,
     HALF,
@@ -34,6 +37,29 @@ def spread(k: int, count: int, limit: float) -> float:
     if count > 1:
         return -limit + 2.0 * limit * float(k) / float(count - 1)
     return 0.0
+
+
+@wp.func
+def turn_limit(robots: Robots, e: int, i: int) -> float:
+    """Largest value of a robot's second control."""
+    if robots.kind[e, i] == OMNIDIRECTIONAL:
+        return robots.max_accel[e, i]
+    return robots.max_turn[e, i]
+
+
+@wp.kernel
+def _list_curvatures(
+    # Robots:
+    robots: Robots,
+    # Settings:
+    num_steering: int,
+    # Out:
+    curvatures: wp.array3d(dtype=wp.float32),  # [env, robot, turn]
+):
+    """`Robots.curvature`: a tangent costs as much as two sines, and these never change."""
+    e, i, b = wp.tid()
+    u = spread(b, num_steering, turn_limit(robots, e, i))
+    curvatures[e, i, b] = curvature(robots.kind[e, i], u, robots.wheelbase[e, i])
 
 
 @wp.func
@@ -233,16 +259,13 @@ def _plan_dwa(
     m = map_id[e]
     kind = robots.kind[e, i]
     accel = robots.max_accel[e, i]
-    turn = robots.max_turn[e, i]
+    turn = turn_limit(robots, e, i)
     offset = robots.center_offset[e, i]
     clearance = robots.clearance[e, i]
     start = pose[e, i]
     at = point_xy(center[e, i])
     steps = float(horizon)
     speed = wp.abs(start[2]) + wp.abs(slip[e, i])
-    reach_turn = turn
-    if kind == OMNIDIRECTIONAL:
-        reach_turn = accel
     # The first step's position and heading do not depend on the acceleration: turns outside save trigonometry.
     v0 = start[2]
     side0 = slip[e, i]
@@ -271,8 +294,8 @@ def _plan_dwa(
         s1 = Lanes()
         for n in range(LANES):
             if b + n < num_steering:
-                turns[n] = spread(b + n, num_steering, reach_turn)
-                curves[n] = curvature(kind, turns[n], robots.wheelbase[e, i])
+                turns[n] = spread(b + n, num_steering, turn)
+                curves[n] = robots.curvature[e, i, b + n]
                 theta1[n] = start[3] + heading_change(kind, v0, turns[n], curves[n], dt)
                 c1[n] = wp.cos(theta1[n])
                 s1[n] = wp.sin(theta1[n])
@@ -320,4 +343,14 @@ def _plan_dwa(
                             best_k = k
     if best_k >= 0:
         push = spread(best_k / num_steering, num_accel, accel)
-        control[e, i] = wp.vec2(push, spread(best_k % num_steering, num_steering, reach_turn))
+        control[e, i] = wp.vec2(push, spread(best_k % num_steering, num_steering, turn))
+
+
+def list_curvatures(robots: dict[str, torch.Tensor], num_steering: int) -> torch.Tensor:
+    """`Robots.curvature` of robots given by one [E, N] tensor per field: float32 [E, N, num_steering]."""
+    shape, device = (*robots["kind"].shape, num_steering), robots["kind"].device
+    curvatures = torch.empty(shape, device=device)
+    launch_on(device)(
+        _list_curvatures, shape, [robots_struct(robots, 0, shape[0]), num_steering], [wp.from_torch(curvatures)]
+    )
+    return curvatures

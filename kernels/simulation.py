@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from maexp.kernels import step
+from maexp.kernels.dwa import list_curvatures
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.planner import set_goals
@@ -64,7 +65,8 @@ class Simulation:
         num_shards: int = 1,
         nav: tuple[NavGrids, int] | None = None,
     ):
-        self.map_tensors, self.num_maps, self.robot_tensors = maps, num_maps, robots
+        self.map_tensors, self.num_maps = maps, num_maps
+        self.robot_tensors = robots | {"curvature": list_curvatures(robots, settings.num_steering)}
         self.weights, self.settings, self.sizes = weights, settings, sizes
         self.device = torch.device(device)
         self.maps = maps_struct(maps)

@@ -120,6 +120,7 @@ class Robots:
     max_speed: wp.array2d(dtype=wp.float32)  # [m/s]
     max_accel: wp.array2d(dtype=wp.float32)  # [m/s^2]
     max_turn: wp.array2d(dtype=wp.float32)  # steering angle [rad] or yaw rate [rad/s]
+    curvature: wp.array3d(dtype=wp.float32)  # [env, robot, turn] `curvature` of the turns that DWA tries [rad/m]
     collision_threshold: wp.array2d(dtype=wp.float32)  # [m]
     clearance: wp.array2d(dtype=wp.float32)  # clearance_factor * collision_threshold [m]
     radar_range: wp.array2d(dtype=wp.float32)  # [m]

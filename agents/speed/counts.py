@@ -52,12 +52,12 @@ def plan_dwa(c: Counts) -> Cost:
     """List the known points in reach, then score turns x accelerations after `horizon` steps."""
     body = VEC4 + WORD + VEC3 + VEC2 + 9 * WORD  # pose, slip, centre, waypoint, parameters
     moved = c["plan_rows"] * ROW + c["plan_near"] * VEC3 + c["plan_known"] * (WORD * c["words"] + 2 * VEC2)
-    moved += c["near"] * (WORD + VEC3) + c["mates"] * (VEC2 + 2 * WORD) + VEC2
+    moved += c["near"] * (WORD + VEC3) + c["mates"] * (VEC2 + 2 * WORD) + VEC2 + c["turns"] * WORD
     step = 10 + 2 * TRIG + 4  # position, heading's sine and cosine, speed
     point = 30 + 2 * TRIG if c["footprint"] else 6  # distance of a listed point to the predicted body
     mate = 14 + 2 * TRIG * c["footprint"]  # distance to the body of another robot that may come near enough to matter
     candidate = (c["horizon"] - 1) * step + 4 + c["plan_known"] * point + c["mates"] * mate + 8 + TRIG
-    turn = TRIG + 4 + 3 + 2 * TRIG  # curvature, first heading with sine and cosine
+    turn = 4 + 3 + 2 * TRIG  # first heading with sine and cosine
     work = c["plan_near"] * 6 + c["near"] * 6 + c["turns"] * turn + c["candidates"] * candidate
     return Cost(c["driving"] * body + moved, c["driving"] * work)
 
