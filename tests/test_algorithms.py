@@ -15,7 +15,7 @@ from maexp.agents.settings.model import ModelConfig
 
 TINY = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 FAST = {  # the toy's best settings in few steps; the defaults are for long runs on real maps
-    "clipped": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64, epochs=3),
+    "clipped": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64),
     "trust": dict(fisher_size=64, max_kl=0.06, critic_epochs=2, minibatch_size=64),
     "actor": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64, lmbda=0.95, entropy_coeff=3e-3),
 }

@@ -60,16 +60,6 @@ def test_conf_algorithm_holds_the_defaults(algorithm):
     assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
 
 
-def test_one_pass_takes_smaller_and_larger_steps():
-    """Of `action=targets`: algorithms that use each team step once, beside those that have their own way."""
-    for algorithm in ALGORITHMS:
-        cfg = compose_config("train", [f"algorithm={algorithm}"]).algorithm
-        clipped = algorithm in ("ippo", "mappo", "vdppo")
-        wanted = (0.003, 0.003, 128) if clipped else (0.002, 0.002, 256)
-        assert (cfg.lr, cfg.critic_lr, cfg.minibatch_size) == wanted
-        assert cfg.epochs == (None if "trpo" in algorithm else 1)
-
-
 def test_conf_model_holds_the_presets():
     for name, sizes in SIZES.items():
         held = given(compose_config("train", [*REGIONS, f"model={name}"]).model)

@@ -98,7 +98,7 @@ def test_yaml_holds_the_same_values():
     settings |= {"resume": " ".join(["a run"] * 30)}  # more than a line
     written = to_yaml(settings, "train")
     assert OmegaConf.to_container(OmegaConf.create(written)) == settings
-    assert "  range: 10.0  # [m]\n" in written and "  lr: 0.003  # learning rate of the policy\n" in written
+    assert "  range: 10.0  # [m]\n" in written and "  lr: 0.002  # learning rate of the policy\n" in written
     assert "num_robots: 3  # robots in a team" in written and "  max_speed: 8.0  # [m/s]\n" in written
 
 
@@ -205,26 +205,6 @@ def test_a_setting_that_came_later_keeps_what_was_before(monkeypatch):
         warnings.simplefilter("error")
         after = play(saved)
     assert (after["reward.time_on"], after["radar.range"], after["planner.name"]) == ("covered", 99.0, "wavefront")
-
-
-def test_older_checkpoints_keep_three_passes_and_their_critic():
-    def old(*words):
-        with pytest.warns(UserWarning, match="an earlier version"):
-            return play({"overrides": list(words)}, verb="train")
-
-    three = {"epochs": 3, "minibatch_size": 128, "lr": 0.0007, "critic_lr": 0.001}
-    for words in ([], ["algorithm=vdppo"]):
-        assert {name: old(*words)[f"algorithm.{name}"] for name in three} == three
-    assert old("algorithm.lr=0.5")["algorithm.lr"] == 0.5
-    for words in (["tuning=reference"], ["preset=paper", "model=small"]):
-        assert (old(*words)["algorithm.epochs"], old(*words)["algorithm.lr"]) == (2, 0.0001)
-    assert old("algorithm=vda2c")["algorithm.epochs"] == 1
-    assert "algorithm.epochs" not in old("algorithm=matrpo")
-    saved = save(algorithm__epochs=3)
-    del saved["settings"]["model"]["critic_attends"]
-    after = play(saved, verb="train")
-    assert (after["algorithm.epochs"], after["algorithm.lr"], after["model.critic_attends"]) == (3, 0.003, True)
-    assert not play(save(), verb="train")["model.critic_attends"]
 
 
 def test_old_defaults_compose_for_every_scenario():

@@ -9,7 +9,6 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from maexp.agents.algorithms.table import find_algorithm
 from maexp.agents.networks.actor import make_policy
-from maexp.agents.networks.critics import VALUE, build_critic
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
@@ -216,26 +215,6 @@ def test_all_algorithms_learn_to_choose(name):
     for size in (1, 5):
         other = make_env(2, num_robots=size)
         assert policy(other.reset())[ACTION].shape == (2, size)
-
-
-@pytest.mark.parametrize("attends", [False, True])
-def test_critics_know_no_order_of_targets_and_none_that_is_not_there(attends):
-    env = make_env(2)
-    td = env.reset()
-    torch.manual_seed(0)
-    critic = build_critic("team", env, ModelConfig(action="targets", critic_attends=attends))
-    value = critic(td.clone())[VALUE]
-    assert value.shape == (2, env.num_robots, 1) and value.std() > 0
-    order = torch.randperm(td[MASK].shape[-1])
-    other = td.clone()
-    other[TARGETS], other[MASK] = td[TARGETS][:, :, order], td[MASK][:, :, order]
-    torch.testing.assert_close(critic(other)[VALUE], value)
-    other = td.clone()
-    other[TARGETS][~td[MASK]] = 7.0
-    assert (~td[MASK]).any()
-    torch.testing.assert_close(critic(other)[VALUE], value)
-    other[TARGETS][td[MASK]] += 0.1
-    assert not torch.allclose(critic(other)[VALUE], value, atol=1e-4)
 
 
 def test_an_untrained_policy_is_the_classical_planner():

@@ -76,7 +76,9 @@ class TargetEncoder(nn.Module):
         team, flat = features.shape[:2], some.flatten(0, 1)
         hidden = torch.zeros(flat.shape, device=flat.device).masked_fill(~flat, -torch.inf).unsqueeze(1)
         targets = self.among_targets(self.inputs(features).flatten(0, 1), hidden)
-        robots = self.among_robots(mean_of(targets, flat).unflatten(0, team), contact_bias(comm))
+        weight = flat.unsqueeze(-1).to(targets.dtype)
+        mean = ((targets * weight).sum(1) / weight.sum(1)).unflatten(0, team)
+        robots = self.among_robots(mean, contact_bias(comm))
         targets = targets.unflatten(0, team)
         return self.merge(torch.cat((targets, robots.unsqueeze(2).expand_as(targets)), dim=-1)), robots
 
@@ -102,21 +104,6 @@ class TargetChooser(nn.Module):
         return (logits.masked_fill(~some, NEVER).reshape(*lead, *mask.shape[1:]),)
 
 
-class TargetSums(nn.Module):
-    """As TargetEncoder, but no candidate looks at the others: a fifth of its operations, for critics."""
-
-    def __init__(self, config: ModelConfig):
-        super().__init__()
-        width = config.target_width
-        self.inputs = nn.Sequential(nn.Linear(len(FEATURES), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
-        self.among_robots = Attention(width, config.target_heads)
-
-    def forward(self, features: Tensor, some: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
-        """Arguments and results as of TargetEncoder."""
-        targets = self.inputs(features)
-        return targets, self.among_robots(mean_of(targets, some), contact_bias(comm))
-
-
 class TargetReader(nn.Module):
     """Each robot's candidates as one vector, for critics: [batch, robots, critic_hidden].
 
@@ -133,7 +120,7 @@ class TargetReader(nn.Module):
     def __init__(self, config: ModelConfig, team: bool):
         super().__init__()
         self.team = team
-        self.encoder = TargetEncoder(config) if config.critic_attends else TargetSums(config)
+        self.encoder = TargetEncoder(config)
         extra = 2 + team
         self.wide = nn.Sequential(nn.Linear(2 * config.target_width + extra, config.critic_hidden), nn.ReLU())
 
@@ -146,12 +133,6 @@ class TargetReader(nn.Module):
         parts = [total, robots, time_left, alive.unsqueeze(-1).to(total.dtype)]
         parts += [one.unsqueeze(1).expand(-1, total.shape[1], -1) for one in coverage]
         return self.wide(torch.cat(parts, dim=-1))
-
-
-def mean_of(targets: Tensor, some: Tensor) -> Tensor:
-    """Mean of the candidates [*, M, width] that there are, bool [*, M]: shape [*, width]."""
-    weight = some.unsqueeze(-1).to(targets.dtype)
-    return (targets * weight).sum(-2) / weight.sum(-2)
 
 
 def first_if_none(mask: Tensor) -> Tensor:

@@ -2,8 +2,7 @@
 
 **Change a default, and write its old value here**, at the end of `OLD_DEFAULTS`: as an override, or as a function
 that makes one from the row of the scenario (`maexp.envs.scenarios.Scenario`) and the words of the run, where the old
-default depended on these ("" where there was none). A new setting goes here too unless its default is what
-the code did before.
+default depended on these. A new setting goes here too unless its default is what the code did before.
 
 What `action=targets` sets (its reward, `lmbda`) is not here: checkpoints that can have it hold every value.
 
@@ -20,10 +19,6 @@ from maexp.agents.settings.overrides import find_override
 from maexp.envs.scenarios import Scenario, find_scenario
 
 OLD_SCENARIO = "maze_small"
-PRESETS = {"paper": "reference"}
-"""Tunings that a preset chooses."""
-THREE_PASSES = {"epochs": 3, "minibatch_size": 128, "lr": 0.0007, "critic_lr": 0.001}
-"""What the clipped algorithms had."""
 
 
 def _wheelbase(row: Scenario, words: list[str]) -> str:
@@ -37,17 +32,6 @@ def _clearance(row: Scenario, words: list[str]) -> str:
         return "planner=dwa"
     factor = row.clearance_factor if row.build else "null"  # null: that of the map's own scenario
     return f"planner.clearance_factor={factor}"
-
-
-def _clipped(name: str, value: float) -> Callable[[Scenario, list[str]], str]:
-    """A setting of the algorithms that pass over a batch several times, which had three passes then."""
-
-    def word(row: Scenario, words: list[str]) -> str:
-        own = "reference" in (find_override(words, "tuning"), PRESETS.get(find_override(words, "preset")))
-        clipped = (find_override(words, "algorithm") or "mappo") in ("ippo", "mappo", "vdppo")
-        return f"algorithm.{name}={value}" if clipped and not own else ""
-
-    return word
 
 
 OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
@@ -65,13 +49,10 @@ OLD_DEFAULTS: list[str | Callable[[Scenario, list[str]], str]] = [
     "model.offsets=shared",
     "model.sees_time=false",
     "algorithm.mask_collided=false",
-    "model.critic_attends=true",
-    *(_clipped(name, value) for name, value in THREE_PASSES.items()),
 ]
 
 
 def old_defaults(words: list[str]) -> list[str]:
     """The overrides to put in front of the words of a run that was started when these were the defaults."""
     row = find_scenario(find_override(words, "scenario") or OLD_SCENARIO)
-    found = [one if isinstance(one, str) else one(row, words) for one in OLD_DEFAULTS]
-    return [one for one in found if one]
+    return [one if isinstance(one, str) else one(row, words) for one in OLD_DEFAULTS]

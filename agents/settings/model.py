@@ -11,13 +11,11 @@ class ModelConfig:
 
     Attributes:
         action: what a robot chooses: a region of the map and an offset, or one of its frontier "targets" (the env shows
-            them with observation.targets). Those of `target_...`, `score_weight` and `critic_attends` belong to the
-            latter, the other sizes but `critic_hidden` to regions.
+            them with observation.targets). Those of `target_...` and `score_weight` belong to the latter, the
+            other sizes but `critic_hidden` to regions.
         target_width: features per target.
         target_heads: attention heads; must divide `target_width`.
         score_weight: of the classical planner's value of a target in its logit, where one radar disc is 1.
-        critic_attends: whether critics of "targets" attend over a robot's targets as its policy does; else they add
-            them up, for a fifth of the operations.
         stem: how the picture becomes small. "pool" averages blocks of 4 x 4 pixels (no weights, fast on a
             CPU); "conv" learns two strided convolutions on the full picture, as in the paper.
         channels: feature maps of the convolutions.
@@ -37,7 +35,6 @@ class ModelConfig:
     target_width: int = whole(48, most=4096)
     target_heads: int = whole(2, most=64)
     score_weight: float = number(50.0)
-    critic_attends: bool = flag(False)
     stem: str = choice("pool", "conv")
     channels: int = whole(16, most=4096)
     grid_features: int = whole(16, most=4096)
@@ -71,7 +68,6 @@ class ModelConfig:
 SIZES = {
     "small": ModelConfig(),
     "paper": ModelConfig(
-        critic_attends=True,
         stem="conv",
         channels=32,
         grid_features=16,
