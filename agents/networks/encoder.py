@@ -219,7 +219,9 @@ def compact(picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor
     picture, pose, grid = (value.reshape(-1, *value.shape[len(lead) :]) for value in (picture, pose, grid))
     pooled = pool_regions(picture, *region_centres(pose, grid)).unflatten(0, (-1, lead[-1]))
     comm, maps = comm.reshape(-1, *comm.shape[-2:]), pooled[:, :, :MERGED]
-    parts = (pooled, merged_maps(maps, comm), merged_maps(maps, torch.ones_like(comm)))
+    everyone = maps.amax(1, keepdim=True).expand_as(maps)
+    heard = everyone if bool(comm.all()) else merged_maps(maps, comm)
+    parts = (pooled, heard, everyone)
     cells = torch.cat(parts, dim=2).permute(0, 1, 3, 4, 2).contiguous()
     return cells.reshape(*lead, *cells.shape[2:])
 
