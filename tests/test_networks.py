@@ -240,11 +240,12 @@ def test_resampling_keeps_constants_and_positions():
     torch.testing.assert_close((source @ weights).unflatten(0, (4, 4)).mean(1), centres[0], atol=2e-3, rtol=0)
 
 
-def test_compact_pictures_serve_in_place_of_pictures(env):
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_compact_pictures_serve_in_place_of_pictures(env, share):
     """Of a policy that hears some, of a critic that sees all and of one that sees itself; gradients too."""
     td = states(4, 3)
     observation = td["agents", "observation"]
-    observation["comm"] = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(3)) < 0.5
+    observation["comm"] = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(3)) < share
     pooled = td.clone()
     parts = (observation[name] for name in ("map", "pose", "grid", "comm"))
     pooled["agents", "observation", "map"] = compact(*parts)
