@@ -1,12 +1,16 @@
 """Import of files: floor maps of ROS and arrays of MAexp, good, odd and broken."""
 
+import re
+
 import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from scipy import ndimage
 
 from maexp.envs.checker import check_map
-from maexp.envs.importing import ImportOptions, export_ros_map, import_map, import_map_with_report
+from maexp.envs.importing import ImportOptions, export_ros_map, finish, import_map, import_map_with_report
+from maexp.envs.importing import grid as grids
 from maexp.envs.map import MapError
 from maexp.envs.scenarios import make_map
 
@@ -92,6 +96,57 @@ def test_a_small_room_gets_fine_cells(tmp_path):
     assert world.resolution < 0.25 and world.free_area > 20
     closed = import_map(write_ros(tmp_path, image, resolution=0.1, name="small"), min_passage=1.0)
     assert closed.free_area < 15
+
+
+def test_coarse_pixels_are_cut_to_what_keeps_a_robot_from_colliding(tmp_path):
+    """A robot of `pointcloud` collides 0.3 m from a point, one of `indoor_small` at 0.06 m."""
+    for scenario, pixel, threshold in (("pointcloud", 0.5, 0.3), ("indoor_small", 0.1, 0.06)):
+        path = write_ros(tmp_path, resolution=pixel)
+        world, report = import_map_with_report(path, scenario=scenario)
+        assert world.resolution == threshold and check_map(world).ok and not report.warnings
+        told = next(step.detail for step in report.steps if step.name == "density")
+        assert f"{pixel:g} m" in told and f"{threshold:g} m" in told
+    by_hand, report = import_map_with_report(path, resolution=0.05)
+    assert by_hand.resolution == 0.05 and "density" in [step.name for step in report.steps] and not report.warnings
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.37, 0.5, 0.83, 0.999])
+def test_cut_cells_keep_every_wall_and_every_door(ratio):
+    labels = np.random.default_rng(0).integers(0, 3, (23, 17)).astype(np.uint8)
+    coarse = grids.Grid(labels, 2.0, (3.0, -1.0), 0.4, height=labels + 0.5)
+    fine = grids.refine(coarse, 2.0 * ratio)
+    assert fine.cell == 2.0 * ratio
+    x, y = np.meshgrid(*(np.arange(n) + 0.5 for n in fine.labels.shape), indexing="ij")
+    old = np.floor(coarse.to_index(fine.to_world(np.stack([x, y], -1)))).astype(int).clip(0, [22, 16])
+    np.testing.assert_array_equal(fine.labels, labels[old[..., 0], old[..., 1]])
+    np.testing.assert_array_equal(fine.height, fine.labels + 0.5)
+    for label, touching in ((grids.OBSTACLE, grids.EIGHT), (grids.FREE, None)):
+        assert ndimage.label(fine.labels == label, touching)[1] == ndimage.label(labels == label, touching)[1]
+
+
+def test_cells_coarser_than_the_collision_threshold_are_warned_of(tmp_path):
+    path = write_ros(tmp_path, resolution=0.2)
+    for setting, given in (("resolution", 0.4), ("max_points", 2000)):
+        world, report = import_map_with_report(path, **{setting: given})
+        assert world.resolution == pytest.approx(0.4)
+        (warning,) = report.warnings
+        assert f"{setting}={given}" in warning and "coarser than 0.3 m" in warning and "scenario=pointcloud" in warning
+    advice = int(re.search(r"set max_points=(\d+)", warning)[1])
+    world, report = import_map_with_report(path, max_points=advice)
+    assert world.resolution <= 0.3 and len(world.free) <= advice and not report.warnings
+
+
+def test_a_large_box_is_imported_in_coarser_cells(tmp_path, monkeypatch):
+    """Rather than refused, as where few of a large map's cells are free."""
+    path = write_ros(tmp_path, resolution=0.5)
+    fine = import_map(path)
+    whole = import_map_with_report(path, resolution=0.3)[1]
+    cells = next(step.after for step in whole.steps if step.name == "resolution")
+    monkeypatch.setattr(finish, "CLEANED_CELLS", int(0.8 * cells))
+    world, report = import_map_with_report(path)
+    assert fine.resolution == 0.3 < world.resolution < 0.5 and check_map(world).ok
+    (warning,) = report.warnings
+    assert "coarser than 0.3 m" in warning and warning.endswith("; crop") and "max_points" not in warning
 
 
 def test_set_by_hand(tmp_path):

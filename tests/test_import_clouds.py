@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from maexp.envs.checker import check_map
 from maexp.envs.importing import import_map, import_map_with_report
 from maexp.envs.map import MapError
+from maexp.envs.scenarios import find_scenario
 
 ROOM = (8.0, 6.0, 2.5)  # [m]
 BLOCK = (2.0, 3.0, 2.0, 3.0)  # x and y of a block in the room [m]
@@ -207,7 +208,7 @@ def terrain(spacing=0.9):
 def test_an_airborne_scan(tmp_path):
     world, report = import_map_with_report(write_xyz(tmp_path / "x.xyz", terrain()))
     assert world.scenario == "outdoor" and check_map(world).ok
-    assert 0.9 * 11_760 < world.free_area < 12_100
+    assert 0.9 * 11_760 < world.free_area < 12_190, "cells of 1.3 m, cut to 0.75 m, reach beyond the edge"
     standing = next(step.after for step in report.steps if step.name == "terrain")
     assert standing == pytest.approx(240 / 0.9**2, rel=0.15), "the house stands on the slope, and nothing else"
     low = world.free[:, :2].min(axis=0)
@@ -215,6 +216,17 @@ def test_an_airborne_scan(tmp_path):
     assert np.abs(world.free).max() < 1000, "moved to the origin"
     tile = import_map(tmp_path / "x.xyz", tile=60.0)
     assert np.ptp(tile.free[:, :2], axis=0).max() <= 60.0 and check_map(tile).ok
+
+
+def test_walls_of_a_sparse_scan_stay_closed(tmp_path):
+    """Many cells as small as a car's collision threshold hold no point; the hedge between two fields has no hole."""
+    points = terrain(spacing=1.2)
+    hedge = np.abs(points[:, 0] - points[:, 0].min() - 30) < 0.9
+    points[hedge, 2] += 3.0
+    world, report = import_map_with_report(write_xyz(tmp_path / "x.xyz", points))
+    assert world.resolution == 0.75 and check_map(world).ok
+    assert "density" in [step.name for step in report.steps]
+    assert 0.9 * 8_660 < world.free_area < 9_000, "the larger field alone"
 
 
 def test_las_in_feet(tmp_path):
@@ -231,7 +243,7 @@ def test_las_in_feet(tmp_path):
     data.write(tmp_path / "x.las")
     world, report = import_map_with_report(tmp_path / "x.las")
     assert "0.3048 m a unit (by the file)" in report.table()
-    assert 0.9 * 11_760 < world.free_area < 12_100
+    assert 0.9 * 11_760 < world.free_area < 12_190
     room = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
     room.header.scales = [0.001] * 3
     rng = np.random.default_rng(0)
@@ -362,6 +374,7 @@ def test_real_scans(data_dir, name, scenario):
     world = import_map(data_dir / name, scenario=scenario)
     low, high = REAL[name, scenario]
     assert low < world.free_area < high
+    assert world.resolution <= find_scenario(world.scenario).collision_threshold
     report = check_map(world)
     assert report.ok and not report.warnings, report.table()
 

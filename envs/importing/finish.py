@@ -13,7 +13,7 @@ from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.scenarios.lattice import wall_points
 from maexp.kernels.types import START_CLEARANCE
 
-from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, seal, thin_walls
+from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, refine, seal, thin_walls
 from .options import ImportOptions
 from .report import ImportReport
 from .sources import Source
@@ -29,26 +29,54 @@ def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOpt
     """The map of a source of grids; raises MapError where no resolution leaves room for the team."""
     if options.resolution is not None:
         cleaned = _Cleaned(_grid_at(source, options.resolution, report), scenario, options)
-        if cleaned.start.cell > options.resolution * (1 + 1e-6):
-            report.warn(
-                f"resolution {options.resolution:g} m is finer than the file's: kept its {cleaned.start.cell:g} m"
-            )
-        elif options.resolution < source.finest * (1 - 1e-6):
-            report.warn(f"resolution {options.resolution:g} m is finer than the points allow, {source.finest:g} m")
         _require_room(cleaned, options, scenario)
         reason = "as set"
     else:
         cleaned, reason = _choose_resolution(source, scenario, options, report)
+    _tell_of_density(cleaned.start.cell, source, scenario, report)
+    _warn_of_coarse_cells(cleaned, scenario, options, report)
     report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
     cleaned.tell(report)
     return _to_map(cleaned.grid, scenario, name, options, report)
 
 
 def _grid_at(source: Source, cell: float, report: ImportReport) -> Grid:
-    grid = source.at(cell)
+    """The place in cells of `cell` [m]: parts of larger ones where the file shows nothing so small.
+
+    Counted anew, points that lie farther apart than the cells would leave holes in walls.
+    """
+    grid = source.at(max(cell, source.finest))
     if not grid.count(FREE):
-        raise MapError(f"{report.path}: no cell of {cell:g} m is free; check units, up, floor and crop")
-    return grid
+        raise MapError(f"{report.path}: no cell of {grid.cell:g} m is free; check units, up, floor and crop")
+    return refine(grid, cell)
+
+
+def _tell_of_density(cell: float, source: Source, scenario: Scenario, report: ImportReport) -> None:
+    if cell < source.finest * (1 - 1e-6):
+        report.add(
+            "density",
+            f"the file shows nothing smaller than {source.finest:g} m: walls and floor are found in cells of that "
+            f"size and then cut into cells of {cell:g} m",
+        )
+
+
+def _warn_of_coarse_cells(cleaned: _Cleaned, scenario: Scenario, options: ImportOptions, report: ImportReport) -> None:
+    """Robots meet walls before they could know of them where points lie farther apart than the threshold."""
+    cell, threshold = cleaned.start.cell, scenario.collision_threshold
+    if cell <= threshold * (1 + 1e-6):
+        return
+    if options.resolution is not None:
+        what, remedy = f"resolution={cell:g} m is", f"set {threshold:g} or less, or leave it out"
+    elif cleaned.start.labels.size * (cell / threshold) ** 2 > CLEANED_CELLS:
+        what, remedy = f"in a box of this size, of at most {CLEANED_CELLS:,} cells, those of {cell:g} m are", "crop"
+    else:
+        needed = math.ceil(1.1 * cleaned.area / threshold**2 / 1000) * 1000
+        what = f"with max_points={options.max_points} the cells of {cell:g} m are"
+        remedy = f"set max_points={needed}, or crop"
+    report.warn(
+        f"{what} coarser than {threshold:g} m, the distance at which a robot of scenario={scenario.name} collides, "
+        f"so robots may be lost at ragged walls; {remedy}"
+    )
 
 
 def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
@@ -117,18 +145,21 @@ class _Cleaned:
 def _choose_resolution(
     source: Source, scenario: Scenario, options: ImportOptions, report: ImportReport
 ) -> tuple[_Cleaned, str]:
-    """The coarsest cells that keep the free area and give the team room.
+    """The coarsest cells that keep the free area, give the team room, and tell a robot of a wall before it collides.
 
     Coarse cells swallow doors and narrow rooms: the finest candidate, at most a third of the scenario's
     resolution, tells how much area there is to keep.
     """
-    base = scenario.resolution
-    sizes = sorted({max(base * step, source.finest) for step in STEPS_DOWN}, reverse=True)
-    grid = _grid_at(source, sizes[-1], report)
+    base, threshold = scenario.resolution, scenario.collision_threshold
+    sizes = sorted({min(max(base * step, source.finest), threshold) for step in STEPS_DOWN}, reverse=True)
+    grid, *_ = keep_component(_grid_at(source, max(sizes[-1], source.finest), report), options.component)
     area = grid.count(FREE) * grid.cell**2
-    coarsest = math.ceil(math.sqrt(area / options.max_points) / 0.05) * 0.05
+    step = min(0.05, 0.2 * base)
+    coarsest = math.ceil(math.sqrt(area / options.max_points) / step) * step
     if coarsest > sizes[0]:
         sizes = [round(coarsest, 3), *(size for size in sizes if size > coarsest / 4)]
+    least = math.sqrt(1.02 * grid.labels.size / CLEANED_CELLS) * grid.cell  # finer ones are too many to clean
+    sizes = [size for size in sizes if size >= least] or [round(math.ceil(least / step) * step, 3)]
     if sizes[0] * POINTS_IN_RANGE > scenario.radar_range:
         raise MapError(
             f"{report.path}: {area:,.0f} m2 of free space need cells of {sizes[0]:g} m to stay below "
@@ -142,7 +173,7 @@ def _choose_resolution(
             tried[size] = _Cleaned(_grid_at(source, size, report), scenario, options)
         return tried[size]
 
-    finest = next((size for size in sizes if size <= sizes[0] / 3), sizes[-1])
+    finest = next((size for size in sizes if size <= max(base, sizes[0]) / 3), sizes[-1])
     goal = KEPT_SHARE * clean(finest).area
     for size in sizes:
         cleaned = clean(size)

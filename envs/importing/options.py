@@ -21,8 +21,8 @@ class ImportOptions:
         scenario: whose robot and radar fit the map; "auto": "outdoor" for airborne scans where that scenario
             exists, else "pointcloud".
         name: name of the map; None: the stem of the file.
-        resolution: spacing of the map's points [m].
-        max_points: free points the automatic resolution may produce.
+        resolution: spacing of the map's points [m]; None: at most the robot's collision threshold.
+        max_points: free points the automatic resolution may produce; it is coarser where they are not enough.
         num_robots: the team that must find room.
 
     Grids (ROS map_server): `pixel_size` [m] when an image comes without its yaml; `free_threshold` and
