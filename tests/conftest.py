@@ -1,6 +1,7 @@
-"""Shared fixtures: one torch thread, Warp's mode, and the folder of real scans."""
+"""Shared fixtures: one torch thread, Warp's mode, the folder of real scans, and a tiny benchmark."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -33,3 +34,21 @@ def oracle_dir() -> Path:
     if not (folder / "masking_maze.npz").is_file():
         pytest.skip(f"RECORDED ARRAYS ABSENT: no masking_maze.npz in {folder}; set MAEXP_ORACLE to the folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def whole_run(tmp_path_factory) -> Path:
+    """Folder of a tiny benchmark that ran in one go: not to be changed."""
+    from tiny_benchmark import TINY
+
+    from maexp.agents.cli import main
+
+    folder = tmp_path_factory.mktemp("benchmark") / "whole"
+    assert main(["benchmark", *TINY, f"hydra.run.dir={folder}"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run_copy(whole_run, tmp_path) -> Path:
+    """A copy of it that a test may change."""
+    return Path(shutil.copytree(whole_run, tmp_path / "copy"))

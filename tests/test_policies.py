@@ -1,39 +1,14 @@
-"""Classical planners: they finish, they are batched without a trace of the batch, and they choose as they say."""
-
-from dataclasses import replace
+"""Classical planners: they finish, and they are batched without a trace of the batch."""
 
 import numpy as np
 import pytest
 import torch
-from oracle.grid import frontier_cells, geodesic_distance
+from mazes import OFFSET, REGION, make_env
 
-from maexp.agents.policies.classical import (
-    CLASSICAL,
-    POLICIES,
-    FrontierPlanner,
-    OraclePlanner,
-    _prefer,
-    choose_by_area,
-    choose_by_assignment,
-    choose_by_force,
-    choose_by_utility,
-    choose_nearest,
-)
-from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RobotConfig, make_map
-from maexp.envs.navigation import Navigation
-from maexp.envs.targets import Scene, keyed_uniform, plan_in_turn, value_targets
+from maexp.agents.policies.classical import CLASSICAL, POLICIES, OraclePlanner
+from maexp.envs import CommConfig, RobotConfig, make_map
+from maexp.envs.targets import keyed_uniform
 from maexp.kernels import visible_points
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import UNREACHED
-
-MAPS = [make_map("maze_small", k) for k in (0, 3)]
-REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
-
-
-def make_env(num_envs=4, planner="wavefront", clearance=None, **settings) -> ExplorationEnv:
-    settings = {"maps": MAPS, "seed": 11, "macro_steps": 80} | settings
-    planning = PlannerConfig(name=planner, clearance_factor=clearance)
-    return ExplorationEnv(num_envs=num_envs, planner=planning, num_threads=1, **settings)
 
 
 def play(env, name: str, steps: int):
@@ -100,85 +75,25 @@ def test_random_draws_are_even_and_change_with_every_key():
     assert torch.equal(keyed_uniform(env, 40), draw)
 
 
-def test_navigation_shows_what_the_team_knows():
-    env = make_env(3)
+def splitmix(*parts: int) -> float:
+    """A number in [0, 1) of a chain of splitmix64 (Steele et al. 2014)."""
+    key, bits = 0, (1 << 64) - 1
+    for part in parts:
+        key = (key + part + 0x9E3779B97F4A7C15) & bits
+        key = (key ^ (key >> 30)) * 0xBF58476D1CE4E5B9 & bits
+        key = (key ^ (key >> 27)) * 0x94D049BB133111EB & bits
+        key ^= key >> 31
+    return (key >> 40) / 2**24
+
+
+def test_random_draws_are_those_of_their_keys():
+    env = make_env(4)
     env.reset()
-    nav = Navigation(env)
-    nav.update()
-    for e in range(3):
-        shot = env.snapshot(e)
-        place = shot["map"]
-        side = int(round(place.extent[1][0] - place.extent[0][0])) + 1
-        known = np.zeros((side, side), np.uint8)
-        for points, seen, kind in (
-            (place.free, shot["seen_free"], FREE), (place.boundary, shot["seen_boundary"], OBSTACLE)
-        ):  # fmt: skip
-            cells = np.round(points[seen.any(axis=0)][:, :2] - np.array(place.extent[0])).astype(int)
-            known[cells[:, 1], cells[:, 0]] = kind
-        got = nav.known[e, 0].numpy()[: side * side].reshape(side, side)
-        np.testing.assert_array_equal(got, known)
-        want = frontier_cells(known == FREE, known == OBSTACLE)
-        np.testing.assert_array_equal(nav.frontier[e, 0].numpy()[: side * side].reshape(side, side) != 0, want)
-        assert nav.size[e, 0].sum() == want.sum() > 0
-        for cell in nav.target[e, 0][nav.target[e, 0] >= 0].tolist():
-            assert known.flat[cell] == FREE
-    assert (known == UNKNOWN).any()
-
-
-def test_travel_and_points_of_targets():
-    env = make_env(2, robot=RobotConfig(collision_threshold=0.1))  # nothing is tight: plain distances
-    env.reset()
-    nav = Navigation(env)
-    nav.update()
-    travel = nav.travel()
-    for e in range(2):
-        w = int(nav.width[nav.state["map_id"][e]])
-        known = nav.known[e, 0].numpy()[: w * w].reshape(w, w)
-        for i in range(3):
-            x, y = np.floor(nav.centers()[e, i].numpy() + 0.5).astype(int)
-            want = geodesic_distance(known == FREE, [y * w + x]).ravel()
-            target = nav.target[e, 0]
-            for k in (target >= 0).nonzero().ravel().tolist():
-                far = want[target[k]]
-                assert travel[e, i, k] == (np.inf if far == UNREACHED else pytest.approx(far / 10))
-                point = nav.points(nav.target)[e, 0, k]
-                assert point.tolist() == [int(target[k]) % w, int(target[k]) // w]
-    assert travel.isfinite().any()
-
-
-def test_actions_mean_the_points_they_came_from():
-    env = make_env(3)
-    env.reset()
-    nav = Navigation(env)
-    points = keyed_uniform(env, 2) * 36.0
-    region, offset = nav.to_action(points)
-    td = env.reset()
-    td[REGION], td[OFFSET] = region, offset
-    env.step(td)
-    torch.testing.assert_close(env.simulation.tensors["goal"], points, atol=1e-4, rtol=0)
-    region, offset = nav.to_action(points + 1000.0)
-    assert (region == 63).all() and (offset == 1.0).all()
-
-
-def test_goals_under_dwa_are_in_sight_and_in_reach():
-    env = make_env(4, planner="dwa", clearance=4.0)  # no place of these corridors is open ground then
-    td = env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
-    reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill
-    for _ in range(3):
-        td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
-        centers = planner.tracker.nav.centers().clone()
-        passable = planner.tracker.nav.passable.passable.numpy().copy()
-        td = env.step(td)["next"]
-        goal = env.simulation.tensors["goal"]
-        assert ((goal - centers).norm(dim=-1) <= reach + 1e-3).float().mean() > 0.9
-        for e in range(4):
-            w = int(planner.tracker.nav.width[planner.tracker.nav.state["map_id"][e]])
-            for i in range(3):
-                a, b = centers[e, i].numpy(), goal[e, i].numpy()
-                line = a + np.linspace(0.2, 1.0, 20)[:, None] * (b - a)
-                cells = np.floor(line + 0.5).astype(int)
-                assert passable[e][cells[:, 1] * w + cells[:, 0]].mean() > 0.9
+    env.simulation.tensors["episode"].copy_(torch.tensor([0, -1, 2, 3]))
+    state, draw = env.simulation.tensors, keyed_uniform(env, 2)
+    for e, i, k in np.ndindex(4, 3, 2):
+        keys = (int(state["seed"]), *(int(state[name][e]) for name in ("env_id", "episode", "macro_step")), 2 * i + k)
+        assert draw[e, i, k] == splitmix(*keys)
 
 
 def test_the_oracle_is_told_what_is_truly_to_be_seen():
@@ -186,7 +101,7 @@ def test_the_oracle_is_told_what_is_truly_to_be_seen():
     env = make_env(3, maps=[make_map("maze_small", 0)], num_robots=2)
     env.reset()
     oracle = OraclePlanner(env)
-    told, guessed = oracle.look(), oracle.tracker.look(compact=True)
+    told, guessed = oracle.look(), oracle.tracker.look()
     disc = np.pi * 10.0**2
     compared = 0
     for e in range(3):
@@ -204,239 +119,6 @@ def test_the_oracle_is_told_what_is_truly_to_be_seen():
             compared += want > 0.1
     assert compared > 5 and told.gain.max() < guessed.gain.max()
     assert told.gain.sum() < 0.8 * guessed.gain.sum()
-
-
-class Places:
-    """Stands in for a `Navigation` where a choice needs only the robots' places."""
-
-    radar_range = 10.0
-
-    def __init__(self, at, ways=None):
-        self.at, self.ways = torch.tensor(at), ways
-
-    def centers(self):
-        return self.at
-
-    def cell_of_env(self):
-        return torch.ones(len(self.at))
-
-    @property
-    def target(self):
-        return torch.zeros(self.ways.shape[:3], dtype=torch.long)
-
-    def points_on_way(self, cells, ahead: float):
-        return self.at.unsqueeze(2) + self.ways
-
-    def grow_trees(self, samples: int, branch: float):
-        return torch.ones(len(self.at), 1, self.ways.shape[2], dtype=torch.bool)
-
-
-def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
-    travel = torch.tensor(travel)
-    points = torch.zeros(*travel.shape, 2) if points is None else torch.tensor(points)
-    size = torch.ones_like(travel) if size is None else torch.tensor(size)
-    alive = torch.ones(travel.shape[:2], dtype=torch.bool) if alive is None else torch.tensor(alive)
-    gain = torch.ones_like(travel)
-    nav = nav or Places(np.zeros((*travel.shape[:2], 2), np.float32))
-    return Scene(travel, points, size, gain, torch.zeros_like(points), alive, nav)
-
-
-INF = float("inf")
-
-
-def test_targets_with_little_to_see_wait():
-    scene = replace(scene_of([[[1.0, 2.0, INF], [1.0, INF, INF]]]), gain=torch.tensor([[[0.2, 0.4, 0.4]] * 2]))
-    assert _prefer(scene).travel.tolist() == [[[INF, 2.0, INF], [1.0, INF, INF]]]
-
-
-def test_utility_weighs_what_is_to_be_seen_against_the_way():
-    gain = torch.tensor([[[0.2, 0.4]]])
-    near, far = (replace(scene_of([[[1.0, way]]]), gain=gain) for way in (10.0, 400.0))
-    assert choose_by_utility(near).tolist() == [[1]]
-    assert choose_by_utility(far).tolist() == [[0]]
-    torch.testing.assert_close(value_targets(near), torch.tensor([[[0.2 - 0.003, 0.4 - 0.03]]]))
-
-
-def test_voronoi_keeps_to_the_own_area_and_ignores_the_dead():
-    travel = [[[1.0, 5.0, 9.0], [2.0, 4.0, 3.0], [7.0, 8.0, 8.0]]]
-    assert choose_by_area(scene_of(travel)).tolist() == [[0, 2, 0]]
-    assert choose_by_area(scene_of(travel, alive=[[False, True, True]])).tolist()[0][1:] == [0, 0]
-
-
-def test_hungarian_takes_the_least_total_and_shares_none():
-    scene = scene_of([[[1.0, 2.0, INF], [1.5, 9.0, INF]], [[INF, 3.0, INF], [INF, 1.0, INF]]])
-    assert choose_by_assignment(scene).tolist() == [[1, 0], [1, 1]]
-
-
-def test_choices_in_turn_spread_the_team():
-    at = [[[0.0, 0.0], [2.0, 0.0], [30.0, 0.0]]]
-    points = [at[0], at[0]]
-    travel = [[[1.0, 1.0, 6.0], [1.0, 1.0, 6.0]]]
-    scene = scene_of(travel, points=[points])
-    gain = torch.tensor([[[1.0, 0.9, 0.8]] * 2])
-    heard, alone = torch.ones(1, 2, 2, dtype=torch.bool), torch.eye(2, dtype=torch.bool).unsqueeze(0)
-    value, points = gain - scene.travel / 10.0, scene.points / 10.0
-    score, taken, claimed = plan_in_turn(gain, value, points, heard)
-    assert taken.tolist() == [[0, 2]]  # 1 is in sight of 0
-    torch.testing.assert_close(claimed, torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.8, 0.0]]]))
-    torch.testing.assert_close(score, value - gain * claimed)
-    assert plan_in_turn(gain, value, points, alone)[1].tolist() == [[0, 0]]  # who hears nothing shares nothing
-
-
-@pytest.mark.parametrize("name", CLASSICAL)
-@pytest.mark.parametrize("lost", [[1], [2], [1, 2]])
-def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(name, lost):
-    """A robot that has collided has no way anywhere."""
-    points = [[40.0, 0.0], [0.0, 30.0], [-20.0, 0.0]]
-    at = torch.tensor([[[0.0, 20.0], [-9.0, 0.0], [30.0, 0.0]]])
-    travel = (at.unsqueeze(2) - torch.tensor([[points]])).norm(dim=-1)
-
-    def choose(kept):
-        ways = torch.tensor([[points]]) - at[:, kept].unsqueeze(2)
-        alive, way = torch.ones(1, 3, dtype=torch.bool), travel.clone()
-        alive[:, lost], way[:, lost] = False, INF
-        scene = scene_of(way[:, kept].tolist(), [[points] * len(kept)], alive=alive[:, kept].tolist(),
-                         nav=Places(at[:, kept].tolist(), ways))  # fmt: skip
-        return CLASSICAL[name](scene)[0].tolist()
-
-    whole, living = choose([0, 1, 2]), [i for i in range(3) if i not in lost]
-    assert [whole[i] for i in living] == choose(living)
-
-
-def test_force_turns_toward_the_larger_pull_and_away_from_others():
-    ways = torch.tensor([[[[3.0, 0.0], [-3.0, 0.0]]] * 2])
-    travel, size = [[[5.0, 5.0], [5.0, 5.0]]], [[[4.0, 5.0], [4.0, 5.0]]]
-    alone = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [50.0, 0.0]]], ways))
-    assert choose_by_force(alone).tolist() == [[1, 1]]
-    close = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [-2.0, 0.0]]], ways))
-    assert choose_by_force(close).tolist() == [[0, 1]]
-    dead = scene_of(travel, size=size, alive=[[True, False]], nav=close.nav)
-    assert choose_by_force(dead).tolist()[0][0] == 1
-
-
-def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_left():
-    env = make_env(1, num_robots=1)
-    env.reset()
-    env.simulation.tensors["macro_step"].fill_(1)
-    planner = FrontierPlanner(env, choose_nearest)
-    planner.tracker.nav.update()
-    here = planner.tracker.nav.centers().unsqueeze(2)
-    travel = torch.full((1, 1, planner.tracker.nav.num_blocks), INF)
-    travel[..., :2] = torch.tensor([0.5, 20.0])
-    points = here.expand(-1, -1, planner.tracker.nav.num_blocks, -1).clone()
-    points[..., 1, :] += 20.0
-    kept = []
-    for step in range(1, 5):
-        env.simulation.tensors["macro_step"].fill_(step)
-        for _ in range(2):  # looking twice counts once
-            given = planner.tracker._give_up(travel, points)[0, 0, :2].tolist()
-        kept.append(given)
-    assert kept == [[0.5, 20.0], [0.5, 20.0], [INF, 20.0], [INF, 20.0]]
-    travel[..., 1] = INF
-    assert planner.tracker._give_up(travel, points)[0, 0, 0] == 0.5
-
-
-def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
-    env = make_env(1, num_robots=2)
-    env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
-    planner.tracker.nav.update()
-    travel = torch.full((1, 2, planner.tracker.nav.num_blocks), INF)
-    travel[..., :2] = torch.tensor([9.0, 20.0])
-    points = torch.full((*travel.shape, 2), 1000.0)
-    state = planner.tracker.state
-    for step in range(1, 4):
-        env.simulation.tensors["macro_step"].fill_(step)
-        state["chosen"], state["stood"] = torch.zeros_like(state["chosen"]), planner.tracker.nav.centers().clone()
-        state["stood"][0, 1, 0] -= 1.0  # the second robot has moved
-        kept = planner.tracker._give_up(travel, points)
-    assert kept[0, :, :2].tolist() == [[INF, 20.0], [9.0, 20.0]]
-    env.simulation.tensors["macro_step"].fill_(0)
-    assert planner.tracker._give_up(travel, points)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
-
-
-@pytest.mark.parametrize("speed, drive", [(0.0, 4.0), (3.0, 10.0), (8.0, 16.0)])
-def test_goals_lie_beyond_the_target_as_far_as_a_robot_gets(speed, drive):
-    """Two seconds at 2 m/s^2 and at most 8 m/s."""
-    env = make_env(1)
-    env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
-    env.simulation.tensors["pose"][..., 2] = speed
-    gap = torch.tensor([2.0, 9.0, 30.0])
-    target = planner.tracker.nav.centers() + torch.stack([torch.zeros(3), gap], -1)
-    toward = torch.tensor([6.0, 0.0]).expand(1, 3, 2)
-    goal = planner.tracker._approach(torch.zeros(1, 3, dtype=torch.long), target, toward)
-    expected = torch.stack([(drive - gap).clamp_min(0.0), torch.zeros(3)], -1)
-    torch.testing.assert_close(goal - target, expected.unsqueeze(0), atol=1e-4, rtol=0)
-
-
-def test_how_far_goals_lie_is_each_robots_own():
-    """A slow robot, a fast one, and one that slides sideways; two seconds at 2 m/s^2."""
-    kinds = [("differential", 0.5), ("differential", 8.0), ("omnidirectional", 8.0)]
-    env = make_env(1, robot=[RobotConfig(kind=kind, max_speed=speed, max_accel=2.0) for kind, speed in kinds])
-    env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
-    env.simulation.tensors["slip"][:, 2] = 3.0
-    target = planner.tracker.nav.centers()
-    toward = torch.tensor([6.0, 0.0]).expand(1, 3, 2)
-    goal = planner.tracker._approach(torch.zeros(1, 3, dtype=torch.long), target, toward)
-    drive = torch.stack([torch.tensor([1.0, 4.0, 10.0]), torch.zeros(3)], -1)
-    torch.testing.assert_close(goal - target, drive.unsqueeze(0), atol=1e-4, rtol=0)
-
-
-def test_open_ground_is_where_no_known_obstacle_is_near():
-    env = make_env(12, planner="dwa", maps=[make_map("indoor_small", 1)])
-    env.reset()
-    nav = Navigation(env)
-    nav.update()
-    ends = nav.centers() + 2.0 * (keyed_uniform(env, 2) - 0.5)
-    found = nav.leads_through_open_ground(ends)
-    width, radius = int(nav.width[0]), 1.2 * 3.0 * 0.06
-    for e in range(12):
-        at = (nav.known[e, 0] == OBSTACLE).nonzero()[:, 0].numpy()
-        walls = np.stack([at % width, at // width], -1)
-        for i in range(3):
-            places = np.linspace(nav.centers()[e, i].numpy(), ends[e, i].numpy(), 7)
-            cells = np.floor((places - nav.origin[0].numpy()) / float(nav.cell_size[0]))
-            cells = cells.clip(0, [width - 1, int(nav.height[0]) - 1])
-            gaps = np.linalg.norm(cells[:, None] - walls[None], axis=-1).min(1) * float(nav.cell_size[0])
-            assert bool(found[e, i]) == bool((gaps >= radius).any())
-    assert found.any() and not found.all()
-
-
-def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
-    env = make_env(2)
-    env.reset()
-    nav = Navigation(env)
-    nav.update()
-    place, reach = nav.centers(), torch.ones(2, env.num_robots)
-    nowhere = torch.full((2, env.num_robots), -1)
-    for name, values in (
-        ("grow_trees", (5, 2.0)), ("waypoints", (nowhere, place, reach)), ("leads_through_open_ground", (place,)),
-    ):  # fmt: skip
-        getattr(nav, name)(*values)
-        with nav.only(torch.tensor([1])), pytest.raises(RuntimeError, match=f"{name} is about all envs"):
-            getattr(nav, name)(*values)
-
-
-@pytest.mark.parametrize(
-    "scenario, clearance, drive", [("outdoor", 3.0, 16.0), ("maze_small", 3.0, 4.0), ("maze_small", 4.0, 0.0)]
-)
-def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, clearance, drive):
-    """Four seconds from standstill at 2 m/s^2 outdoors, two in a maze, whose corridors are open to small clearances."""
-    env = make_env(2, planner="dwa", clearance=clearance, maps=[make_map(scenario, 0)])
-    env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
-    nav = planner.tracker.nav
-    nav.update()
-    cell, x = float(nav.cell_size[0]), torch.tensor([1.0, 0.0])
-    near = (nav.centers() / cell).round() * cell  # the robot's own place, as the middle of a cell
-    cells = ((near - nav.origin[0]) / cell).floor().long()
-    cells = cells[..., 1] * int(nav.width[0]) + cells[..., 0]
-    beyond = planner.tracker._approach(cells, nav.points(cells), (6.0 * x).expand(2, 3, 2)) - nav.points(cells)
-    is_open = nav.leads_through_open_ground(nav.centers())
-    assert is_open.any() == (drive > 0.0)
-    torch.testing.assert_close(beyond, drive * is_open.unsqueeze(-1) * x, atol=1e-4, rtol=0)
 
 
 def test_wavefront_holds_nothing_that_a_saved_state_lacks():

@@ -1,0 +1,118 @@
+"""The tables of a benchmark: means, what is best, and differences from the best classical planner."""
+
+import csv
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from maexp.agents.benchmark.cell import CellResult
+from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
+from maexp.agents.benchmark.plan import Cell
+from maexp.agents.benchmark.table import (
+    ROWS,
+    best,
+    best_columns,
+    pool_column,
+    print_tables,
+    table_csv,
+    table_latex,
+    table_markdown,
+)
+
+
+def column(policy: str, seed: int = 0, **values: list[float]):
+    names = [row.metric for row in ROWS]
+    episodes = {name: np.array(values.get(name, [0.5, 0.7]), dtype=float) for name in names}
+    return pool_column(policy, "held_out", [(seed, episodes)])
+
+
+ER, CS = (next(row for row in ROWS if row.label == label) for label in ("ER", "CS85"))
+
+
+def test_best_goes_by_direction_and_by_what_is_printed():
+    assert best({"a": 0.9, "b": 0.5}, ER) == {"a"} and best({"a": 90.0, "b": 50.0}, CS) == {"b"}
+    assert best({"a": 0.9001, "b": 0.9004, "c": 0.1}, ER) == {"a", "b"}  # both print as 90.0
+    assert best({"a": float("nan"), "b": 412.0}, CS) == {"b"} and best({"a": float("nan")}, CS) == set()
+    assert best({"a": float("nan"), "b": None}, CS) == set() and best({"a": 0.9}, ER) == set()
+
+
+@pytest.fixture
+def tables() -> dict:
+    nan = np.nan
+    columns = [
+        column("random", exploration_ratio=[0.5, 0.7], coverage_step_85=[nan, nan], coverage_step_95=[nan, nan]),
+        column("ippo", exploration_ratio=[0.9, 0.97], coverage_step_85=[300, 350], coverage_step_95=[nan, 400]),
+    ]
+    return {"maze": columns, "maze_small": [column("random"), column("voronoi", exploration_ratio=[0.6, 0.6])]}
+
+
+def test_csv_has_a_row_for_every_scenario_policy_and_metric(tables):
+    rows = list(csv.DictReader(StringIO(table_csv(tables))))
+    assert len(rows) == 4 * len(ROWS)
+    found = {(row["scenario"], row["policy"], row["metric"]): row for row in rows}
+    one = found["maze", "ippo", "coverage_step_95"]
+    assert (float(one["mean"]), one["reached"], one["episodes"], one["best"]) == (400, "1", "2", "1")
+    assert float(one["paper_mean"]) == 441
+    assert found["maze", "random", "coverage_step_95"]["mean"] == ""
+    assert float(found["maze", "ippo", "exploration_ratio"]["paper_mean"]) == pytest.approx(0.9317)
+    ties = [found["maze_small", name, "exploration_ratio"]["best"] for name in ("random", "voronoi")]
+    assert ties == ["1", "1"]
+
+
+def test_markdown_and_latex_mark_the_best(tables):
+    text = table_markdown(tables)
+    row = next(line for line in text.splitlines() if line.startswith("| CS95"))
+    assert row.split("|")[2].strip() == "-<br>(0/2)"
+    assert row.split("|")[3].strip() == "**400 ± 0**<br>[400, 400] (1/2)<br>paper 441 ± 57"
+    rows = [line for line in text.splitlines() if line.startswith("| ER")]
+    assert rows[1].count("**60.0 ±") == 2 and rows[0].count("**") == 2
+    latex = table_latex(tables)
+    assert r"$\mathbf{93.5} \pm 3.5$" in latex and r"$93.17 \pm 4.27$" in latex
+    widths = {line.count("&") for line in latex.splitlines() if line.endswith(r"\\")}
+    assert len(widths) == 1 and latex.count("{tabular}") == 2
+
+
+def test_the_terminals_table_fits_100_columns(tables):
+    wide = [1400.0, 2999.0]
+    tables["maze"].append(column("potential_field", reward_variance=wide, coverage_step_85=wide, coverage_step_95=wide))
+    out = StringIO()
+    print_tables(tables, Console(file=out, width=80))
+    text = out.getvalue()
+    assert max(map(len, text.splitlines())) <= 100
+    assert "2200 ± 800" in text.replace("  ", " ") and "441 ± 57" in text and "…" not in text
+
+
+# Less the best classical planner
+
+
+def played(policy: str, coverage: list, seed: int = 0, maps: list | None = None) -> tuple[Cell, CellResult]:
+    values = np.array(coverage)
+    episodes = {"coverage_auc": values, "coverage_step_95_censored": -100 * values, "collisions": 0 * values}
+    names = None if maps is None else np.array(maps)
+    return Cell("maze", policy, seed), CellResult(episodes, np.zeros(1), values[:, None], {}, names)
+
+
+def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training():
+    maps = ["a", "a", "b", "b"]
+    planner = [played("voronoi", [0.1, 0.2, 0.6, 0.9], seed, maps) for seed in (0, 1, 2)]
+    alike = [played("ippo", [0.2, 0.3, 0.7, 1.0], seed, maps) for seed in (2, 0)]
+    found = subtract("ippo", alike, planner)["coverage_auc"]
+    assert (found["n"], found["mean"]) == (8, pytest.approx(0.1)) and found["ci95"] == [pytest.approx(0.1)] * 2
+    unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8], 1, maps)]
+    found = subtract("ippo", unlike, planner)["coverage_auc"]
+    assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
+    assert subtract("ippo", [played("ippo", [0.5], 7)], planner) == {}
+    text = differences_markdown("voronoi", {"ippo": subtract("ippo", alike, planner)})
+    assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
+
+
+def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():
+    one, other = [played("voronoi", [0.5, 0.7])], [played("hungarian", [0.9, 0.1]), played("hungarian", [0.9, 0.4], 1)]
+    assert find_best({"voronoi": one, "hungarian": other, "rrt_frontiers": []}) == "voronoi" and find_best({}) is None
+
+
+def test_what_knows_the_map_is_never_the_best():
+    columns = [column("oracle", exploration_ratio=[0.99, 0.99]), column("ippo"), column("random")]
+    assert best_columns(columns, ER) == {"ippo", "random"}
