@@ -4,6 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.objectives.value import GAE, MultiAgentGAE
 
+from maexp.agents.networks.actor import SEEN
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE
 
 REWARD = ("agents", "reward")
@@ -57,6 +58,15 @@ def estimator_for(loss, gamma: float, lmbda: float, finite_horizon: bool, critic
 
 
 @torch.no_grad()
+def look(loss, states: TensorDictBase, chunk: int) -> torch.Tensor:
+    """What the policy makes of `states` [n], for a critic that shares its encoder."""
+    actor = loss.actor_network
+    with loss.actor_network_params.to_module(actor):
+        parts = states.select(*actor.in_keys).split(chunk)
+        return torch.cat([actor.get_dist_params(part)[SEEN] for part in parts])
+
+
+@torch.no_grad()
 def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDictBase:
     """Write values, advantages and value targets into a Collector batch.
 
@@ -80,6 +90,8 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
             return torch.cat([loss.critic_network(part.copy()).get(key) for part in states.split(chunk)])
 
     inputs = loss.critic_network.in_keys
+    if SEEN in inputs and SEEN not in batch.keys(True):
+        batch.set(SEEN, look(loss, batch.flatten(), chunk).unflatten(0, batch.shape))
     value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
     last = loss.bare_estimator.tensor_keys.terminated  # "done" where the horizon is finite
     done, final = (batch["next", name].squeeze(-1) for name in ("done", last))
@@ -88,7 +100,10 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
     ends &= ~final  # what follows is worth 0 and never read
     following = torch.cat((value[:, 1:], torch.zeros_like(value[:, :1])), dim=1)
     if ends.any():
-        following[ends] = values(batch["next"].select(*inputs)[ends])
+        after = batch["next"].select(*inputs, *loss.actor_network.in_keys, strict=False)[ends]
+        if SEEN in inputs:
+            after.set(SEEN, look(loss, after, chunk))
+        following[ends] = values(after.select(*inputs))
     batch.set(key, value)
     batch.set(("next", *key), following)
     return loss.bare_estimator(batch)

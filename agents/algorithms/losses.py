@@ -13,8 +13,8 @@ from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
 from torchrl.objectives.utils import distance_loss
 
-from maexp.agents.algorithms.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for
-from maexp.agents.networks.actor import ALIVE, PARAMS
+from maexp.agents.algorithms.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for, write_advantages
+from maexp.agents.networks.actor import ALIVE, PARAMS, SEEN
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE
 from maexp.agents.networks.distributions import Heads
 
@@ -105,8 +105,21 @@ class LivingRobots:
 
     def _log_weight(self, tensordict, adv_shape):
         alive = self._alive  # the shape given is that of the advantages selected
-        log_weight, dist, kl, behaviour = super()._log_weight(tensordict.copy(), alive.shape)
+        acted = tensordict.copy()
+        log_weight, dist, kl, behaviour = super()._log_weight(acted, alive.shape)
+        self.share(acted, tensordict)
         return select_living(log_weight, alive), dist, select_living(kl, alive), behaviour
+
+    def share(self, acted: TensorDictBase, batch: TensorDictBase) -> None:
+        """Give a critic that shares the policy's encoder what that has just made of the states, with its graph."""
+        if SEEN in self.critic_network.in_keys:
+            batch.set(SEEN, acted.get(SEEN))
+
+    def with_advantage(self, batch: TensorDictBase) -> TensorDictBase:
+        """The batch; with advantages where it had none and TorchRL's estimator would not find what the critic reads."""
+        if SEEN not in self.critic_network.in_keys or self.tensor_keys.advantage in batch.keys(True):
+            return batch
+        return write_advantages(self, batch.copy())
 
     def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
         return select_living(dist.entropy().unsqueeze(-1), self._alive)
@@ -165,7 +178,7 @@ class KLPenalty(LivingRobots):
         return terms
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return super().forward(tensordict).update(self._extra)
+        return super().forward(self.with_advantage(tensordict)).update(self._extra)
 
     def adapt_penalty(self, divergence: float) -> None:
         """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""
@@ -251,7 +264,8 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
 
     def _log_probs(self, tensordict: TensorDictBase):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(tensordict.select(*self.actor_network.in_keys))
+            dist = self.actor_network.get_dist(acted := tensordict.select(*self.actor_network.in_keys))
+        self.share(acted, tensordict)
         log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
         return sum(log_probs.values(True, True)).unsqueeze(-1), dist
 
@@ -265,7 +279,7 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
         return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None, explained
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()
+        tensordict = self.with_advantage(tensordict.copy())
         if self.tensor_keys.advantage not in tensordict.keys(True):
             self.value_estimator(
                 tensordict,

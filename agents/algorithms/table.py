@@ -1,6 +1,6 @@
 """The six algorithms: for each its loss, critic and updater; their settings stand in `settings/algorithms.py`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torchrl.modules import PopArtValueNorm
 
@@ -8,7 +8,7 @@ from maexp.agents.algorithms import losses
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.networks.critics import build_critic
 from maexp.agents.settings.algorithms import TUNINGS, Settings, Tunings
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.settings.model import ModelConfig, model_config
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class Algorithm:
         return self.tunings.configure(tuning, **overrides)
 
     def make_critic(self, env, model: "str | ModelConfig", settings: Settings | None = None):
-        """The critic of this algorithm for the specs of `env`."""
+        """The critic of this algorithm for the specs of `env`; beside a trust region it has an encoder of its own."""
+        if self.updater is TrustRegionUpdater:
+            model = replace(model_config(model), critic_encoder="own")
         mixer = getattr(settings or self.settings, "mixer", "qmix")
         return build_critic(self.critic, env, model, mixer)
 

@@ -12,10 +12,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from maexp.agents.algorithms.advantages import write_advantages
+from maexp.agents.algorithms.advantages import look, write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE
+from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN
 from maexp.agents.networks.encoder import compact, pools_pictures
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
@@ -184,6 +184,8 @@ class Updater:
     def learn_values(self, steps: list[TensorDictBase], meter: Meter) -> None:
         """One pass of the critic alone."""
         for parts in self.minibatches(steps, self.settings.minibatch_size):
+            for part in parts if SEEN in self.loss.critic_network.in_keys else ():
+                part.set(SEEN, look(self.loss, part, CHUNK))
             meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))
 
     def _step_critic(self, terms: list[tuple]) -> dict[str, float]:

@@ -23,6 +23,7 @@ TARGETS = ("agents", "observation", "targets")
 TARGETS_MASK = ("agents", "observation", "targets_mask")
 COVERAGE = ("info", "coverage")
 PARAMS = ("agents", "params")
+SEEN = ("agents", "seen")  # each robot as one vector: what the policy made of its observation, for critics
 CELLS = ("agents", "cells")  # what `compact` made of the pictures: who learns from them need not pool them again
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
 TARGET_HEADS = {"target": distributions.Categorical}
@@ -89,18 +90,23 @@ class ActionParams(nn.Module):
         self.network = network
         self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
         self.pools = pools_pictures(network)
+        self.shares = getattr(network, "shares", False)
 
     @property
     def out_keys(self) -> list[tuple[str, ...]]:
-        return [PARAMS, *([CELLS] if self.pools else [])]
+        return [PARAMS, *([CELLS] if self.pools else []), *([SEEN] if self.shares else [])]
 
     def forward(self, *observation: Tensor) -> TensorDict | tuple[TensorDict, Tensor]:
         if self.pools and not observation[0].is_floating_point():
             observation = (compact(*observation[:4]), *observation[1:])
-        values = self.network(*observation)
+        if isinstance(self.network, TargetChooser):
+            *values, seen = self.network.look(*observation)
+        else:
+            values, seen = self.network(*observation), None
         lead = observation[0].shape[: values[0].ndim - 2]
         params = TensorDict(dict(zip(self.names, values, strict=True)), batch_size=lead)
-        return (params, observation[0]) if self.pools else params
+        others = [observation[0]] * self.pools + [seen] * self.shares
+        return (params, *others) if others else params
 
 
 def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Module, dict[str, type]]:

@@ -1,7 +1,8 @@
 """Critics: what a robot may look at when its state is valued, and how a team's value is put together.
 
-local: own observation only. team: the observations of all robots, whoever hears whom (training is
-centralised). mixed: local values, mixed to one value of the team.
+local: own observation only. team: the observations of all robots, whoever hears whom (training is centralised).
+With `model.critic_encoder=shared`, what the policy's encoder made of them. mixed: local values, mixed to one value of
+the team.
 """
 
 import torch
@@ -12,6 +13,7 @@ from maexp.agents.networks.actor import (
     ALIVE,
     COMM,
     COVERAGE,
+    SEEN,
     TARGETS,
     TARGETS_MASK,
     TIME_LEFT,
@@ -20,7 +22,7 @@ from maexp.agents.networks.actor import (
 )
 from maexp.agents.networks.encoder import CellEncoder, add_state
 from maexp.agents.networks.mixers import make_mixer
-from maexp.agents.networks.target_chooser import TargetReader
+from maexp.agents.networks.target_chooser import SeenReader, TargetReader
 from maexp.agents.settings.model import ModelConfig, model_config
 
 VALUE = ("agents", "state_value")
@@ -124,8 +126,11 @@ def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: st
     config, team = model_config(model), kind == "team"
     shape = observation_shape(env, config)
     if config.action == "targets":
-        encoder, inputs = TargetReader(config, team), [TARGETS, TARGETS_MASK, COMM, TIME_LEFT, ALIVE]
-        inputs += [COVERAGE] * team
+        if config.critic_encoder == "shared":
+            encoder, inputs = SeenReader(config, team), [SEEN]
+        else:
+            encoder, inputs = TargetReader(config, team), [TARGETS, TARGETS_MASK, COMM]
+        inputs += [TIME_LEFT, ALIVE] + [COVERAGE] * team
     else:
         encoder, inputs = RobotEncoder(config, shape.channels, shape.side, team), observation_keys(config)
     network = Critic(config, encoder, kind, mixer)

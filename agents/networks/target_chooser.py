@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
@@ -17,6 +18,7 @@ from maexp.envs.target_view import FEATURES
 SCORE = FEATURES.index("score")
 OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
 NEVER = -1e9  # logit of what cannot be chosen
+PART = 96  # teams that are learned from together
 COUNT = 10.0  # candidates that sums are measured in
 
 
@@ -89,6 +91,7 @@ class TargetChooser(nn.Module):
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.score_weight = config.score_weight
+        self.shares = config.critic_encoder == "shared"
         self.encoder = TargetEncoder(config)
         self.head = nn.Linear(config.target_width, 1)
         nn.init.zeros_(self.head.weight)
@@ -97,11 +100,25 @@ class TargetChooser(nn.Module):
     def forward(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor]:
         """Logits [*, robots, M] of (features [*, robots, M, F], mask [*, robots, M], comm [*, robots, robots])."""
         lead = comm.shape[:-2]
-        features, mask, comm = (part.reshape(-1, *part.shape[len(lead) :]) for part in (features, mask, comm))
+        logits, _ = self._look(*flatten(features, mask, comm))
+        return (logits.reshape(*lead, *logits.shape[1:]),)
+
+    def look(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
+        """The logits, and every robot as one vector, for critics that share the encoder: [*, robots, 2 * width]."""
+        lead, places = comm.shape[:-2], mask.shape[-1]
+        parts, back = split_teams(*flatten(features, mask, comm))
+        looks = [self._look(*part) for part in parts]
+        logits = torch.cat([F.pad(one, (0, places - one.shape[-1]), value=NEVER) for one, _ in looks])[back]
+        seen = torch.cat([one for _, one in looks])[back]
+        return logits.reshape(*lead, *logits.shape[1:]), seen.reshape(*lead, *seen.shape[1:])
+
+    def _look(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits and robots of teams [batch]."""
         some = first_if_none(mask)
-        targets, _ = self.encoder(features, some, comm)
+        targets, robots = self.encoder(features, some, comm)
         logits = self.score_weight * features[..., SCORE] + OUTPUT_GAIN * self.head(targets).squeeze(-1)
-        return (logits.masked_fill(~some, NEVER).reshape(*lead, *mask.shape[1:]),)
+        seen = torch.cat((add_up(targets, mask), robots), dim=-1) if self.shares else robots
+        return logits.masked_fill(~some, NEVER), seen
 
 
 class TargetReader(nn.Module):
@@ -126,13 +143,63 @@ class TargetReader(nn.Module):
 
     def forward(self, features: Tensor, mask: Tensor, comm: Tensor, *state: Tensor) -> Tensor:
         """`state`: time_left [batch, robots, 1], alive [batch, robots], and for `team` coverage [batch, 1]."""
-        some = first_if_none(mask)
-        targets, robots = self.encoder(features, some, comm | self.team)
-        total = (targets * mask.unsqueeze(-1)).sum(2) / COUNT
-        time_left, alive, *coverage = state
-        parts = [total, robots, time_left, alive.unsqueeze(-1).to(total.dtype)]
-        parts += [one.unsqueeze(1).expand(-1, total.shape[1], -1) for one in coverage]
-        return self.wide(torch.cat(parts, dim=-1))
+        parts, back = split_teams(features, mask, comm | self.team)
+        seen = torch.cat([self._look(*part) for part in parts])[back]
+        return self.wide(with_state(seen, *state))
+
+    def _look(self, features: Tensor, mask: Tensor, comm: Tensor) -> Tensor:
+        """Candidates and robots of teams [batch] as one vector a robot."""
+        targets, robots = self.encoder(features, first_if_none(mask), comm)
+        return torch.cat((add_up(targets, mask), robots), dim=-1)
+
+
+class SeenReader(nn.Module):
+    """Each robot's vector as the policy's encoder made it, with the state: [batch, robots, critic_hidden]."""
+
+    first_rank = 2
+
+    def __init__(self, config: ModelConfig, team: bool):
+        super().__init__()
+        self.wide = nn.Sequential(nn.Linear(2 * config.target_width + 2 + team, config.critic_hidden), nn.ReLU())
+
+    def forward(self, seen: Tensor, time_left: Tensor, alive: Tensor, *coverage: Tensor) -> Tensor:
+        return self.wide(with_state(seen, time_left, alive, *coverage))
+
+
+def with_state(seen: Tensor, time_left: Tensor, alive: Tensor, *coverage: Tensor) -> Tensor:
+    """`seen` [batch, robots, width], followed by what critics are told besides."""
+    parts = [seen, time_left, alive.unsqueeze(-1).to(seen.dtype)]
+    parts += [one.unsqueeze(1).expand(-1, seen.shape[1], -1) for one in coverage]
+    return torch.cat(parts, dim=-1)
+
+
+def flatten(features: Tensor, mask: Tensor, comm: Tensor) -> list[Tensor]:
+    """What a team sees, with one leading dimension."""
+    lead = comm.ndim - 2
+    return [part.reshape(-1, *part.shape[lead:]) for part in (features, mask, comm)]
+
+
+def split_teams(features: Tensor, mask: Tensor, comm: Tensor) -> tuple[list[list[Tensor]], Tensor | slice]:
+    """Teams [batch] that are learned from in parts that fit a core's cache: those with few candidates together, cut to
+    what these have.
+
+    Returns:
+        the parts, and the index that puts what was made of them, one after another, back in order
+    """
+    if len(comm) <= PART or comm.is_cuda or not torch.is_grad_enabled():
+        return [[features, mask, comm]], slice(None)
+    counts, order = (mask.any(1) * torch.arange(1, mask.shape[-1] + 1)).amax(-1).clamp_min(1).sort()
+    most = [*counts[PART - 1 :: PART].tolist(), int(counts[-1])]
+    parts = [
+        [features[rows, :, :count], mask[rows, :, :count], comm[rows]]
+        for rows, count in zip(order.split(PART), most, strict=False)
+    ]
+    return parts, order.argsort()
+
+
+def add_up(targets: Tensor, mask: Tensor) -> Tensor:
+    """The sum of each robot's candidates."""
+    return (mask.unsqueeze(-2).to(targets.dtype) @ targets).squeeze(-2) / COUNT
 
 
 def first_if_none(mask: Tensor) -> Tensor:

@@ -29,6 +29,8 @@ class ModelConfig:
             paper, a policy cannot even copy a planner.
         sees_time: show each cell the share of the episode that is left, and whether its robot has collided.
         critic_hidden: width of the critic's hidden layers.
+        critic_encoder: "own": critics of targets have an encoder of their own, as beside trust regions and for regions
+            anyway. "shared": they read what the policy's encoder made of them, and what they learn trains it too.
     """
 
     action: str = choice("regions", "targets")
@@ -45,6 +47,7 @@ class ModelConfig:
     offsets: str = choice("per_region", "shared")
     sees_time: bool = flag(True)
     critic_hidden: int = whole(64, most=4096)
+    critic_encoder: str = choice("own", "shared")
 
     def __post_init__(self):
         check_ranges(self, "model")
