@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from maexp.envs.config import RadarConfig
 from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
-from maexp.kernels.types import PIXELS
+from maexp.kernels.types import PIXEL_SHARED, PIXELS
 
 CELLS_PER_RANGE = 5
 FRAME_MARGIN = 0.05
@@ -88,6 +88,8 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
     neighbour_count, neighbour = _neighbours(m, free, boundary, boundary_order)
     frame_origin, pixel = _frame(m.extent)
     pixel_of, point_of = _pixels(m, free, boundary, free_order, boundary_order, frame_origin, pixel)
+    is_free = point_of < len(free)
+    shared = is_free & (np.bincount(pixel_of[is_free], minlength=PIXELS**2) > 1)[pixel_of]
     clearance = cKDTree(m.boundary).query(free)[0] if len(boundary) else np.full(len(free), np.inf)
     (x0, y0), (x1, y1) = m.extent
     return {
@@ -103,7 +105,7 @@ def _prepare(m: PointCloudMap, reach: float, radars: list[RadarConfig]) -> dict:
             "occluder_radius": radius[occluder_order],
             "occluder_cell": occluder_cell,
             "pixel_point": point_of[np.argsort(pixel_of, kind="stable")],
-            "point_pixel": pixel_of[np.argsort(point_of, kind="stable")],
+            "point_pixel": np.where(shared, pixel_of + PIXEL_SHARED, pixel_of)[np.argsort(point_of, kind="stable")],
         },
         "scalars": {
             "total_weight": np.int32(total),

@@ -35,6 +35,9 @@ LATER = {"starts": math.inf, "covered_sum": 0}
 EARLIER = {"target": "waypoint", "raw": "unscaled"}
 """What saved states of earlier versions call some arrays."""
 
+PICTURES = (("agents", "observation", "map"), ("team", "map"))
+"""Observations that are pictures."""
+
 
 def _setting(name: str, meaning: str) -> property:
     """A read-only attribute of the env: a field of its `EnvSettings`."""
@@ -155,6 +158,18 @@ class ExplorationEnv(EnvBase):
             blank = -1 if name.startswith("coverage_step") else 0
             info[name] = torch.where(keep, info[name], torch.full_like(info[name], blank))
         return out.update(done)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        """TorchRL's, but pictures of the teams that start anew are copied: its `where` over all takes far longer."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or self.device.type != "cpu" or bool(mask.all()):
+            return super()._reset_proc_data(tensordict, tensordict_reset)
+        rows, merged = mask.reshape(-1).nonzero().squeeze(-1), {}
+        for key in PICTURES if self.observation_config.pictures else ():
+            before, drawn = tensordict.pop(key, None), tensordict_reset.pop(key)
+            # New tensors: the step that has ended keeps its own. Of the teams that go on, `drawn` is black.
+            merged[key] = drawn if before is None else before.index_copy(0, rows, drawn[rows])
+        return super()._reset_proc_data(tensordict, tensordict_reset).update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state, sim = self.simulation.tensors, self.simulation

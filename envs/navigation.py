@@ -15,20 +15,19 @@ import torch
 import warp as wp
 
 from maexp.envs.nav_grid import bank_nav_grids
-from maexp.kernels import targets
-from maexp.kernels.frontier import mark_frontier
-from maexp.kernels.geodesic import STRAIGHT, UNREACHED
+from maexp.envs.simulation import navigation_bytes, refuse_too_many
+from maexp.kernels import goals, outlook, targets
+from maexp.kernels.blocks import FrontierBlocks
+from maexp.kernels.geodesic import STRAIGHT
 from maexp.kernels.known_grid import KnownGrids
-from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.launches import Launch, finish_filling, launch_named, launch_on, record, replay, view
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.tree import _grow_tree
-from maexp.kernels.types import REGIONS
 from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
 
-BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 OPEN_GROUND = 1.2  # places with so many clearances of room around are open: DWA pays nothing for being there
 OPEN_SAMPLES = 7  # places on a way that are looked at
 
@@ -61,10 +60,14 @@ class Navigation:
         size: int32 [E, R, K], frontier cells in the block.
         block: int64 [E, 1, T], the blocks with a target in some row, in order; -1 fills up.
         cell: int64 [E, R, T], the cells to go to for these; -1 = none.
+        point: float32 [E, N, T, 2], where those are [m].
+        way: float32 [E, N, T], how far each robot has to drive there [m], infinite where there is no way.
+        around: float32 [E, N, T], frontier cells in those blocks.
     """
 
     def __init__(self, env: ExplorationEnv):
         sim = env.simulation
+        refuse_too_many(env.settings, navigation_bytes(env.settings, env.bank))
         self.envs: torch.Tensor | None = None
         self._state, self.device = sim.tensors, env.device
         self.num_envs, self.num_robots = env.num_envs, env.num_robots
@@ -73,64 +76,61 @@ class Navigation:
         self.grids, cells = nav
         limited = env.comm_config.limited
         self.rows = self.num_robots if limited else 1
+        names = ("map_id", "active", "collided", "macro_step", "seed", "env_id", "episode")
+        self.arrays = {name: wp.from_torch(self._state[name]) for name in names}
+        self.arrays["center"] = wp.from_torch(self._state["center"], dtype=wp.vec3)
+        self.arrays |= {name: wp.from_torch(sim.map_tensors[name], dtype=wp.vec2) for name in ("lower", "upper")}
         prefix = "known" if limited else "viewers"
-        self.arrays = {
-            name: wp.from_torch(self._state[name], dtype=kind)
-            for name, kind in (
-                ("map_id", wp.int32), ("active", wp.int32), ("collided", wp.int32), ("center", wp.vec3),
-                (f"{prefix}_free", wp.int32), (f"{prefix}_boundary", wp.int32),
-            )
-        }  # fmt: skip
-        self.known_grids = KnownGrids(
-            sim.maps, self.grids, self.arrays["map_id"], self.arrays[f"{prefix}_free"],
-            self.arrays[f"{prefix}_boundary"], self.rows, cells,
-        )  # fmt: skip
+        flags = [wp.from_torch(self._state[f"{prefix}_{points}"]) for points in ("free", "boundary")]
+        self.known_grids = KnownGrids(sim.maps, self.grids, self.arrays["map_id"], *flags, self.rows, cells)
         threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("collision_threshold", "clearance"))
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
-        self.paths = PathSearch(self.passable, mask_of_robot)
+        self.paths = PathSearch(self.passable, mask_of_robot, shared=True)
         room = np.ascontiguousarray((comfort * (OPEN_GROUND / COMFORT))[:, mask_of_robot])
         self.room = wp.array(room, dtype=wp.float32, device=str(env.device))
-        self._size_blocks(env, float(threshold.max()))
+        least = min(r.range for r in env.radar_configs)
+        self.blocks = FrontierBlocks(self.paths, least, float(threshold.max()))
+        self.num_blocks = self.blocks.num_blocks
         self._make_views(cells)
+        self._all = self._listed = torch.arange(self.num_envs, dtype=torch.int32, device=env.device)
+        self._updates = record(self._update, self.known_grids.known.device)
         self._rays: dict[float, list[wp.array]] = {}
         finish_filling(env.device)
-        self.lower, self.upper = sim.map_tensors["lower"], sim.map_tensors["upper"]
         self.radar_range = max(r.range for r in env.radar_configs)
         self.clearance = float(sim.robot_tensors["clearance"].max())
 
-    def _size_blocks(self, env: ExplorationEnv, threshold: float) -> None:
-        cell, width, height = (getattr(self.grids, name).numpy() for name in ("cell", "width", "height"))
-        reach = min(r.range for r in env.radar_configs)
-        block = np.maximum(2, np.round(reach / cell / BLOCKS_PER_RANGE)).astype(np.int32)
-        search = np.ceil(threshold / cell + MARGIN_CELLS).astype(np.int32) + 1
-        self.block_side, self.search = (wp.array(v, dtype=wp.int32, device=str(env.device)) for v in (block, search))
-        self.num_blocks = int((-(-width // block) * -(-height // block)).max())
-        self.tallest, self.finest = int(height.max()), float(cell.min())
-
     def _make_views(self, cells: int) -> None:
         """Outputs as torch tensors that share memory with the kernels' arrays."""
-        e, n, r, k = self.num_envs, self.num_robots, self.rows, self.num_blocks
+        e, n, r, blocks = self.num_envs, self.num_robots, self.rows, self.blocks
         self.cell_size, self.width, self.height = (
             wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width", "height")
         )
         self.origin = wp.to_torch(self.grids.origin)
-        self._known = wp.to_torch(self.known_grids.known).view(e, r, cells)
-        self._frontier = torch.zeros_like(self._known)
+        self._known, self._frontier = (
+            wp.to_torch(one).view(e, r, cells) for one in (self.known_grids.known, blocks.frontier)
+        )
         self._distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
-        self._target = torch.zeros((e, r, k), dtype=torch.int32, device=self.device)
-        self._size = torch.zeros_like(self._target)
-        self._sums = torch.zeros((e, r, k, 2), dtype=torch.int64, device=self.device)
+        self._target, self._size = (wp.to_torch(one).view(e, r, -1) for one in (blocks.target_cell, blocks.size))
+        self._looked, self._count = wp.to_torch(blocks.looked), wp.to_torch(blocks.count)
 
     @contextmanager
     def only(self, envs: torch.Tensor | None) -> Iterator[None]:
         """Look at some envs, int64 [S], and leave what is there of the others as it is; None: at all."""
         self.envs = envs
+        if envs is not None:
+            self._listed = envs.to(torch.int32)
+            self._looked.zero_().index_fill_(0, envs, 1)
         try:
             yield
         finally:
-            self.envs = None
+            self.envs, self._listed = None, self._all
+            self._looked.fill_(1)
+
+    def values(self) -> dict:
+        """Arrays by the names of the kernels' parameters; `env` is int32 [S], the envs looked at."""
+        return self.blocks.values() | self.arrays | {"env": view(self._listed)}
 
     def pick(self, values: torch.Tensor) -> torch.Tensor:
         """What concerns the envs looked at: [E, ...] -> [S, ...]."""
@@ -152,53 +152,28 @@ class Navigation:
 
     def update(self) -> None:
         """Bring everything up to date with the env."""
-        a, grids = self.arrays, self.grids
-        self.known_grids.paint(self.launch)
-        self.passable.paint(self.launch)
-        grid_of_env = self._spread(self.state["map_id"])
-        self.launch(
-            targets._locate_robots, (self.num_envs, self.num_robots),
-            inputs=[grids, wp.from_torch(grid_of_env), a["active"], a["collided"], a["center"],
-                    self.passable.passable, self.paths.row_of_item],
-            outputs=[self.paths.search.sources, self.paths.search.stop],
-        )  # fmt: skip
-        self.paths.flood(self.launch)
-        self._place_targets(wp.from_torch(grid_of_env.repeat_interleave(self.rows)))
-        self._list_targets()
+        replay(self._updates)
+        looks, most = len(self._listed), max(int(self.pick(self._count).max()), 1)
+        shape, device = (looks, self.num_robots, most), self.device
+        self.block = torch.empty((looks, 1, most), dtype=torch.int64, device=device)
+        self.cell = torch.empty((looks, self.rows, most), dtype=torch.int64, device=device)
+        self.point, self.way = torch.empty((*shape, 2), device=device), torch.empty(shape, device=device)
+        self.around = torch.empty(shape, device=device)
+        values = self.values() | {"point": view(self.point, wp.vec2)} | {
+            name: view(getattr(self, name)) for name in ("block", "cell", "way", "around")
+        }  # fmt: skip
+        launch_named(self.launch, targets._list_targets, (looks, most), "block cell point way around", values)
 
-    def _place_targets(self, rows: wp.array) -> None:
-        """Frontier cells, and the targets that they are gathered in; ``rows`` int32 [E * R], the map of each, -1: leave
-        it as it is."""
-        grids = self.grids
-        frontier = wp.from_torch(self._frontier.flatten(0, 1))
-        mark_frontier(
-            self.known_grids.known, rows, grids.width, grids.height, frontier, self.tallest, self.launch
-        )  # fmt: skip
-        for counted in (self._size, self._sums):
-            counted[slice(None) if self.envs is None else self.envs] = 0
-        size, sums, target = (wp.from_torch(one.flatten(0, 1)) for one in (self._size, self._sums, self._target))
-        self.launch(
-            targets._sum_frontier, (rows.shape[0], self.tallest),
-            inputs=[grids, rows, self.block_side, frontier], outputs=[size, sums],
-        )  # fmt: skip
-        self.launch(
-            targets._place_targets, tuple(target.shape),
-            inputs=[grids, rows, self.block_side, self.search, size, sums, self.paths.search.distance, self.rows,
-                    self.num_robots],
-            outputs=[target],
-        )  # fmt: skip
-
-    def _list_targets(self) -> None:
-        """The blocks where some row has a target, env by env (of some 4,000 blocks a hundred have)."""
-        target = self.pick(self._target)
-        env, block = (target >= 0).any(1).nonzero(as_tuple=True)
-        count = torch.bincount(env, minlength=len(target))
-        slot = torch.arange(len(env), device=self.device) - (count.cumsum(0) - count)[env]
-        most = max(int(count.max()), 1)
-        self.block = torch.full((len(target), 1, most), -1, device=self.device)
-        self.block[env, 0, slot] = block
-        cell = target.gather(2, self.block.clamp_min(0).expand(-1, self.rows, -1)).long()
-        self.cell = torch.where(self.block >= 0, cell, -1)
+    def _update(self, launch: Launch) -> None:
+        """The launches of `update` that are always the same."""
+        self.known_grids.paint(launch)
+        self.passable.paint(launch)
+        self.blocks.mark(launch)
+        launch_named(
+            launch, targets._locate_robots, self.paths.shape, "sources stop", self.values()
+        )
+        self.paths.flood(launch)
+        self.blocks.place(launch)
 
     @property
     def state(self) -> dict[str, torch.Tensor] | Rows:
@@ -243,7 +218,7 @@ class Navigation:
         area = torch.empty(start.shape, device=self.device)
         middle = torch.empty((*start.shape, 2), device=self.device)
         self.launch(
-            targets._look_around, tuple(area.shape),
+            outlook._look_around, tuple(area.shape),
             inputs=[self.grids, self.known_grids.grid_of_row, grid, wp.from_torch(start),
                     *self._spread_rays(radius), float(radius)],
             outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
@@ -251,14 +226,30 @@ class Navigation:
         shape = (self.num_envs, self.rows, -1)
         return self.pick(area.view(shape)), self.pick(middle.view(*shape, 2))
 
+    def look_from_targets(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """`look_around` as far as the radar reaches from the targets of `cell`: float32 [E, R, T] and [E, R, T, 2].
+
+        What still holds since the last time is not computed again.
+        """
+        area = torch.empty(self.cell.shape, device=self.device)
+        middle = torch.empty((*self.cell.shape, 2), device=self.device)
+        radius = float(self.radar_range)
+        ray_cell, ray_part = self._spread_rays(radius)
+        values = self.values() | {
+            "radius": radius, "block": view(self.block), "cell": view(self.cell),
+            "ray_cell": ray_cell, "ray_part": ray_part, "area": view(area), "middle": view(middle, wp.vec2),
+        }  # fmt: skip
+        writes = "looked_from kept_area kept_middle looked_at area middle"
+        launch_named(self.launch, outlook._look_from_targets, tuple(self.cell.shape), writes, values)
+        return area, middle
+
     def _spread_rays(self, radius: float) -> list[wp.array]:
-        """Cells of the rays of a radius [m], computed once, and their directions."""
+        """The rays of a radius [m], computed once: their cells and what those count."""
         if radius not in self._rays:
-            steps, device = int(radius / self.finest) + 2, str(self.device)
-            rays = [wp.zeros((targets.RAYS, steps), dtype=wp.vec2i, device=device)]
-            rays.append(wp.zeros(targets.RAYS, dtype=wp.vec2, device=device))
-            finish_filling(device)
-            self.launch(targets._spread_rays, (targets.RAYS, steps), inputs=[], outputs=rays)
+            shape = (outlook.RAYS, int(radius / float(self.cell_size.min())) + 2)
+            rays = [wp.zeros(shape, dtype=kind, device=str(self.device)) for kind in (wp.vec2i, wp.vec3)]
+            finish_filling(self.device)
+            self.launch(outlook._spread_rays, shape, inputs=[], outputs=rays)
             self._rays[radius] = rays
         return self._rays[radius]
 
@@ -273,11 +264,11 @@ class Navigation:
         found = torch.zeros_like(self._target).flatten(0, 1)
         items = self.num_envs * self.num_robots
         node = torch.empty((items, samples, 2), device=self.device)
-        state = [wp.from_torch(self.state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
+        state = [self.arrays[name] for name in ("seed", "env_id", "episode", "macro_step")]
         cells = branch / float(self.cell_size.max())
         self.launch(
             _grow_tree, items,
-            inputs=[self.grids, self.arrays["map_id"], self.block_side, *state, self.known_grids.known,
+            inputs=[self.grids, self.arrays["map_id"], self.blocks.block, *state, self.known_grids.known,
                     self.paths.search.sources, self.rows, self.num_robots, samples, cells],
             outputs=[wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
         )  # fmt: skip
@@ -290,16 +281,6 @@ class Navigation:
     def centers(self) -> torch.Tensor:
         """Centres of the bodies [m]: float32 [E, N, 2]."""
         return self.state["center"][..., :2]
-
-    def travel(self, cells: torch.Tensor | None = None) -> torch.Tensor:
-        """Way from every robot to every target [m]: float32 [E, N, K], infinite where there is none.
-
-        ``cells``, int64 [E, R, M], asks for other places (-1 = none): float32 [E, N, M].
-        """
-        cells = (self.target if cells is None else cells).expand(-1, self.num_robots, -1)
-        way = self.distance.gather(2, cells.clamp_min(0))
-        metres = way * (self.cell_of_env() / STRAIGHT).view(-1, 1, 1)
-        return torch.where((cells >= 0) & (way < UNREACHED), metres, torch.inf)
 
     def cell_of_env(self) -> torch.Tensor:
         """Edge of a cell of each env's grid [m]: float32 [E]."""
@@ -372,19 +353,35 @@ class Navigation:
         found = torch.empty(index.shape[:2], dtype=torch.bool, device=self.device)
         self.launch(
             targets._find_open_ground, tuple(found.shape),
-            inputs=[self.grids, self.arrays["map_id"], self.known_grids.known, self.rows,
+            inputs=[self.grids, self.arrays["map_id"], self.known_grids.known, self.known_grids.walls, self.rows,
                     wp.from_torch(index.to(torch.int32).contiguous()), self.room],
             outputs=[wp.from_torch(found)],
         )  # fmt: skip
         return found
 
+    def aim(self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
+        """Where robots go that have chosen targets, or anywhere, float32 [E, N, 2] [m].
+
+        Args:
+            chosen: int64 [E, N]; -1 = none.
+            cell: int64 [E, N], where that is; -1 afterwards where there is none.
+            toward: float32 [E, N, 2]; 0 afterwards where there is none.
+        """
+        target = torch.empty_like(toward)
+        values = self.values() | {
+            "chosen": view(chosen), "cell": view(cell), "toward": view(toward, wp.vec2),
+            "target": view(target, wp.vec2),
+        }  # fmt: skip
+        launch_named(self.launch, goals._aim, tuple(chosen.shape), "cell toward target", values)
+        return target
+
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
-        m = self.state["map_id"].long()
-        lower, side = self.lower[m].unsqueeze(1), (self.upper[m] - self.lower[m]).unsqueeze(1)
-        count = REGIONS
-        share = (points - lower) / side.clamp_min(1e-9) * count
-        index = share.floor().clamp(0, count - 1)
-        offset = ((share - index) * 2.0 - 1.0).clamp(-1.0, 1.0)
-        index = index.long()
-        return index[..., 0] * count + index[..., 1], offset
+        points = points.float().contiguous()
+        region = torch.empty(points.shape[:2], dtype=torch.int64, device=points.device)
+        offset = torch.empty_like(points)
+        values = self.arrays | {
+            "point": view(points, wp.vec2), "region": view(region), "offset": view(offset, wp.vec2),
+        }  # fmt: skip
+        launch_named(self.launch, goals._to_action, tuple(region.shape), "region offset", values)
+        return region, offset

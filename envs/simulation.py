@@ -3,12 +3,14 @@
 import math
 import os
 
+import numpy as np
 import torch
 
 from maexp.envs.bank import MapBank
 from maexp.envs.config import TIME_ON
 from maexp.envs.nav_grid import bank_nav_grids, grid_shape
 from maexp.envs.settings import EnvSettings
+from maexp.kernels.blocks import block_memory_per_env, block_sides
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
@@ -133,18 +135,36 @@ def body_pixels(length: float, width: float) -> int:
 
 
 def bytes_per_env(settings: EnvSettings, bank: MapBank) -> int:
-    """What one env of the simulation takes on its device: state, scratch, and the grids of the `wavefront` planner."""
+    """What one env takes on its device: state, scratch, grids of the `wavefront` planner and of targets it shows."""
     total = sum(memory_per_env(sizes(settings, bank)).values())
     if settings.planner.name == "wavefront":
-        limited, robots = settings.comm.limited, settings.num_robots
-        shapes = [grid_shape(one) for one in bank.maps]
-        cells = max(width * height for width, height in shapes)
-        masks = robots if limited else len({one.collision_threshold for one in settings.robots})
-        total += grid_memory_per_env(
-            cells, robots, robots if limited else 1, masks, bank.max_free + bank.max_boundary,
-            max(-(-width // 32) * height for width, height in shapes), news_capacity(cells),
-        )  # fmt: skip
-    return total
+        total += grid_memory_per_env(**grid_sizes(settings, bank))
+    return total + (navigation_bytes(settings, bank) if settings.observation.targets else 0)
+
+
+def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
+    """What `grid_memory_per_env` counts with."""
+    limited, robots = settings.comm.limited, settings.num_robots
+    shapes = [grid_shape(one) for one in bank.maps]
+    cells = max(width * height for width, height in shapes)
+    return {
+        "cells": cells, "robots": robots, "known_rows": robots if limited else 1,
+        "masks": robots if limited else len({one.collision_threshold for one in settings.robots}),
+        "points": bank.max_free + bank.max_boundary, "news": news_capacity(cells),
+        "wall_words": max(-(-width // 32) * height for width, height in shapes),
+    }  # fmt: skip
+
+
+def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
+    """What a `Navigation` and the targets that it finds keep of one env."""
+    grids, reach = grid_sizes(settings, bank), min(one.range for one in settings.radars)
+    blocks = 0
+    for one in bank.maps:
+        side = int(block_sides(np.float32(one.resolution), reach))
+        blocks = max(blocks, math.prod(-(-cells // side) for cells in grid_shape(one)))
+    kept = block_memory_per_env(grids["cells"], grids["known_rows"], grids["wall_words"], blocks)
+    in_vain = 4 * grids["robots"] * blocks  # decisions in vain of every robot (`TargetTracker`)
+    return grid_memory_per_env(**grids, shared=settings.device.type == "cpu") + kept + in_vain
 
 
 def check_memory(settings: EnvSettings, bank: MapBank) -> None:
@@ -155,16 +175,24 @@ def check_memory(settings: EnvSettings, bank: MapBank) -> None:
     """
     # One observation and the next, and the two bounds that TorchRL's spec keeps as tensors.
     channels = (PICTURE_CHANNELS * settings.num_robots + TEAM_CHANNELS) * settings.observation.pictures
-    per_env = bytes_per_env(settings, bank) + 4 * channels * PIXELS**2
-    if settings.device.type == "cuda":
-        free = torch.cuda.mem_get_info(settings.device)[0]
-    else:
-        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        if os.path.exists("/proc/meminfo"):  # pages the kernel would give back count as available
-            with open("/proc/meminfo") as file:
-                for line in file:
-                    if line.startswith("MemAvailable:"):
-                        free = int(line.split()[1]) * 1024
+    refuse_too_many(settings, bytes_per_env(settings, bank) + 4 * channels * PIXELS**2)
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that can still be had on a device."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    if os.path.exists("/proc/meminfo"):  # pages the kernel would give back count as available
+        with open("/proc/meminfo") as file:
+            for line in file:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def refuse_too_many(settings: EnvSettings, per_env: int) -> None:
+    """Raise ValueError if what is about to be allocated, bytes for each env, is more than there is."""
+    free = free_memory(settings.device)
     if per_env * settings.num_envs > free:
         most = int(free / per_env)
         lower = f"lower num_envs to {most}" if most else "lower num_robots or use a smaller map"

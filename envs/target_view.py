@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, plan_in_turn, value_targets
+from maexp.kernels.teamwork import compare_with_others, gather_gain
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
@@ -87,7 +88,7 @@ class TargetView:
 
     def _look(self) -> dict[str, torch.Tensor]:
         """`observe` of the envs that `Navigation.only` leaves."""
-        scene = self.tracker.look(compact=True)
+        scene = self.tracker.look()
         nav = scene.nav
         s = {name: nav.pick(value) for name, value in self.state.items()}
         s["has_last"] = s["has_last"] & (nav.state["macro_step"] != 0).unsqueeze(-1)
@@ -101,7 +102,7 @@ class TargetView:
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
         travel = torch.where(some, scene.travel.gather(2, best), 0.0) / nav.radar_range
         near = _Near(self, s, scene, best, some, travel)
-        columns = near.plan() | near.way() | near.worth() | near.bearings() | near.others() | near.team()
+        columns = near.plan() | near.way() | near.worth() | near.bearings() | near.team()
         features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
         return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": some.clone()}
 
@@ -134,7 +135,7 @@ class TargetView:
         """Go on where `state_dict` was taken."""
         for prefix, part in (("target_view", self.state), ("target", self.tracker.state)):
             for name in part:
-                part[name] = state[f"{prefix}_{name}"].to(part[name].device).clone()
+                part[name] = state[f"{prefix}_{name}"].to(part[name]).clone()
         self.tracker.nav.update()  # plain DWA drives along the ways that were found when the robots last looked
 
 
@@ -153,26 +154,20 @@ class _Near:
         self.to = self.point - nav.centers().unsqueeze(2)
         self.distance = self.to.norm(dim=-1) / self.reach
         self.gain = scene.gain.gather(2, best)
-        robots = best.shape[1]
-        own = torch.eye(robots, dtype=torch.bool, device=best.device)
-        self.own = own.view(1, robots, 1, robots)
-        self.mate = (nav.state["comm"] & ~own).unsqueeze(2)  # [E, N, 1, N]: robots that this one hears
 
     def plan(self) -> dict[str, torch.Tensor]:
         """What the classical planner would do, each robot hearing only those it hears."""
-        some = self.some
+        some, hears = self.some, self.nav.state["comm"]
         value = value_targets(self.scene).gather(2, self.best)
         open_value = torch.where(some, value, -torch.inf)
-        score, taken, claimed = plan_in_turn(self.gain, open_value, self.point / self.reach, self.nav.state["comm"])
+        score, taken, claimed = plan_in_turn(self.gain, open_value, self.point / self.reach, hears)
         where = _pick(self.point, taken.unsqueeze(-1)).squeeze(2)
-        counts = self.mate & some.any(-1).view(len(some), 1, 1, -1)
         return {
             "score": score,
             "value": value.clamp_min(-FAR),
             "planned": torch.zeros_like(score).scatter_(2, taken.unsqueeze(-1), 1.0),
             "claimed": claimed,
-            "plan_gap": self._nearest_of(where, counts),
-        }
+        } | self._others(where)
 
     def way(self) -> dict[str, torch.Tensor]:
         return {
@@ -183,14 +178,14 @@ class _Near:
         }
 
     def worth(self) -> dict[str, torch.Tensor]:
-        gain = torch.where(self.some, self.gain, 0.0).unsqueeze(2)
-        gap = (self.point.unsqueeze(3) - self.point.unsqueeze(2)).norm(dim=-1) / self.reach
+        gain = torch.where(self.some, self.gain, 0.0)
+        near, around = gather_gain(self.point, gain, self.reach, 1.0, 2.5)
         return {
             "gain": self.gain,
             "size": self.scene.size.gather(2, self.best) / 10.0,
             "worth": (self.gain >= LEAST_GAIN).float(),
-            "gain_near": ((gap < 1.0) * gain).sum(-1),
-            "gain_around": ((gap < 2.5) * gain).sum(-1) / 4.0,
+            "gain_near": near,
+            "gain_around": around / 4.0,
         }
 
     def bearings(self) -> dict[str, torch.Tensor]:
@@ -206,25 +201,27 @@ class _Near:
             columns[f"{name}aside"] = unit[..., 1] * ahead[..., 0] - unit[..., 0] * ahead[..., 1]
         return columns
 
-    def others(self) -> dict[str, torch.Tensor]:
+    def _others(self, where: torch.Tensor) -> dict[str, torch.Tensor]:
+        """``where``, float32 [E, N, 2]: where the robots would go [m]."""
         scene, s = self.scene, self.state
-        envs, robots, count = self.best.shape
-        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.travel(scene.nav.cell) / self.reach, torch.inf)
-        theirs = ways.unsqueeze(1).expand(-1, robots, -1, -1)
-        theirs = theirs.gather(3, self.best.unsqueeze(2).expand(-1, -1, robots, -1)).transpose(2, 3)
-        rival = theirs.masked_fill(~self.mate, torch.inf).amin(-1)
-        last = s["has_last"].view(envs, 1, 1, robots)
+        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.way / self.reach, torch.inf)
+        plans, last = (where, self.some.any(-1)), (s["last"], s["has_last"])
+        rival, *gaps = compare_with_others(self.point, self.best, ways, self.nav.state["comm"], plans, last)
+        plan_gap, own_last, mates_last = ((gap / self.reach).clamp(max=FAR) for gap in gaps)
         return {
             "rival": rival.clamp(max=2 * FAR),
             "lead": (rival - self.travel).clamp(-FAR, FAR),
             "nearest": (self.travel <= rival).float(),
-            "own_last": self._nearest_of(s["last"], self.own & last),
-            "mates_last": self._nearest_of(s["last"], self.mate & last),
+            "plan_gap": plan_gap,
+            "own_last": own_last,
+            "mates_last": mates_last,
         }
 
     def team(self) -> dict[str, torch.Tensor]:
         nav, env, tracker = self.nav, self.view.env, self.view.tracker
         speed, limit = tracker.speed(), nav.pick(env.simulation.robot_tensors["max_speed"])
+        own = torch.eye(self.best.shape[1], dtype=torch.bool, device=self.best.device)
+        mates = nav.state["comm"] & ~own & self.scene.alive.unsqueeze(1)
         cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
         columns = {
             "count": self.some.sum(-1) / 10.0,
@@ -232,14 +229,9 @@ class _Near:
             "drive": tracker.drive(speed) / self.reach,
             "time_left": (1.0 - nav.state["macro_step"].float() / env.macro_steps).unsqueeze(-1),
             "known": (1.0 + cells / (math.pi * self.reach**2)).log(),
-            "mates": (self.mate.squeeze(2) & self.scene.alive.unsqueeze(1)).sum(-1) / 4.0,
+            "mates": mates.sum(-1) / 4.0,
         }
         return {name: value.unsqueeze(-1).float() for name, value in columns.items()}
-
-    def _nearest_of(self, where: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
-        """Distance [ranges], at most `FAR`, from every candidate to the nearest of ``where`` [E, N, 2] that counts."""
-        gap = (self.point.unsqueeze(3) - where.view(len(where), 1, 1, -1, 2)).norm(dim=-1) / self.reach
-        return gap.masked_fill(~counts, FAR).amin(-1).clamp(max=FAR)
 
 
 def _best(value: torch.Tensor, count: int) -> torch.Tensor:

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
+import warp as wp
 
 from maexp.envs.navigation import Navigation
+from maexp.kernels import goals, targets
+from maexp.kernels.launches import launch_named, launch_on, view
+from maexp.kernels.teamwork import choose_in_turn
 from maexp.kernels.types import DT
 
 if TYPE_CHECKING:
@@ -76,16 +80,14 @@ def value_targets(scene: Scene) -> torch.Tensor:
 
     Unknown area against the way there (Burgard et al. 2005).
     """
-    return torch.where(
-        scene.travel.isfinite(), scene.gain - BETA * scene.travel / scene.nav.radar_range, -torch.inf
-    )
+    return scene.gain - BETA * scene.travel / scene.nav.radar_range
 
 
 def plan_in_turn(
     gain: torch.Tensor, value: torch.Tensor, point: torch.Tensor, hears: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Robots choose one after the other, the one with the most to win first; a target taken lowers the gain of others
-    that can be seen from there (Burgard et al. 2005). One round per robot, all envs together.
+    that can be seen from there (Burgard et al. 2005).
 
     Args:
         gain: float32 [E, N, M], what is to be seen from a candidate.
@@ -97,26 +99,7 @@ def plan_in_turn(
         each candidate's value when it is its robot's turn, float32 [E, N, M]; the candidate taken, int64 [E, N] (0 for
         robots without any); the share of the gain that was claimed before, float32 [E, N, M].
     """
-    env = torch.arange(len(gain), device=gain.device)
-    taken = torch.zeros(gain.shape[:2], dtype=torch.int64, device=gain.device)
-    score, claimed, left = torch.zeros_like(gain), torch.zeros_like(gain), torch.ones_like(gain)
-    some = value > -torch.inf
-    waiting = some.any(-1)
-    rest = torch.where(some, value, 0.0) - gain
-    for _ in range(gain.shape[1]):
-        value = gain * left + rest
-        best, index = torch.where(some, value, -torch.inf).max(-1)
-        robot = torch.where(waiting, best, -torch.inf).argmax(1)
-        acts = waiting[env, robot]
-        k = index[env, robot]
-        score[env, robot] = torch.where(acts.unsqueeze(-1), value[env, robot], score[env, robot])
-        claimed[env, robot] = torch.where(acts.unsqueeze(-1), 1.0 - left[env, robot], claimed[env, robot])
-        taken[env, robot] = torch.where(acts, k, taken[env, robot])
-        waiting[env, robot] = False
-        gap = (point - point[env, robot, k].view(-1, 1, 1, 2)).norm(dim=-1)
-        told = (acts.unsqueeze(-1) & hears[env, :, robot]).unsqueeze(-1)
-        left = torch.where(told, left * gap.clamp(max=1.0), left)
-    return score, taken, claimed
+    return choose_in_turn(gain, value, point, hears)
 
 
 class TargetTracker:
@@ -133,6 +116,7 @@ class TargetTracker:
     def __init__(self, env: ExplorationEnv):
         self.env, self.nav = env, Navigation(env)
         self.seconds = DT * env.local_steps
+        self.disc = torch.pi * (self.nav.radar_range / self.nav.cell_size) ** 2  # cells in it, on each map
         shape, device = (env.num_envs, env.num_robots), env.device
         self.state = {
             "dwell": torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=device),
@@ -141,39 +125,31 @@ class TargetTracker:
             "counted": torch.full((env.num_envs,), -1, dtype=torch.int32, device=device),
         }
 
-    def look(self, compact: bool = False) -> Scene:
-        """Bring everything up to date with the env, and give up what led nowhere (once a macro step).
-
-        Args:
-            compact: list the targets that there are (`Scene.block`), not one for every block of frontier cells.
-        """
+    def look(self) -> Scene:
+        """Bring everything up to date with the env, and give up what led nowhere (once a macro step)."""
         nav, robots = self.nav, self.env.num_robots
         nav.update()
-        cells = nav.cell if compact else nav.target
-        block = nav.block.clamp_min(0).expand(-1, robots, -1) if compact else None
-        points = nav.points(cells.clamp_min(0)).expand(-1, robots, -1, -1)
-        travel = self._give_up(nav.travel(cells), points, block)
-        gain, middle = self.outlook(cells if compact else None)
-        size = nav.size.expand(-1, robots, -1)
+        area, middle = nav.look_from_targets()
         return Scene(
-            travel=travel,
-            points=points,
-            size=(size.gather(2, block) if compact else size).float(),
-            gain=gain,
-            middle=middle,
+            travel=self._give_up(nav.way, nav.point, nav.block),
+            points=nav.point,
+            size=nav.around,
+            gain=self._share(area),
+            middle=middle.expand(-1, robots, -1, -1),
             alive=nav.alive(),
             nav=nav,
-            block=block,
+            block=nav.block.clamp_min(0).expand(-1, robots, -1),
         )
 
-    def outlook(
-        self, cells: torch.Tensor | None = None, known: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """`Scene.gain` and `Scene.middle`; arguments as in `Navigation.look_around`."""
-        nav, robots = self.nav, self.env.num_robots
-        disc = torch.pi * (nav.radar_range / nav.cell_of_env()) ** 2
-        area, middle = nav.look_around(nav.radar_range, cells, known)
-        return (area / disc.view(-1, 1, 1)).expand(-1, robots, -1), middle.expand(-1, robots, -1, -1)
+    def outlook(self, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """`Scene.gain` and `Scene.middle` if ``known``, as in `Navigation.look_around`, were what is known."""
+        area, middle = self.nav.look_around(self.nav.radar_range, self.nav.cell, known)
+        return self._share(area), middle.expand(-1, self.env.num_robots, -1, -1)
+
+    def _share(self, area: torch.Tensor) -> torch.Tensor:
+        """Unknown cells, [E, R, T], as a share of the radar's disc, for every robot: [E, N, T]."""
+        disc = self.disc[self.nav.state["map_id"]].view(-1, 1, 1)
+        return (area / disc).expand(-1, self.env.num_robots, -1)
 
     def take(
         self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor
@@ -188,11 +164,10 @@ class TargetTracker:
         Returns:
             region int64 [E, N] and offset float32 [E, N, 2].
         """
-        nav, found = self.nav, chosen >= 0
+        chosen, cell, toward = chosen.long().contiguous(), cell.long().clone(), toward.float().clone()
         self.state["chosen"] = chosen.unsqueeze(-1).clone()
-        cell = torch.where(found, cell, -1)
-        target = torch.where(found.unsqueeze(-1), nav.points(cell.clamp_min(0)), self._roam())
-        return nav.to_action(self._approach(cell, target, torch.where(found.unsqueeze(-1), toward, 0.0)))
+        target = self.nav.aim(chosen, cell, toward)
+        return self.nav.to_action(self._approach(cell, target, toward))
 
     def drive(self, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
@@ -227,58 +202,36 @@ class TargetTracker:
         far = torch.where(at_target.unsqueeze(-1), beyond, far)
         return torch.where(is_open.unsqueeze(-1), far, near)
 
-    def _give_up(
-        self, travel: torch.Tensor, points: torch.Tensor, block: torch.Tensor | None = None
-    ) -> torch.Tensor:
+    def _give_up(self, way: torch.Tensor, point: torch.Tensor, block: torch.Tensor) -> torch.Tensor:
         """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
-        each robot those that it got stuck on the way to. ``block`` as in `Scene`."""
-        nav = self.nav
-        s = {name: nav.pick(value) for name, value in self.state.items()}
-        step = nav.state["macro_step"]
-        begun, due = step == 0, step != s["counted"]
-        s["dwell"][begun], s["chosen"][begun] = 0, -1
-        due = (due | begun).view(-1, 1, 1)
-        near = torch.clamp(1.5 * nav.cell_of_env(), min=nav.clearance).view(-1, 1, 1)
-        beside = travel.isfinite() & ((points - nav.centers().unsqueeze(2)).norm(dim=-1) <= near) & due
-        beside = beside.any(1, keepdim=True).expand_as(beside) if nav.rows == 1 else beside
-        if block is None:
-            s["dwell"] += beside
-        else:
-            s["dwell"].scatter_add_(2, block, beside.to(torch.int32))
-        stuck = (nav.centers() - s["stood"]).norm(dim=-1, keepdim=True) < STUCK * nav.clearance
-        stuck = stuck & (s["chosen"] >= 0) & nav.alive().unsqueeze(-1) & due
-        s["dwell"].scatter_add_(2, s["chosen"].clamp_min(0), stuck.to(torch.int32))
-        s["stood"] = torch.where(due, nav.centers(), s["stood"])
-        s["counted"] = step.clone()
-        dwell = s["dwell"] if block is None else s["dwell"].gather(2, block)
-        kept = travel.masked_fill(dwell >= DWELL, torch.inf)
-        # Nothing else left: try them all once more.
-        again = ~kept.isfinite().flatten(1).any(1)
-        s["dwell"][again] = 0
-        self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
-        return torch.where(again.view(-1, 1, 1), travel, kept)
+        each robot those that it got stuck on the way to; if nothing else is left, try them all once more.
 
-    def _roam(self) -> torch.Tensor:
-        """Where robots without a target go [m]: anywhere, [E, N, 2]."""
-        m = self.nav.state["map_id"].long()
-        lower, upper = self.nav.lower[m].unsqueeze(1), self.nav.upper[m].unsqueeze(1)
-        return lower + keyed_uniform(self.env, 2) * (upper - lower)
+        Args:
+            way, point: as `Navigation.way` and `point`.
+            block: int64 [E, 1, T], the blocks they stand for; -1 = none.
+
+        Returns:
+            float32 [E, N, T], `way`, infinite for targets given up.
+        """
+        nav, s = self.nav, self.state
+        left, kept = torch.zeros(len(way), dtype=torch.int32, device=way.device), torch.empty_like(way)
+        values = nav.values() | {name: view(one) for name, one in s.items() if name != "stood"} | {
+            "stood": view(s["stood"], wp.vec2), "block": view(block), "way": view(way), "kept": view(kept),
+            "point": view(point, wp.vec2), "left": view(left), "clearance": nav.clearance,
+            "least": STUCK * nav.clearance, "shared": int(nav.rows == 1), "most": DWELL,
+        }  # fmt: skip
+        robots, slots = (len(way), way.shape[1]), (len(way), way.shape[2])
+        launch_named(nav.launch, targets._note_stuck, robots, "chosen stood dwell", values)
+        launch_named(nav.launch, targets._count_visits, slots, "dwell", values)
+        launch_named(nav.launch, targets._drop_targets, robots, "kept left counted", values)
+        launch_named(nav.launch, targets._try_again, robots, "kept dwell", values)
+        return kept
 
 
 def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
-    """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone: no generator's
-    state, and the same for env i in any batch."""
+    """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone (`kernels.goals`)."""
     state = env.simulation.tensors
-    robots = torch.arange(env.num_robots * count, device=env.device).view(1, env.num_robots, count)
-    key = torch.zeros((env.num_envs, 1, 1), dtype=torch.int64, device=env.device)
-    for part in (*(state[name].view(-1, 1, 1) for name in ("seed", "env_id", "episode", "macro_step")), robots):
-        key = _mix(key + part)
-    return ((key >> 40) & 0xFFFFFF).float() / float(1 << 24)
-
-
-def _mix(x: torch.Tensor) -> torch.Tensor:
-    """Finaliser of splitmix64 (Steele et al. 2014) on int64, which wraps as uint64 does."""
-    x = x + (0x9E3779B97F4A7C15 - (1 << 64))
-    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * (0xBF58476D1CE4E5B9 - (1 << 64))
-    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * (0x94D049BB133111EB - (1 << 64))
-    return x ^ ((x >> 31) & ((1 << 33) - 1))
+    draw = torch.empty((env.num_envs, env.num_robots, count), device=env.device)
+    keys = [view(state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
+    launch_on(env.device)(goals._draw_uniform, tuple(draw.shape), keys, [view(draw)])
+    return draw

@@ -163,9 +163,10 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     known = torch.zeros_like(flags)
     active = torch.ones(seen.shape[0], dtype=torch.int32, device=seen.device)
     words, told = wp.from_torch(flags), wp.from_torch(torch.zeros_like(flags))
+    lanes = lanes_on(words.device, 1024)
     values = {"active": wp.from_torch(active), "hears": wp.from_torch(hears), "seen": words, "told": told}
-    values["known"] = wp.from_torch(known)
-    launch_named(launch_on(words.device), merge._share_points, (seen.shape[0], seen.shape[2]), "known", values)
+    values |= {"known": wp.from_torch(known), "lanes": lanes}
+    launch_named(launch_on(words.device), merge._share_points, (seen.shape[0], lanes), "known told", values)
     return unpack_flags(known, robots)
 
 

@@ -8,8 +8,9 @@ import torch
 import warp as wp
 
 from maexp.kernels.launches import launch_on
+from maexp.kernels.startup import MODULE_OPTIONS
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 FORBIDDEN = 1 << 24  # cost of a pair that cannot be; the sums of 40 robots still fit in int32
 

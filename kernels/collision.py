@@ -6,12 +6,13 @@ import warp as wp
 
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
 from maexp.kernels.launches import Launch
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.func

@@ -6,9 +6,10 @@ Every pair of an acceleration and a turn is rolled out for a few local steps and
 import torch
 import warp as wp
 
-from maexp.kernels.dynamics import curvature, heading_change
+from maexp.kernels.dynamics import curvature, heading_change, turn_limit
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
 from maexp.kernels.launches import launch_on
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.state import robots_struct
 from maexp.kernels.types import (
     ERROR_CAPACITY,
@@ -25,7 +26,7 @@ from maexp.kernels.types import (
     within,
 )
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 FAR = 1.0e30
 NEAREST = 1.0e-6  # distances below count as this [m], so that the logarithm stays finite
@@ -37,14 +38,6 @@ def spread(k: int, count: int, limit: float) -> float:
     if count > 1:
         return -limit + 2.0 * limit * float(k) / float(count - 1)
     return 0.0
-
-
-@wp.func
-def turn_limit(robots: Robots, e: int, i: int) -> float:
-    """Largest value of a robot's second control."""
-    if robots.kind[e, i] == OMNIDIRECTIONAL:
-        return robots.max_accel[e, i]
-    return robots.max_turn[e, i]
 
 
 @wp.kernel

@@ -9,18 +9,27 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, PI, Robots
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PI, Robots
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.func
 def wrap_angle(theta: float) -> float:
     """Angle in [-pi, pi)."""
     return theta - 2.0 * PI * wp.floor((theta + PI) / (2.0 * PI))
+
+
+@wp.func
+def turn_limit(robots: Robots, e: int, i: int) -> float:
+    """Largest value of a robot's second control."""
+    if robots.kind[e, i] == OMNIDIRECTIONAL:
+        return robots.max_accel[e, i]
+    return robots.max_turn[e, i]
 
 
 @wp.func

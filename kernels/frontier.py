@@ -10,13 +10,35 @@ import torch
 import warp as wp
 
 from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.startup import MODULE_OPTIONS
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 UNKNOWN = 0
 FREE = 1
 OBSTACLE = 2
 
+
+
+@wp.func
+def is_frontier(known: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int) -> wp.uint8:
+    """1 for a frontier cell, else 0."""
+    cell = y * w + x
+    found = wp.uint8(0)
+    if known[row, cell] == wp.uint8(FREE):
+        if x > 0:
+            if known[row, cell - 1] == wp.uint8(UNKNOWN):
+                found = wp.uint8(1)
+        if x + 1 < w:
+            if known[row, cell + 1] == wp.uint8(UNKNOWN):
+                found = wp.uint8(1)
+        if y > 0:
+            if known[row, cell - w] == wp.uint8(UNKNOWN):
+                found = wp.uint8(1)
+        if y + 1 < h:
+            if known[row, cell + w] == wp.uint8(UNKNOWN):
+                found = wp.uint8(1)
+    return found
 
 
 @wp.kernel
@@ -38,23 +60,8 @@ def _mark_frontier(
     h = height[grid]
     if y >= h:
         return
-    line = known[row]
-    for cell in range(y * w, (y + 1) * w):
-        found = wp.uint8(0)
-        if line[cell] == wp.uint8(FREE):
-            if cell > y * w:
-                if line[cell - 1] == wp.uint8(UNKNOWN):
-                    found = wp.uint8(1)
-            if cell + 1 < (y + 1) * w:
-                if line[cell + 1] == wp.uint8(UNKNOWN):
-                    found = wp.uint8(1)
-            if y > 0:
-                if line[cell - w] == wp.uint8(UNKNOWN):
-                    found = wp.uint8(1)
-            if y + 1 < h:
-                if line[cell + w] == wp.uint8(UNKNOWN):
-                    found = wp.uint8(1)
-        frontier[row, cell] = found
+    for x in range(w):
+        frontier[row, y * w + x] = is_frontier(known, row, x, y, w, h)
     if y == h - 1:
         for cell in range(w * h, known.shape[1]):
             frontier[row, cell] = wp.uint8(0)

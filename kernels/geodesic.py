@@ -19,8 +19,9 @@ import torch
 import warp as wp
 
 from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.startup import MODULE_OPTIONS
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
 DIAGONAL = 14  # weight of a step to a diagonal neighbour
@@ -29,8 +30,6 @@ UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them sti
 
 BLOCKED, OPEN, TIGHT = 0, 1, 2  # states of a cell
 TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken where the way around is long
-TIGHT_STRAIGHT = TIGHT_FACTOR * STRAIGHT
-TIGHT_DIAGONAL = TIGHT_FACTOR * DIAGONAL
 
 BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
 LAST_BUCKET = BUCKETS - 1
@@ -38,51 +37,112 @@ LAST_BUCKET = BUCKETS - 1
 SKIP = -2  # as the stop of a search: leave its distances as they are
 
 
-@wp.func
-def least_distance(x: int, y: int, end_x: int, end_y: int) -> int:
-    """Distance between two cells if nothing is in the way; 0 without an end (-1)."""
-    if end_x < 0:
-        return 0
-    dx = wp.abs(x - end_x)
-    dy = wp.abs(y - end_y)
-    return STRAIGHT * wp.max(dx, dy) + (DIAGONAL - STRAIGHT) * wp.min(dx, dy)
+# In C++: half the time of the same in Warp's Python, most of which goes to looking at eight neighbours. Rows of cells
+# have no gaps. Warp's debug mode does not look at pointers, but it heeds `assert`.
+SEARCH = f"""
+    const int cells = w * h;
+    const wp::uint8* state = &wp::index(passable, row, 0);
+    int* label = &wp::index(distance, item, 0);
+    int* labelled = &wp::index(touched, item, 0);
+    int* after = &wp::index(next, place, 0);
+    int* before = &wp::index(previous, place, 0);
+    assert(cells <= passable.shape[1] && cells <= distance.shape[1]);
+    assert(cells <= next.shape[1] && cells <= previous.shape[1]);
+    assert(labelled[0] >= 0 && labelled[1] < distance.shape[1]);
+
+    auto search = [&](auto left)  // the least that may be left from a cell to the goal
+    {{
+        int bucket[{BUCKETS}];
+        int waiting = 0, key = {UNREACHED}, limit = 2147483646, lowest = cells, highest = -1;
+
+        auto lower = [&](int cell, int x, int y, int value)  // and move the cell to the bucket of its key
+        {{
+            assert(x >= 0 && x < w && y >= 0 && y < h && cell == y * w + x);
+            const int old = label[cell];
+            if (value >= old) return;
+            label[cell] = value;
+            const int rest = left(x, y);
+            if (old < {UNREACHED})
+            {{
+                const int ahead = after[cell], behind = before[cell];
+                if (behind < 0) bucket[((old + rest) >> 1) & {LAST_BUCKET}] = ahead; else after[behind] = ahead;
+                if (ahead >= 0) before[ahead] = behind;
+            }}
+            else ++waiting;
+            int& head = bucket[((value + rest) >> 1) & {LAST_BUCKET}];
+            after[cell] = head;
+            before[cell] = -1;
+            if (head >= 0) before[head] = cell;
+            head = cell;
+        }};
+        auto visit = [&](int cell, int x, int y, int value, int weight)
+        {{
+            lower(cell, x, y, value + (state[cell] == {TIGHT} ? {TIGHT_FACTOR} * weight : weight));
+        }};
+
+        for (int k = 0; k < {BUCKETS}; ++k) bucket[k] = -1;
+        for (int k = 0; k < sources.shape[1]; ++k)
+        {{
+            const int source = wp::index(sources, item, k);
+            if (source < 0 || source >= cells || state[source] == {BLOCKED}) continue;
+            const int y = source / w, x = source - y * w;
+            lower(source, x, y, 0);
+            key = wp::min(key, left(x, y));
+            lowest = wp::min(lowest, source);
+            highest = wp::max(highest, source);
+        }}
+        while (waiting > 0 && key <= limit)
+        {{
+            int& head = bucket[(key >> 1) & {LAST_BUCKET}];
+            const int cell = head;
+            if (cell < 0) {{ key += 2; continue; }}
+            const int d = label[cell], y = cell / w, x = cell - y * w;
+            head = after[cell];
+            if (head >= 0) before[head] = -1;
+            --waiting;
+            lowest = wp::min(lowest, cell);
+            highest = wp::max(highest, cell);
+            if (cell == goal) limit = d;
+            const bool east = x + 1 < w && state[cell + 1] != {BLOCKED}, west = x > 0 && state[cell - 1] != {BLOCKED};
+            if (east) visit(cell + 1, x + 1, y, d, {STRAIGHT});
+            if (west) visit(cell - 1, x - 1, y, d, {STRAIGHT});
+            auto pass = [&](int beside, int v)
+            {{
+                if (state[beside] == {BLOCKED}) return;
+                visit(beside, x, v, d, {STRAIGHT});
+                if (east && state[beside + 1] != {BLOCKED}) visit(beside + 1, x + 1, v, d, {DIAGONAL});
+                if (west && state[beside - 1] != {BLOCKED}) visit(beside - 1, x - 1, v, d, {DIAGONAL});
+            }};
+            if (y + 1 < h) pass(cell + w, y + 1);
+            if (y > 0) pass(cell - w, y - 1);
+        }}
+        // Labels lie at most one row and one column beyond the cells that were left.
+        labelled[0] = wp::max(lowest - w - 1, 0);
+        labelled[1] = wp::min(highest + w + 1, cells - 1);
+    }};
+
+    for (int cell = labelled[0]; cell <= labelled[1]; ++cell) label[cell] = {UNREACHED};
+    if (goal < 0) search([](int, int) {{ return 0; }});
+    else
+    {{
+        const int goal_y = goal / w, goal_x = goal - goal_y * w;
+        search([=](int x, int y)
+        {{
+            const int dx = wp::abs(x - goal_x), dy = wp::abs(y - goal_y);
+            return {STRAIGHT} * wp::max(dx, dy) + {DIAGONAL - STRAIGHT} * wp::min(dx, dy);
+        }});
+    }}
+"""
 
 
-@wp.func
-def _lower_label(
-    cell: int,
-    x: int,
-    y: int,
-    value: int,
-    end: wp.vec2i,
-    distance: wp.array(dtype=wp.int32),
-    after: wp.array(dtype=wp.int32),
-    before: wp.array(dtype=wp.int32),
-    bucket: wp.array(dtype=wp.int32),
-) -> int:
-    """Lower a cell's label, if `value` is lower, and move it to the bucket of its key; return how many joined."""
-    old = distance[cell]
-    if value >= old:
-        return 0
-    distance[cell] = value
-    left = least_distance(x, y, end[0], end[1])
-    if old < UNREACHED:  # it waits in the bucket of its old key
-        ahead = after[cell]
-        behind = before[cell]
-        if behind < 0:
-            bucket[((old + left) >> 1) & LAST_BUCKET] = ahead
-        else:
-            after[behind] = ahead
-        if ahead >= 0:
-            before[ahead] = behind
-    slot = ((value + left) >> 1) & LAST_BUCKET
-    head = bucket[slot]
-    after[cell] = head
-    before[cell] = -1
-    if head >= 0:
-        before[head] = cell
-    bucket[slot] = cell
-    return wp.where(old < UNREACHED, 0, 1)
+@wp.func_native(SEARCH)
+def search_from(
+    passable: wp.array2d(dtype=wp.uint8), row: int, sources: wp.array2d(dtype=wp.int32), item: int, goal: int,
+    place: int, w: int, h: int, next: wp.array2d(dtype=wp.int32), previous: wp.array2d(dtype=wp.int32),
+    touched: wp.array2d(dtype=wp.int32), distance: wp.array2d(dtype=wp.int32),
+):  # fmt: skip
+    """Distances of all cells, or of the ways to `goal`; those of the search before are cleared."""
+    ...
 
 
 @wp.kernel
@@ -98,9 +158,8 @@ def _search_distance(
     sources: wp.array2d(dtype=wp.int32),  # [item, source], -1 = none
     stop: wp.array(dtype=wp.int32),  # [item], the cell whose distance is wanted; -1 = those of all; SKIP
     # Scratch:
-    next: wp.array2d(dtype=wp.int32),  # [item, cell], of its bucket's list
-    previous: wp.array2d(dtype=wp.int32),  # [item, cell]
-    buckets: wp.array2d(dtype=wp.int32),  # [item, bucket], first cell; -1 = none
+    next: wp.array2d(dtype=wp.int32),  # [place, cell], of its bucket's list
+    previous: wp.array2d(dtype=wp.int32),  # [place, cell]
     # In and out:
     touched: wp.array2d(dtype=wp.int32),  # [item, 2], first and last cell with a label
     # Out:
@@ -113,79 +172,8 @@ def _search_distance(
     row = row_of_item[item]
     w = width[grid_of_row[row]]
     h = height[grid_of_row[row]]
-    ok = passable[row]
-    dist = distance[item]
-    after = next[item]
-    before = previous[item]
-    bucket = buckets[item]
-    for cell in range(touched[item, 0], touched[item, 1] + 1):
-        dist[cell] = UNREACHED
-    for k in range(BUCKETS):
-        bucket[k] = -1
-    end = wp.vec2i(-1, -1)
-    if goal >= 0:
-        end = wp.vec2i(goal % w, goal / w)
-    lowest = wp.int32(w * h)
-    highest = wp.int32(-1)
-    waiting = wp.int32(0)
-    key = wp.int32(UNREACHED)
-    for i in range(sources.shape[1]):
-        source = sources[item, i]
-        if source >= 0 and source < w * h:
-            if ok[source] != wp.uint8(BLOCKED):
-                waiting += _lower_label(source, source % w, source / w, 0, end, dist, after, before, bucket)
-                key = wp.min(key, least_distance(source % w, source / w, end[0], end[1]))
-                lowest = wp.min(lowest, source)
-                highest = wp.max(highest, source)
-    limit = wp.int32(2147483646)
-    while waiting > 0 and key <= limit:
-        slot = (key >> 1) & LAST_BUCKET
-        cell = bucket[slot]
-        if cell < 0:
-            key += 2
-        else:
-            ahead = after[cell]
-            bucket[slot] = ahead
-            if ahead >= 0:
-                before[ahead] = -1
-            waiting -= 1
-            d = dist[cell]
-            x = cell % w
-            y = cell / w
-            lowest = wp.min(lowest, cell)
-            highest = wp.max(highest, cell)
-            if cell == goal:
-                limit = d
-            east = wp.bool(False)
-            west = wp.bool(False)
-            if x + 1 < w:
-                east = ok[cell + 1] != wp.uint8(BLOCKED)
-            if x > 0:
-                west = ok[cell - 1] != wp.uint8(BLOCKED)
-            if east:
-                value = d + wp.where(ok[cell + 1] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
-                waiting += _lower_label(cell + 1, x + 1, y, value, end, dist, after, before, bucket)
-            if west:
-                value = d + wp.where(ok[cell - 1] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
-                waiting += _lower_label(cell - 1, x - 1, y, value, end, dist, after, before, bucket)
-            for k in range(2):
-                v = y + 1 - 2 * k
-                if v >= 0 and v < h:
-                    beside = v * w + x
-                    if ok[beside] != wp.uint8(BLOCKED):
-                        value = d + wp.where(ok[beside] == wp.uint8(TIGHT), TIGHT_STRAIGHT, STRAIGHT)
-                        waiting += _lower_label(beside, x, v, value, end, dist, after, before, bucket)
-                        if east:
-                            if ok[beside + 1] != wp.uint8(BLOCKED):
-                                value = d + wp.where(ok[beside + 1] == wp.uint8(TIGHT), TIGHT_DIAGONAL, DIAGONAL)
-                                waiting += _lower_label(beside + 1, x + 1, v, value, end, dist, after, before, bucket)
-                        if west:
-                            if ok[beside - 1] != wp.uint8(BLOCKED):
-                                value = d + wp.where(ok[beside - 1] == wp.uint8(TIGHT), TIGHT_DIAGONAL, DIAGONAL)
-                                waiting += _lower_label(beside - 1, x - 1, v, value, end, dist, after, before, bucket)
-    # Labels lie at most one row and one column beyond the cells that were left.
-    touched[item, 0] = wp.max(lowest - w - 1, 0)
-    touched[item, 1] = wp.min(highest + w + 1, w * h - 1)
+    place = item % next.shape[0]
+    search_from(passable, row, sources, item, goal, place, w, h, next, previous, touched, distance)
 
 
 class DistanceSearch:
@@ -196,6 +184,7 @@ class DistanceSearch:
         cells: capacity of a grid, the largest width * height of the batch.
         num_sources: sources of one search.
         device: Warp device.
+        shared: one place to search in for all on the CPU, where one search ends before the next begins.
 
     Attributes:
         sources: int32 [items, num_sources], cell numbers, -1 = none. Fill before `launch`.
@@ -204,15 +193,17 @@ class DistanceSearch:
         distance: int32 [items, cells], 10 a straight step; `UNREACHED` elsewhere.
     """
 
-    def __init__(self, items: int, cells: int, num_sources: int = 1, device: str | wp.Device = "cpu"):
+    def __init__(
+        self, items: int, cells: int, num_sources: int = 1, device: str | wp.Device = "cpu", shared: bool = False
+    ):
         def numbers(*shape, value=0):
             return wp.full(shape, value, dtype=wp.int32, device=device)
 
         self.sources = numbers(items, num_sources, value=-1)
         self.stop = numbers(items, value=-1)
         self.distance = numbers(items, cells, value=UNREACHED)
-        self.next, self.previous = numbers(items, cells), numbers(items, cells)
-        self.buckets = numbers(items, BUCKETS)
+        places = 1 if shared and wp.get_device(device).is_cpu else items
+        self.next, self.previous = numbers(places, cells), numbers(places, cells)
         self.touched = numbers(items, 2)  # cell 0 is cleared in vain once
 
     def search(
@@ -236,7 +227,7 @@ class DistanceSearch:
         launch(
             _search_distance, self.distance.shape[0],
             [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
-            [self.next, self.previous, self.buckets, self.touched, self.distance],
+            [self.next, self.previous, self.touched, self.distance],
         )  # fmt: skip
 
 

@@ -12,9 +12,10 @@ import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import Launch, lanes_on, launch_named
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 
@@ -90,6 +91,33 @@ def enter_cell(
             news[row, slot] = cell
 
 
+# In C++: nearly all points are looked at in vain.
+NEXT_NEWS = """
+    const int* flag = &wp::index(flags, e, word, 0);
+    const wp::uint8* done = &wp::index(painted, row, shift);
+    int found = 0, point = start;
+    assert(end <= flags.shape[2] && shift + end <= painted.shape[1]);
+    for (; point < end; point += lanes)
+    {
+        int seen = flag[point];
+        for (int k = 1; k < words; ++k) seen |= wp::index(flags, e, word + k, point);
+        if ((seen & mask) == 0) continue;
+        ++found;
+        if (done[point] == 0) break;
+    }
+    return wp::vec2i(point, found);
+"""
+
+
+@wp.func_native(NEXT_NEWS)
+def next_news(
+    flags: wp.array3d(dtype=wp.int32), e: int, word: int, words: int, mask: int, painted: wp.array2d(dtype=wp.uint8),
+    row: int, shift: int, start: int, end: int, lanes: int,
+) -> wp.vec2i:  # fmt: skip
+    """The next point from `start` on that is known and not yet painted, and how many known ones were met up to it."""
+    ...
+
+
 @wp.kernel
 def _paint_points(
     # Map:
@@ -134,26 +162,26 @@ def _paint_points(
     robot = row % rows_per_env
     words = wp.where(rows_per_env > 1, 1, flags.shape[1])
     mask = wp.where(rows_per_env > 1, 1 << (robot % ROBOTS_PER_WORD), -1)
-    flag = flags[e, robot / ROBOTS_PER_WORD]
-    done = painted[row]
+    word = robot / ROBOTS_PER_WORD
     found = int(0)
     added = int(0)
-    for point in range(lane, point_begin[m + 1] - first, lanes):
-        seen = flag[point]
-        for k in range(1, words):
-            seen = seen | flags[e, k, point]
-        if (seen & mask) != 0:
-            found += 1
-            if done[shift + point] == wp.uint8(0):
-                done[shift + point] = wp.uint8(1)
-                added += 1
-                cell = point_cell[first + point]
-                state = known[row, cell]
-                if state == wp.uint8(UNKNOWN) or (value == wp.uint8(OBSTACLE) and state != value):
-                    listed = again == 0
-                    enter_cell(row, cell, w, value, listed, known, walls, news, news_count)
-                    for k in range(grids.void_begin[begin + cell], grids.void_begin[begin + cell + 1]):
-                        enter_cell(row, grids.voids[k], w, value, listed, known, walls, news, news_count)
+    end = point_begin[m + 1] - first
+    point = int(lane)
+    while point < end:
+        unpainted = next_news(flags, e, word, words, mask, painted, row, shift, point, end, lanes)
+        point = unpainted[0]
+        found += unpainted[1]
+        if point < end:
+            painted[row, shift + point] = wp.uint8(1)
+            added += 1
+            cell = point_cell[first + point]
+            state = known[row, cell]
+            if state == wp.uint8(UNKNOWN) or (value == wp.uint8(OBSTACLE) and state != value):
+                listed = again == 0
+                enter_cell(row, cell, w, value, listed, known, walls, news, news_count)
+                for k in range(grids.void_begin[begin + cell], grids.void_begin[begin + cell + 1]):
+                    enter_cell(row, grids.voids[k], w, value, listed, known, walls, news, news_count)
+        point += lanes
     if again == 0:
         wp.atomic_add(met, row, found)
     wp.atomic_add(total, row, added)

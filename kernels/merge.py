@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.geometry import segment_distance
-from maexp.kernels.launches import Launch
-from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps
+from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, floor_within
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.kernel
@@ -96,6 +97,36 @@ def _merge_scan(
     wp.atomic_add(shared, e, shared_sum)
 
 
+@wp.func
+def is_blocked(maps: Maps, m: int, a: wp.vec3, b: wp.vec3, width: float) -> bool:
+    """Whether a boundary point lies within ``width`` of a segment. Looks at the cells along it only."""
+    size = maps.cell_size[m]
+    origin = maps.cell_origin[m]
+    pad = width + 1.0e-3 * size
+    along = b - a
+    first = maps.boundary_begin[m]
+    top = floor_within(wp.max(a[1], b[1]) + pad - origin[1], size, -1, maps.cells_y[m] - 1)
+    for row in range(floor_within(wp.min(a[1], b[1]) - pad - origin[1], size, 0, maps.cells_y[m]), top + 1):
+        low = origin[1] + float(row) * size - pad - a[1]
+        enter = float(0.0)  # shares of the segment between which it can touch the row
+        leave = float(1.0)
+        if along[1] != 0.0:
+            one = low / along[1]
+            two = (low + size + 2.0 * pad) / along[1]
+            enter = wp.clamp(wp.min(one, two), 0.0, 1.0)
+            leave = wp.clamp(wp.max(one, two), 0.0, 1.0)
+        left = a[0] - origin[0] + wp.min(enter * along[0], leave * along[0]) - pad
+        right = a[0] - origin[0] + wp.max(enter * along[0], leave * along[0]) + pad
+        base = maps.cell_begin[m] + row * maps.cells_x[m]
+        begin = base + floor_within(left, size, 0, maps.cells_x[m])
+        end = base + floor_within(right, size, -1, maps.cells_x[m] - 1) + 1
+        if begin < end:
+            for j in range(first + maps.boundary_cell[begin], first + maps.boundary_cell[end]):
+                if segment_distance(maps.boundary[j], a, b) < width:
+                    return True
+    return False
+
+
 @wp.kernel
 def _hear_robots(
     # Map:
@@ -123,12 +154,8 @@ def _hear_robots(
         if heard and line_of_sight != 0 and other != i:
             # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
             width = 0.70710678 * maps.resolution[m]
-            a = center[e, wp.min(i, other)]  # one direction for both, lest rounding let only one hear the other
-            b = center[e, wp.max(i, other)]
-            for j in range(maps.boundary_begin[m], maps.boundary_begin[m + 1]):
-                if segment_distance(maps.boundary[j], a, b) < width:
-                    heard = False
-                    break
+            # one direction for both, lest rounding let only one hear the other
+            heard = not is_blocked(maps, m, center[e, wp.min(i, other)], center[e, wp.max(i, other)], width)
         if other == i:
             heard = True
         comm[e, i, other] = heard
@@ -139,48 +166,51 @@ def _hear_robots(
 
 @wp.kernel
 def _share_points(
+    # Settings:
+    lanes: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
     seen: wp.array3d(dtype=wp.int32),  # [env, word, point]
-    # Scratch in:
-    told: wp.array3d(dtype=wp.int32),  # [env, word, point]
-    # State out:
+    # State in and out:
     known: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    # Scratch out:
+    told: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
-    """Robot i knows a point if it has seen it or a robot it hears had seen or been ``told`` of it."""
-    e, j = wp.tid()
+    """Robot i knows a point if it or a robot it hears has seen it or had been told of it.
+
+    ``told`` holds what each tells, so that news travels one hop a step whatever the order of robots.
+    """
+    e, lane = wp.tid()
     if active[e] == 0:
         return
     words = seen.shape[1]
-    anyone = int(0)
-    for w in range(words):
-        anyone = anyone | seen[e, w, j] | told[e, w, j]
-    if anyone == 0:
-        return
-    for w in range(words):
-        result = int(0)
-        for b in range(ROBOTS_PER_WORD):
-            i = w * ROBOTS_PER_WORD + b
-            if i < hears.shape[1]:
-                for v in range(words):
-                    if (hears[e, i, v] & (seen[e, v, j] | told[e, v, j])) != 0:
-                        result = result | (1 << b)
-        known[e, w, j] = result | seen[e, w, j] | told[e, w, j]
-
-
-@wp.kernel
-def _copy_flags(
-    # State in:
-    active: wp.array(dtype=wp.int32),  # [env]
-    flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
-    # Scratch out:
-    copy: wp.array3d(dtype=wp.int32),  # [env, word, point]
-):
-    """Freeze flags, so that news travels one hop a step whatever the order of threads."""
-    e, w, j = wp.tid()
-    if active[e] != 0:
-        copy[e, w, j] = flags[e, w, j]
+    last = ~wp.uint32(0) >> wp.uint32(words * ROBOTS_PER_WORD - hears.shape[1])  # robots of the last word
+    sees = seen[e]
+    knows = known[e]
+    tells = told[e]
+    for j in range(lane, seen.shape[2], lanes):
+        anyone = int(0)
+        for w in range(words):
+            own = sees[w, j] | knows[w, j]
+            if own != 0:
+                anyone = 1
+        if anyone != 0:
+            for w in range(words):
+                tells[w, j] = sees[w, j] | knows[w, j]
+            for w in range(words):
+                result = tells[w, j]
+                missing = ~wp.uint32(result)
+                if w == words - 1:
+                    missing = missing & last
+                while missing != wp.uint32(0):  # those who do not know it yet
+                    below = missing - wp.uint32(1)
+                    bit = int(wp.bit_count(below & ~missing))
+                    for v in range(words):
+                        if (hears[e, w * ROBOTS_PER_WORD + bit, v] & tells[v, j]) != 0:
+                            result = result | (1 << bit)
+                    missing = missing & below
+                knows[w, j] = result
 
 
 def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
@@ -195,7 +225,6 @@ def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
         return
     shard.call(launch, _hear_robots, "comm hears", active=running)
     for what in ("free", "boundary"):
-        seen, told, known = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "told", "known"))
-        envs, _, points = known.shape
-        shard.call(launch, _copy_flags, "copy", known.shape, active=running, flags=known, copy=told)
-        shard.call(launch, _share_points, "known", (envs, points), active=running, seen=seen, told=told, known=known)
+        seen, known, told = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "known", "told"))
+        given = {"seen": seen, "known": known, "told": told, "lanes": lanes_on(shard.device, 1024)}
+        shard.call(launch, _share_points, "known told", (shard.shape[0], given["lanes"]), active=running, **given)

@@ -6,12 +6,13 @@ import warp as wp
 
 from maexp.kernels.dynamics import curvature, heading_change
 from maexp.kernels.launches import Launch
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import HALF, Robots, point_xy, within
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.kernel

@@ -11,6 +11,7 @@ import warp as wp
 
 from maexp.kernels.geometry import rectangle_distance
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     CHANNEL_EXPLORED,
     CHANNEL_OBSTACLE,
@@ -20,6 +21,7 @@ from maexp.kernels.types import (
     ERROR_CAPACITY,
     PI,
     PICTURE_CHANNELS,
+    PIXEL_SHARED,
     PIXELS,
     REGIONS,
     ROBOTS_PER_WORD,
@@ -32,7 +34,7 @@ from maexp.kernels.types import (
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 ON = 255  # grey levels: seen, a wall, the own body
 OTHER = 128  # the body of another
@@ -65,14 +67,11 @@ def count_viewers(
     p: int,
     free_count: int,
     seen_free: wp.array3d(dtype=wp.int32),
-    viewers_free: wp.array3d(dtype=wp.int32),
 ) -> int:
     """Robots that have seen a free point shown by pixel p."""
     pixel = m * PIXELS * PIXELS + p
     begin = maps.pixel_point_begin[pixel]
     end = maps.pixel_point_begin[pixel + 1]
-    if end - begin == 1 and maps.pixel_point[begin] < free_count:
-        return viewers_free[e, 0, maps.pixel_point[begin]]
     viewers = int(0)
     for w in range(seen_free.shape[1]):
         word = int(0)
@@ -84,13 +83,35 @@ def count_viewers(
     return viewers
 
 
+@wp.func
+def draw_pixel(
+    p: int,
+    channel: int,
+    team_bits: int,
+    drawn: wp.array2d(dtype=wp.int32),  # [word, point]
+    j: int,
+    picture: wp.array3d(dtype=wp.uint8),  # [robot, channel, pixel]
+):
+    """Enter pixel p, which shows point j, into the pictures of the robots that the point is drawn for."""
+    if team_bits != 0:
+        for i in range(picture.shape[0]):
+            picture[i, channel, p] = wp.uint8(ON)
+        return
+    for w in range(drawn.shape[0]):
+        bits = wp.uint32(drawn[w, j])
+        while bits != wp.uint32(0):  # those that are set only: few of a large team have seen a point
+            below = bits - wp.uint32(1)
+            i = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~bits))
+            picture[i, channel, p] = wp.uint8(ON)
+            bits = bits & below
+
+
 @wp.kernel
 def _draw_points(
     # Map:
     maps: Maps,
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
-    num_robots: int,
     team_bits: int,
     lanes: int,
     # State in:
@@ -116,40 +137,37 @@ def _draw_points(
         return
     m = map_id[e]
     free_count = maps.free_begin[m + 1] - maps.free_begin[m]
-    count = free_count + maps.boundary_begin[m + 1] - maps.boundary_begin[m]
-    for j in range(lane, count, lanes):
-        channel = wp.where(j < free_count, CHANNEL_EXPLORED, CHANNEL_OBSTACLE)
-        viewers = int(0)
-        if channel == CHANNEL_EXPLORED:
-            viewers = viewers_free[e, 0, j]
-        else:
-            viewers = viewers_boundary[e, 0, j - free_count]
+    boundary_count = maps.boundary_begin[m + 1] - maps.boundary_begin[m]
+    first = maps.shown_begin[m]
+    team_explored = team[e, CHANNEL_EXPLORED]
+    team_viewers = team[e, CHANNEL_VIEWERS]
+    team_obstacle = team[e, CHANNEL_OBSTACLE]
+    pictures = picture[e]
+    drawn_free = draw_free[e]
+    drawn_boundary = draw_boundary[e]
+    viewed_free = viewers_free[e, 0]
+    viewed_boundary = viewers_boundary[e, 0]
+    for j in range(lane, free_count, lanes):
+        viewers = viewed_free[j]
         if viewers != 0:
-            start = maps.point_pixel_begin[maps.shown_begin[m] + j]
-            stop = maps.point_pixel_begin[maps.shown_begin[m] + j + 1]
+            start = maps.point_pixel_begin[first + j]
+            stop = maps.point_pixel_begin[first + j + 1]
+            for k in range(start, stop):
+                p = maps.point_pixel[k] & (PIXEL_SHARED - 1)
+                shown = viewers
+                if maps.point_pixel[k] >= PIXEL_SHARED:
+                    shown = count_viewers(maps, m, e, p, free_count, seen_free)
+                team_explored[p] = wp.uint8(ON)
+                team_viewers[p] = wp.uint8(wp.min(shown, 255))
+                draw_pixel(p, CHANNEL_EXPLORED, team_bits, drawn_free, j, pictures)
+    for j in range(lane, boundary_count, lanes):
+        if viewed_boundary[j] != 0:
+            start = maps.point_pixel_begin[first + free_count + j]
+            stop = maps.point_pixel_begin[first + free_count + j + 1]
             for k in range(start, stop):
                 p = maps.point_pixel[k]
-                team[e, channel, p] = wp.uint8(ON)
-                if channel == CHANNEL_EXPLORED:
-                    shown = count_viewers(maps, m, e, p, free_count, seen_free, viewers_free)
-                    team[e, CHANNEL_VIEWERS, p] = wp.uint8(wp.min(shown, 255))
-                if team_bits != 0:
-                    for i in range(num_robots):
-                        picture[e, i, channel, p] = wp.uint8(ON)
-            if team_bits == 0:
-                for w in range(draw_free.shape[1]):
-                    word = int(0)
-                    if channel == CHANNEL_EXPLORED:
-                        word = draw_free[e, w, j]
-                    else:
-                        word = draw_boundary[e, w, j - free_count]
-                    bits = wp.uint32(word)
-                    while bits != wp.uint32(0):  # those that are set only: few of a large team have seen a point
-                        below = bits - wp.uint32(1)
-                        i = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~bits))
-                        for k in range(start, stop):
-                            picture[e, i, channel, maps.point_pixel[k]] = wp.uint8(ON)
-                        bits = bits & below
+                team_obstacle[p] = wp.uint8(ON)
+                draw_pixel(p, CHANNEL_OBSTACLE, team_bits, drawn_boundary, j, pictures)
 
 
 @wp.kernel
@@ -200,9 +218,12 @@ def _list_bodies(
 @wp.func
 def draw_segment(p: int, q: int, value: wp.uint8, e: int, i: int, picture: wp.array4d(dtype=wp.uint8)):
     """Draw from pixel p (excluded unless equal) to pixel q."""
+    if p == q:
+        picture[e, i, CHANNEL_TRAJECTORY, q] = value
+        return
     dx = q / PIXELS - p / PIXELS
     dy = q % PIXELS - p % PIXELS
-    steps = wp.max(wp.max(wp.abs(dx), wp.abs(dy)), 1)
+    steps = wp.max(wp.abs(dx), wp.abs(dy))
     for k in range(1, steps + 1):
         t = float(k) / float(steps)
         ix = p / PIXELS + int(wp.floor(float(dx) * t + 0.5))
@@ -322,7 +343,7 @@ def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: t
         "picture": wp.from_torch(picture.flatten(3), dtype=wp.uint8),
         "team": wp.from_torch(team.flatten(2), dtype=wp.uint8),
         "draw_free": getattr(s, f"{drawn}_free"), "draw_boundary": getattr(s, f"{drawn}_boundary"),
-        "num_robots": shard.shape[1], "team_bits": int(settings.draw_known and not settings.limited),
+        "team_bits": int(settings.draw_known and not settings.limited),
         "lanes": lanes_on(shard.device, 1024),
     }  # fmt: skip
     shard.call(launch, _draw_points, "picture team", (shard.shape[0], given["lanes"]), **given)

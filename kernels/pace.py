@@ -11,6 +11,7 @@ import warp as wp
 
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.launches import Launch
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Robots, point_xy
 from maexp.kernels.ways import PATH_CELLS, path_slot
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
     from maexp.kernels.wavefront import Wavefront
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 CREEP = 0.25  # least distance of a waypoint that is not the end, in clearances of the robot
 HEADROOM = 4.0  # speed is held to what brakes within so many times the gap to the nearest obstacle
@@ -60,32 +61,53 @@ def clear_ahead(
     return wp.max(room, 0.0)
 
 
+# In C++: from the place's own row outwards, until rows lie farther than what was found. In each row of the bitmap the
+# obstacles next to the place, one to either side, are the nearest. The least root is that of the least square.
+NEAREST_WALL = f"""
+    const int x = (int)wp::floor(p[0]), y = (int)wp::floor(p[1]);
+    const int first = wp::max(x - {LOOK_CELLS}, 0), last = wp::min(x + {LOOK_CELLS}, w - 1);
+    if (first > last) return {LOOK_CELLS}.0f;
+    const int begin = wp::max(x, 0), low = first / 32, shift = first % 32, more = last / 32 - low;
+    const unsigned window = (1u << (last - first + 1)) - 1u, below = (1u << (begin - first)) - 1u;
+    const int* word = &wp::index(walls, row, low);
+    assert((h - 1) * words + low + more < walls.shape[1]);
+    float nearest = {LOOK_CELLS * LOOK_CELLS}.0f;
+    auto look = [&](int v)  // at a row; whether those beyond it may be nearer
+    {{
+        const float dy = (float)v + 0.5f - p[1];
+        if (dy * dy >= nearest) return false;
+        if (v < 0 || v >= h) return true;
+        unsigned bits = unsigned(word[v * words]) >> shift;
+        if (more) bits |= unsigned(word[v * words + 1]) << (32 - shift);
+        bits &= window;
+        if (bits == 0u) return true;
+        const unsigned right = bits >> (begin - first);
+        unsigned left = bits & below;
+        left |= left >> 1; left |= left >> 2; left |= left >> 4;  // down from its highest bit, of {LOOK_CELLS} at most
+        const int behind = left ? first + wp::bit_count(left) - 1 : -{4 * LOOK_CELLS};
+        const int ahead = begin + wp::bit_count((right & (0u - right)) - 1u);  // 32 cells away where there is none
+        const wp::vec2 a((float)ahead + 0.5f - p[0], dy), b((float)behind + 0.5f - p[0], dy);
+        nearest = wp::min(nearest, wp::min(wp::dot(a, a), wp::dot(b, b)));
+        return true;
+    }};
+    for (int k = 0; k <= {LOOK_CELLS} && look(y - k); ++k);
+    for (int k = 1; k <= {LOOK_CELLS} && look(y + k); ++k);
+    return wp::sqrt(nearest);
+"""
+
+
+@wp.func_native(NEAREST_WALL)
+def nearest_wall(walls: wp.array2d(dtype=wp.int32), row: int, p: wp.vec2, w: int, h: int, words: int) -> float:
+    """Distance in cells from a place to the nearest obstacle cell's centre, `LOOK_CELLS` at most."""
+    ...
+
+
 @wp.func
 def nearest_obstacle(grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32), row: int, at: wp.vec2) -> float:
     """Distance to the nearest known obstacle cell [m], `LOOK_CELLS` cells at most."""
-    w = grids.width[m]
     p = (at - grids.origin[m]) / grids.cell[m]
-    x = int(wp.floor(p[0]))
-    y = int(wp.floor(p[1]))
-    first = wp.max(x - LOOK_CELLS, 0)
-    last = wp.min(x + LOOK_CELLS, w - 1)
-    nearest = float(LOOK_CELLS)
-    if first <= last:
-        across = wall_words(w)
-        low = first / 32
-        shift = first % 32
-        window = (wp.uint32(1) << wp.uint32(last - first + 1)) - wp.uint32(1)
-        for v in range(wp.max(y - LOOK_CELLS, 0), wp.min(y + LOOK_CELLS, grids.height[m] - 1) + 1):
-            bits = wp.uint32(walls[row, v * across + low]) >> wp.uint32(shift)
-            if last / 32 > low:
-                bits = bits | (wp.uint32(walls[row, v * across + low + 1]) << wp.uint32(32 - shift))
-            bits = bits & window
-            while bits != wp.uint32(0):
-                below = bits - wp.uint32(1)
-                u = first + int(wp.bit_count(below & ~bits))
-                nearest = wp.min(nearest, wp.length(wp.vec2(float(u) + 0.5, float(v) + 0.5) - p))
-                bits = bits & below
-    return nearest * grids.cell[m]
+    w = grids.width[m]
+    return nearest_wall(walls, row, p, w, grids.height[m], wall_words(w)) * grids.cell[m]
 
 
 @wp.func

@@ -9,10 +9,11 @@ import warp as wp
 
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import BLOCKED, TIGHT
-from maexp.kernels.known_grid import KnownGrids, NavGrids
+from maexp.kernels.known_grid import KnownGrids, NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
+from maexp.kernels.startup import MODULE_OPTIONS
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 
@@ -57,16 +58,51 @@ def _open_cells(
 
 
 @wp.func
+def half_chord(gap: int, radius: float, most: int) -> int:
+    """The most cells to the side, of `most`, that lie nearer than a radius [cells], `gap` rows away; -1: none."""
+    square = radius * radius
+    half = wp.int32(most)
+    while half >= 0 and float(gap * gap + half * half) >= square:
+        half -= 1
+    return half
+
+
+HAS_WALL = """
+    const wp::uint32* words = (const wp::uint32*)&wp::index(walls, row, line);
+    const int low = first / 32, high = last / 32;
+    const wp::uint32 from = ~0u << (first % 32), to = ~0u >> (31 - last % 32);
+    if (low == high) return (words[low] & from & to) != 0;
+    wp::uint32 found = (words[low] & from) | (words[high] & to);
+    for (int word = low + 1; word < high; ++word) found |= words[word];
+    return found != 0;
+"""
+
+
+@wp.func_native(HAS_WALL)
+def has_wall(walls: wp.array2d(dtype=wp.int32), row: int, line: int, first: int, last: int) -> bool:
+    """Whether a row of cells, whose words begin at `line`, holds a known obstacle from `first` to `last`."""
+    ...
+
+
+@wp.func
 def near_wall(
-    known: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int, radius: float
+    walls: wp.array2d(dtype=wp.int32), row: int, x: int, y: int, w: int, h: int, radius: float
 ) -> bool:
     """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
-    reach = int(wp.ceil(radius))
-    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-            if float((v - y) * (v - y) + (u - x) * (u - x)) < radius * radius:
-                if known[row, v * w + u] == wp.uint8(OBSTACLE):
-                    return True
+    across = wall_words(w)
+    half = int(wp.ceil(radius))
+    for gap in range(int(wp.ceil(radius)) + 1):
+        half = half_chord(gap, radius, half)
+        if half < 0:
+            return False
+        first = wp.max(x - half, 0)
+        last = wp.min(x + half, w - 1)
+        if y - gap >= 0:
+            if has_wall(walls, row, (y - gap) * across, first, last):
+                return True
+        if gap > 0 and y + gap < h:
+            if has_wall(walls, row, (y + gap) * across, first, last):
+                return True
     return False
 
 
@@ -97,12 +133,17 @@ def close_around(
     """Give `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
     x = cell % w
     y = cell / w
-    reach = int(wp.ceil(r))
-    for v in range(wp.max(y - reach, 0), wp.min(y + reach, h - 1) + 1):
-        for u in range(wp.max(x - reach, 0), wp.min(x + reach, w - 1) + 1):
-            if float((v - y) * (v - y) + (u - x) * (u - x)) < r * r:
-                if passable[row, v * w + u] != wp.uint8(BLOCKED):
-                    passable[row, v * w + u] = value
+    half = int(wp.ceil(r))
+    for gap in range(int(wp.ceil(r)) + 1):
+        half = half_chord(gap, r, half)
+        first = wp.max(x - half, 0)
+        last = wp.min(x + half, w - 1)
+        for side in range(wp.where(gap == 0, 1, 2)):
+            v = y + wp.where(side == 0, gap, -gap)
+            if v >= 0 and v < h:
+                for u in range(v * w + first, v * w + last + 1):
+                    if passable[row, u] != wp.uint8(BLOCKED):
+                        passable[row, u] = value
 
 
 @wp.kernel
@@ -120,6 +161,7 @@ def _close_cells(
     news: wp.array2d(dtype=wp.int32),  # [known row, slot]
     news_count: wp.array(dtype=wp.int32),  # [known row], -1 = all cells
     known_of_row: wp.array(dtype=wp.int32),  # [mask row]
+    walls: wp.array2d(dtype=wp.int32),  # [known row, word]
     radius: wp.array(dtype=wp.float32),  # [mask row], distance from known obstacle cells [m]
     # In and out:
     passable: wp.array2d(dtype=wp.uint8),  # [mask row, cell]
@@ -145,7 +187,7 @@ def _close_cells(
                 passable[row, cell] = wp.uint8(BLOCKED)
             close_around(cell, w, h, row, r, value, passable)
         elif through_unknown == 0:
-            if near_wall(known, source, cell % w, cell / w, w, h, r):
+            if near_wall(walls, source, cell % w, cell / w, w, h, r):
                 passable[row, cell] = value
 
 
@@ -194,7 +236,7 @@ class PassableGrids:
         dim = (self.passable.shape[0], lanes)
         values = vars(self) | {
             "grids": known.grids, "map_id": known.map_id, "known": known.known, "news": known.news,
-            "news_count": known.news_count, "rows_per_env": self.masks, "lanes": lanes,
+            "news_count": known.news_count, "walls": known.walls, "rows_per_env": self.masks, "lanes": lanes,
         }  # fmt: skip
         launch_named(launch, _assign_grids, self.grid_of_row.shape, "grid_of_row", values)
         launch_named(launch, _open_cells, dim, "passable", values)

@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.dwa import _plan_dwa
+from maexp.kernels.dynamics import turn_limit
 from maexp.kernels.launches import Launch
-from maexp.kernels.types import ERROR_ACTION, OMNIDIRECTIONAL, REGIONS, Maps, Robots
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps, Robots
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.kernel
@@ -30,11 +32,7 @@ def _plan_direct(
     if active[e] == 0:
         return
     first = wp.clamp(command[e, i][0], -1.0, 1.0) * robots.max_accel[e, i]
-    second = wp.clamp(command[e, i][1], -1.0, 1.0)
-    if robots.kind[e, i] == OMNIDIRECTIONAL:
-        second = second * robots.max_accel[e, i]
-    else:
-        second = second * robots.max_turn[e, i]
+    second = wp.clamp(command[e, i][1], -1.0, 1.0) * turn_limit(robots, e, i)
     control[e, i] = wp.vec2(first, second)
 
 

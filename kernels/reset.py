@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.launches import Launch
+from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ERROR_START, PI, START_CLEARANCE, Maps, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 TRIES = 64
 EVALUATION = 2**30
@@ -119,14 +120,17 @@ def _place_team(
 
 @wp.kernel
 def _clear_flags(
+    # Settings:
+    lanes: int,
     # Scratch in:
     mask: wp.array(dtype=wp.int32),  # [env]
     # State out:
     flags: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
-    e, w, j = wp.tid()
+    e, w, lane = wp.tid()
     if mask[e] != 0:
-        flags[e, w, j] = 0
+        for j in range(lane, flags.shape[2], lanes):
+            flags[e, w, j] = 0
 
 
 @wp.kernel
@@ -227,8 +231,9 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     flags = [s.seen_free, s.seen_boundary, s.viewers_free, s.viewers_boundary]
     if shard.settings.limited:
         flags += [s.known_free, s.known_boundary]
+    lanes = lanes_on(shard.device, 1024)
     for one in flags:
-        shard.call(launch, _clear_flags, "flags", one.shape, flags=one)
+        shard.call(launch, _clear_flags, "flags", (*one.shape[:2], lanes), flags=one, lanes=lanes)
     shard.call(
         launch, _clear_env,
         "covered covered_before covered_sum shared "

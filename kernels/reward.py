@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Maps
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 EXPLORE = 0
 OVERLAP = 1

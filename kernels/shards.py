@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 import warp as wp
 
-from maexp.kernels.launches import Launch, RecordedLaunch, lanes_on, launch_named, replay
+from maexp.kernels.launches import Launch, RecordedLaunch, lanes_on, launch_named, record, replay
 from maexp.kernels.state import memory_per_env, robots_struct, warp_views
 from maexp.kernels.wavefront import Wavefront
 
@@ -79,13 +79,7 @@ class Shard:
     def record(self, stage: Stage) -> list[RecordedLaunch]:
         """The launches of a stage, recorded when first asked for."""
         if stage not in self._recorded:
-            launches: list[RecordedLaunch] = []
-
-            def launch(kernel, dim, inputs, outputs):
-                launches.append(RecordedLaunch(kernel, dim, inputs, outputs, self.device))
-
-            stage(launch, self)
-            self._recorded[stage] = launches
+            self._recorded[stage] = record(lambda launch: stage(launch, self), self.device)
         return self._recorded[stage]
 
     def replay(self, stage: Stage) -> None:

@@ -1,11 +1,33 @@
 """Start Warp quietly: on a machine without a GPU its native code warns on every start that there is none."""
 
 import os
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 import warp as wp
+
+KNOWN = wp.config.version.startswith("1.19.")
+"""Whether this is a Warp whose inner workings, nowhere documented, are those that we lean on to be faster."""
+
+
+def module_options() -> dict[str, object]:
+    """Options of every module of kernels: no gradients, which halves the time to compile; cheap loops (`loops.h`).
+
+    `wp.config.cpu_compiler_flags` counts as it is when `maexp` is imported.
+    """
+    options: dict[str, object] = {"enable_backward": False}
+    header = Path(__file__).with_name("loops.h")
+    if KNOWN and len(str(header).split()) == 1:  # Warp cuts flags at spaces
+        version = zlib.crc32(header.read_bytes())  # for Warp's cache of kernels, which knows flags, not files
+        flags = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+        options["cpu_compiler_flags"] = f"{flags} -DMAEXP_LOOPS={version} -include {header}"
+    return options
+
+
+MODULE_OPTIONS = module_options()
 
 
 def start_warp() -> None:

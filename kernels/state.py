@@ -180,8 +180,9 @@ SCRATCH = {
         "_count_points _start_env"),
     "overlap": Field(wp.int32, "E N", "weight", "of the visible points that another robot sees now",
         "_count_points _start_env"),
-    "told_free": Field(wp.int32, "E H P", "", "`known_free` before this step's sharing", "_copy_flags"),
-    "told_boundary": Field(wp.int32, "E H Q", "", "`known_boundary` before this step's sharing", "_copy_flags"),
+    "told_free": Field(wp.int32, "E H P", "", "what each can tell of before it hears others",
+        "_share_points"),
+    "told_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_share_points"),
 
     # Drawing.
     "body_pixel": Field(wp.int32, "E N G", "", "pixels of the robot's body, that of its centre first",

@@ -14,13 +14,14 @@ from maexp.kernels.dynamics import wrap_angle
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
 from maexp.kernels.pace import clear_ahead, nearest_obstacle
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import DIFFERENTIAL, PI, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
     from maexp.kernels.wavefront import Wavefront
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 EASE = 0.8  # share of the greatest deceleration that is counted on
 SPARE_CELLS = 0.25  # gap that is kept beyond the collision threshold, in cells

@@ -1,32 +1,29 @@
-"""Targets of exploration: frontier cells gathered in square blocks, each with a cell to go to and what it offers.
+"""Targets of exploration as robots see them: where they are, how far, and which are given up.
 
-Rows are those of `KnownGrids`: one per env where the team shares what it knows, else one per robot. Blocks are
-numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the env's map.
+Rows are those of `KnownGrids`. S envs are looked at, some or all; `env` says which.
 """
-
-import math
 
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import SKIP, UNREACHED
-from maexp.kernels.known_grid import NavGrids, nav_cell
+from maexp.kernels.frontier import OBSTACLE
+from maexp.kernels.geodesic import SKIP, STRAIGHT, UNREACHED
+from maexp.kernels.known_grid import NavGrids, nav_cell, nav_center
 from maexp.kernels.passable import near_wall
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.teamwork import squared
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import nearest_passable, step_back
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
-
-RAYS = 48  # rays that look around from a target
-
-RAY_ANGLE = 2.0 * math.pi / RAYS
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.kernel
 def _locate_robots(
     # Map:
     grids: NavGrids,
-    grid_of_env: wp.array(dtype=wp.int32),  # [env], -1: search nothing, leave the distances as they are
+    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: search nothing, leave the distances as they are
+    # Settings:
+    rows_per_env: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
@@ -40,7 +37,7 @@ def _locate_robots(
 ):
     e, i = wp.tid()
     item = e * center.shape[1] + i
-    m = grid_of_env[e]
+    m = grid_of_row[e * rows_per_env]
     if m < 0:
         stop[item] = SKIP
         return
@@ -53,169 +50,6 @@ def _locate_robots(
         )
 
 
-@wp.func
-def is_reached(
-    distance: wp.array2d(dtype=wp.int32), e: int, first: int, last: int, robots: int, cell: int
-) -> bool:
-    """Whether one of the robots `first` to `last` (not included) gets to a cell."""
-    found = wp.bool(False)
-    for i in range(first, last):
-        found = found or distance[e * robots + i, cell] < UNREACHED
-    return found
-
-
-@wp.kernel
-def _sum_frontier(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: leave it as it is
-    block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
-    # In:
-    frontier: wp.array2d(dtype=wp.uint8),  # [row, cell]
-    # Out, zero before:
-    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
-    sums: wp.array3d(dtype=wp.int64),  # [row, block, 2], sums of their x and y, from the block's corner
-):
-    """Gather the frontier cells of a line of cells in their blocks."""
-    row, y = wp.tid()
-    m = grid_of_row[row]
-    if m < 0:
-        return
-    w = grids.width[m]
-    if y >= grids.height[m]:
-        return
-    b = block[m]
-    first = y / b * ((w + b - 1) / b)
-    line = frontier[row]
-    for x in range(w):
-        if line[y * w + x] != wp.uint8(0):
-            k = first + x / b
-            wp.atomic_add(size, row, k, 1)
-            wp.atomic_add(sums, row, k, 0, wp.int64(x % b))
-            wp.atomic_add(sums, row, k, 1, wp.int64(y % b))
-
-
-@wp.kernel
-def _place_targets(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row], -1: leave it as it is
-    block: wp.array(dtype=wp.int32),  # [grid], side of a block in cells
-    search: wp.array(dtype=wp.int32),  # [grid], how far outside its block a target may lie, in cells
-    # In:
-    size: wp.array2d(dtype=wp.int32),  # [row, block], frontier cells
-    sums: wp.array3d(dtype=wp.int64),  # [row, block, 2]
-    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
-    # Settings:
-    rows_per_env: int,
-    robots: int,
-    # Out:
-    target_cell: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
-):
-    """The reached cell nearest to the middle of a block's frontier cells, in the block or close to it."""
-    row, k = wp.tid()
-    m = grid_of_row[row]
-    if m < 0:
-        return
-    target_cell[row, k] = -1
-    count = size[row, k]
-    if count == 0:
-        return
-    w = grids.width[m]
-    h = grids.height[m]
-    b = block[m]
-    across = (w + b - 1) / b
-    x0 = (k % across) * b
-    y0 = (k / across) * b
-    e = row / rows_per_env
-    first = wp.where(rows_per_env > 1, row % rows_per_env, 0)
-    last = wp.where(rows_per_env > 1, first + 1, robots)
-    s = search[m]
-    best_gap = wp.int64(1) << wp.int64(62)
-    for y in range(wp.max(y0 - s, 0), wp.min(wp.min(y0 + b, h) + s, h)):
-        for x in range(wp.max(x0 - s, 0), wp.min(wp.min(x0 + b, w) + s, w)):
-            # Compared after scaling by `count`, which keeps the mean in integers; 64 bits, for blocks may be large.
-            gap_x = wp.int64(x - x0) * wp.int64(count) - sums[row, k, 0]
-            gap_y = wp.int64(y - y0) * wp.int64(count) - sums[row, k, 1]
-            gap = gap_x * gap_x + gap_y * gap_y
-            if gap < best_gap:
-                if is_reached(distance, e, first, last, robots, y * w + x):
-                    best_gap = gap
-                    target_cell[row, k] = y * w + x
-
-
-@wp.kernel
-def _spread_rays(
-    # Out:
-    cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], from the middle
-    way: wp.array(dtype=wp.vec2),  # [ray], unit vectors
-):
-    """The cells that each ray goes through."""
-    ray, step = wp.tid()
-    ux = wp.cos((float(ray) + 0.5) * RAY_ANGLE)
-    uy = wp.sin((float(ray) + 0.5) * RAY_ANGLE)
-    t = float(step)
-    cell[ray, step] = wp.vec2i(int(wp.floor(t * ux + 0.5)), int(wp.floor(t * uy + 0.5)))
-    if step == 0:
-        way[ray] = wp.vec2(ux, uy)
-
-
-@wp.kernel
-def _look_around(
-    # Map:
-    grids: NavGrids,
-    grid_of_row: wp.array(dtype=wp.int32),  # [row]
-    # In:
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
-    target_cell: wp.array2d(dtype=wp.int32),  # [row, target], -1 = none
-    ray_cell: wp.array2d(dtype=wp.vec2i),  # [ray, step], as far as the radius in every grid
-    ray_way: wp.array(dtype=wp.vec2),  # [ray]
-    # Settings:
-    radius: float,  # [m]
-    # Out:
-    area: wp.array2d(dtype=wp.float32),  # [row, target], unknown cells in sight of the target
-    middle: wp.array2d(dtype=wp.vec2),  # [row, target], the middle of those, from the target [m]
-):
-    """What a robot at each target might see for the first time: known walls hide what is behind them.
-
-    `RAYS` rays go out cell by cell, as far as the radius or a known obstacle; a cell of a ray stands for the share
-    of its circle that falls to one ray.
-    """
-    row, k = wp.tid()
-    m = grid_of_row[row]
-    cell = target_cell[row, k]
-    total = wp.float32(0.0)
-    moment = wp.vec2(0.0, 0.0)
-    if cell >= 0:
-        w = grids.width[m]
-        h = grids.height[m]
-        reach = int(radius / grids.cell[m])
-        x = cell % w
-        y = cell / w
-        line = known[row]
-        for ray in range(RAYS):
-            u = x
-            v = y
-            for step in range(1, reach + 1):
-                at = ray_cell[ray, step] + wp.vec2i(x, y)
-                if at[0] < 0 or at[0] >= w or at[1] < 0 or at[1] >= h:
-                    break
-                state = line[at[1] * w + at[0]]
-                if state == wp.uint8(OBSTACLE):
-                    break
-                if at[0] != u and at[1] != v:  # not between two walls that touch at a corner either
-                    if line[at[1] * w + u] == wp.uint8(OBSTACLE) and line[v * w + at[0]] == wp.uint8(OBSTACLE):
-                        break
-                if state == wp.uint8(UNKNOWN):
-                    part = float(step) * RAY_ANGLE
-                    total += part
-                    moment += ray_way[ray] * (part * float(step))
-                u = at[0]
-                v = at[1]
-    area[row, k] = total
-    middle[row, k] = moment * (grids.cell[m] / wp.max(total, 1.0e-6))
-
-
 @wp.kernel
 def _find_open_ground(
     # Map:
@@ -223,6 +57,7 @@ def _find_open_ground(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # In:
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    walls: wp.array2d(dtype=wp.int32),  # [row, word]
     # Settings:
     rows_per_env: int,
     # In:
@@ -240,7 +75,7 @@ def _find_open_ground(
     for k in range(cell.shape[2]):
         at = cell[e, i, k]
         if not open and known[row, at] != wp.uint8(OBSTACLE):
-            open = not near_wall(known, row, at % w, at / w, w, grids.height[m], room[e, i] / grids.cell[m])
+            open = not near_wall(walls, row, at % w, at / w, w, grids.height[m], room[e, i] / grids.cell[m])
     found[e, i] = open
 
 
@@ -272,3 +107,173 @@ def _first_cells(
             passable, row_of_item[item], distance, item, here, grids.width[m], grids.height[m]
         )
     cell[e, i, k] = here
+
+
+@wp.kernel
+def _list_targets(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
+    rows_per_env: int,
+    # In:
+    env: wp.array(dtype=wp.int32),  # [look]
+    listed: wp.array2d(dtype=wp.int32),  # [env, slot], blocks
+    count: wp.array(dtype=wp.int32),  # [env]
+    target_cell: wp.array2d(dtype=wp.int32),  # [row, block]
+    size: wp.array2d(dtype=wp.int32),  # [row, block]
+    distance: wp.array2d(dtype=wp.int32),  # [item, cell]
+    # Out:
+    block: wp.array3d(dtype=wp.int64),  # [look, 1, slot], -1 fills up
+    cell: wp.array3d(dtype=wp.int64),  # [look, row, slot], -1 = none
+    point: wp.array3d(dtype=wp.vec2),  # [look, robot, slot] [m]
+    way: wp.array3d(dtype=wp.float32),  # [look, robot, slot] [m], infinite: none
+    around: wp.array3d(dtype=wp.float32),  # [look, robot, slot], frontier cells of the block
+):
+    """The blocks with a target of the envs looked at, side by side."""
+    s, slot = wp.tid()
+    e = env[s]
+    m = map_id[e]
+    k = wp.int32(-1)
+    if slot < count[e]:
+        k = listed[e, slot]
+    block[s, 0, slot] = wp.int64(k)
+    robots = way.shape[1]
+    for i in range(robots):
+        r = wp.where(rows_per_env > 1, i, 0)
+        at = wp.int32(-1)
+        if k >= 0:
+            at = target_cell[e * rows_per_env + r, k]
+            around[s, i, slot] = float(size[e * rows_per_env + r, k])
+        else:
+            around[s, i, slot] = 0.0
+        cell[s, r, slot] = wp.int64(at)
+        point[s, i, slot] = nav_center(grids, m, wp.max(at, 0))
+        way[s, i, slot] = wp.inf
+        if at >= 0:
+            steps = distance[e * robots + i, at]
+            if steps < UNREACHED:
+                way[s, i, slot] = float(steps) * (grids.cell[m] / float(STRAIGHT))
+
+
+@wp.kernel
+def _note_stuck(
+    # Settings:
+    least: float,  # a robot that has moved less since the last decision is stuck [m]
+    # In:
+    env: wp.array(dtype=wp.int32),  # [look]
+    # State in:
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    active: wp.array(dtype=wp.int32),  # [env]
+    collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # In:
+    counted: wp.array(dtype=wp.int32),  # [env], the macro step of the last count
+    # In and out:
+    chosen: wp.array3d(dtype=wp.int64),  # [env, robot, 1], the block it was on the way to; -1 = none
+    stood: wp.array2d(dtype=wp.vec2),  # [env, robot], where it was at the last decision [m]
+    dwell: wp.array3d(dtype=wp.int32),  # [env, robot, block], decisions in vain
+):
+    """Forget what was of another episode, and count decisions of robots that are stuck on the way to a target."""
+    s, i = wp.tid()
+    e = env[s]
+    if macro_step[e] == 0:
+        chosen[e, i, 0] = wp.int64(-1)
+        for k in range(dwell.shape[2]):
+            dwell[e, i, k] = 0
+    elif macro_step[e] == counted[e]:
+        return
+    at = point_xy(center[e, i])
+    k = int(chosen[e, i, 0])
+    if k >= 0 and active[e] != 0 and collided[e, i] == 0 and wp.sqrt(squared(at - stood[e, i])) < least:
+        dwell[e, i, k] = dwell[e, i, k] + 1
+    stood[e, i] = at
+
+
+@wp.kernel
+def _count_visits(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    # Settings:
+    clearance: float,  # [m]
+    shared: int,  # 1: what one robot finds out all know
+    # In:
+    env: wp.array(dtype=wp.int32),  # [look]
+    # State in:
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    # In:
+    counted: wp.array(dtype=wp.int32),  # [env]
+    block: wp.array3d(dtype=wp.int64),  # [look, 1, slot]
+    way: wp.array3d(dtype=wp.float32),  # [look, robot, slot]
+    point: wp.array3d(dtype=wp.vec2),  # [look, robot, slot]
+    # In and out:
+    dwell: wp.array3d(dtype=wp.int32),  # [env, robot, block]
+):
+    """Count decisions beside a target, within a clearance or one and a half cells."""
+    s, slot = wp.tid()
+    e = env[s]
+    k = int(block[s, 0, slot])
+    if k < 0 or (macro_step[e] != 0 and macro_step[e] == counted[e]):
+        return
+    near = wp.max(1.5 * grids.cell[map_id[e]], clearance)
+    met = wp.bool(False)
+    for i in range(dwell.shape[1]):
+        if way[s, i, slot] < wp.inf:
+            if wp.sqrt(squared(point[s, i, slot] - point_xy(center[e, i]))) <= near:
+                met = wp.bool(True)
+                if shared == 0:
+                    dwell[e, i, k] = dwell[e, i, k] + 1
+    if met and shared != 0:
+        for i in range(dwell.shape[1]):
+            dwell[e, i, k] = dwell[e, i, k] + 1
+
+
+@wp.kernel
+def _drop_targets(
+    # Settings:
+    most: int,  # decisions in vain after which a target is given up
+    # In:
+    env: wp.array(dtype=wp.int32),  # [look]
+    # State in:
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    # In:
+    block: wp.array3d(dtype=wp.int64),  # [look, 1, slot]
+    way: wp.array3d(dtype=wp.float32),  # [look, robot, slot]
+    dwell: wp.array3d(dtype=wp.int32),  # [env, robot, block]
+    # Out:
+    kept: wp.array3d(dtype=wp.float32),  # [look, robot, slot], infinite for targets given up
+    left: wp.array(dtype=wp.int32),  # [look], 0 before, 1: some robot has a target left
+    counted: wp.array(dtype=wp.int32),  # [env]
+):
+    s, i = wp.tid()
+    e = env[s]
+    counted[e] = macro_step[e]
+    for slot in range(kept.shape[2]):
+        value = way[s, i, slot]
+        if value < wp.inf:
+            if dwell[e, i, int(block[s, 0, slot])] >= most:
+                value = wp.inf
+            else:
+                left[s] = 1
+        kept[s, i, slot] = value
+
+
+@wp.kernel
+def _try_again(
+    # In:
+    env: wp.array(dtype=wp.int32),  # [look]
+    left: wp.array(dtype=wp.int32),  # [look]
+    way: wp.array3d(dtype=wp.float32),  # [look, robot, slot]
+    # Out:
+    kept: wp.array3d(dtype=wp.float32),  # [look, robot, slot]
+    dwell: wp.array3d(dtype=wp.int32),  # [env, robot, block]
+):
+    """Where a team has no target left, try them all once more."""
+    s, i = wp.tid()
+    if left[s] == 0:
+        for slot in range(kept.shape[2]):
+            kept[s, i, slot] = way[s, i, slot]
+        for k in range(dwell.shape[2]):
+            dwell[env[s], i, k] = 0

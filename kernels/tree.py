@@ -7,8 +7,9 @@ import warp as wp
 
 from maexp.kernels.frontier import FREE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.startup import MODULE_OPTIONS
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 
 

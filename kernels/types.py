@@ -26,6 +26,9 @@ REGIONS = 8
 PIXELS = 125
 """Pixels along one side of the picture of a map."""
 
+PIXEL_SHARED = 1 << 14
+"""Flag beside a pixel's index, above all of them: it shows several free points."""
+
 PICTURE_CHANNELS = 4
 """Of a robot's picture: what it has seen, walls, bodies, its way."""
 CHANNEL_EXPLORED = 0
@@ -100,7 +103,8 @@ class Maps:
     frame_origin: wp.array(dtype=wp.vec2)
     pixel_size: wp.array(dtype=wp.float32)
     # Pixels that show a point, and points that a pixel shows. Points are numbered free first, then boundary;
-    # ``shown_begin`` is the first entry of a map's points in ``point_pixel_begin``.
+    # ``shown_begin`` is the first entry of a map's points in ``point_pixel_begin``. A pixel that a free point
+    # shares with others is flagged in ``point_pixel`` (PIXEL_SHARED).
     shown_begin: wp.array(dtype=wp.int32)  # [M]
     point_pixel_begin: wp.array(dtype=wp.int32)
     point_pixel: wp.array(dtype=wp.int32)

@@ -19,6 +19,7 @@ import warp as wp
 
 from maexp.kernels.launches import Launch
 from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     ERROR_CAPACITY,
     HALF,
@@ -37,7 +38,7 @@ from maexp.kernels.types import (
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 FAR = 1.0e30
 CELL_HALF = 0.709  # half the diagonal of a cell in edges, with room for rounding

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from maexp.kernels.geodesic import BUCKETS, SKIP, UNREACHED, DistanceSearch
+from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.passable import PassableGrids
+from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.state import robots_struct
 from maexp.kernels.stopping import hold_turns
 from maexp.kernels.types import point_xy
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
     from maexp.kernels.simulation import Simulation
 
-wp.set_module_options({"enable_backward": False})  # nobody differentiates: half the time to compile
+wp.set_module_options(MODULE_OPTIONS)
 
 MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
 COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
@@ -174,17 +175,17 @@ def _pick_waypoint(
     chosen = wp.int32(-1)
     nearest = wp.int32(-1)
     nearest_gap = wp.float32(1.0e30)
-    for k in range(kept):
-        j = kept - 1 - k
-        if chosen < 0:
-            cell = path[item, path_slot(j, total)]
-            gap = wp.length(nav_center(grids, m, cell) - at)
-            if gap < nearest_gap:
-                nearest = j
-                nearest_gap = gap
-            if gap <= reach[e, i]:
-                if in_sight(passable, row_of_item[item], here, cell, w):
-                    chosen = j
+    j = kept - 1
+    while j >= 0 and chosen < 0:
+        cell = path[item, path_slot(j, total)]
+        gap = wp.length(nav_center(grids, m, cell) - at)
+        if gap < nearest_gap:
+            nearest = j
+            nearest_gap = gap
+        if gap <= reach[e, i]:
+            if in_sight(passable, row_of_item[item], here, cell, w):
+                chosen = j
+        j -= 1
     path_used[item] = chosen
     if chosen < 0:
         chosen = nearest
@@ -200,9 +201,10 @@ class PathSearch:
     Args:
         passable: where each robot fits.
         mask_of_robot: which of the masks of its env each robot uses, N numbers.
+        shared: as in `DistanceSearch`.
     """
 
-    def __init__(self, passable: PassableGrids, mask_of_robot: np.ndarray):
+    def __init__(self, passable: PassableGrids, mask_of_robot: np.ndarray, shared: bool = False):
         device = passable.passable.device
         rows, cells = passable.passable.shape
         envs, robots = rows // passable.masks, len(mask_of_robot)
@@ -210,7 +212,7 @@ class PathSearch:
         row_of_item = np.arange(envs)[:, None] * passable.masks + np.asarray(mask_of_robot)[None]
         self.passable, self.shape = passable, (envs, robots)
         self.row_of_item = wp.array(row_of_item.reshape(-1), dtype=wp.int32, device=device)
-        self.search = DistanceSearch(items, cells, 1, device)
+        self.search = DistanceSearch(items, cells, 1, device, shared)
         self.path = wp.zeros((items, PATH_CELLS), dtype=wp.int32, device=device)
         self.path_total, self.path_used, self.path_ends = (
             wp.zeros(items, dtype=wp.int32, device=device) for _ in range(3)
@@ -306,7 +308,8 @@ def pick_waypoints(launch: Launch, shard: "Shard") -> None:
 
 
 def grid_memory_per_env(
-    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int
+    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int,
+    shared: bool = False,
 ) -> int:
     """Bytes of the `wavefront` planner's grids and paths for one env (`known_grid`, `passable`, `geodesic`, here).
 
@@ -318,9 +321,10 @@ def grid_memory_per_env(
         points: free and boundary points of the largest maps.
         wall_words: words of the bitmap of walls of the largest grid.
         news: capacity of the list of cells that changed.
-    """
+        shared: as in `DistanceSearch`: all robots search in one place.
+    """  # fmt: skip
     known = known_rows * (cells + points + 4 * (wall_words + news) + 5 * 4)  # bytes, flags, words; counters of a row
     passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
-    search = robots * (3 * 4 * cells + 4 * BUCKETS + 4 * 4)  # distances and lists of buckets, int32; ends
+    search = robots * ((4 if shared else 12) * cells + 4 * 4)  # distances and lists of buckets, int32; ends
     paths = robots * (4 * PATH_CELLS + 4 * 4)  # cells; length, place, end, mask of each
     return known + passable + search + paths

@@ -99,6 +99,16 @@ def uses(function) -> Use:
     return finder.found
 
 
+POINTER = re.compile(r"^ *(const )?[\w:]+\* \w+ = &wp::index\((\w+)", re.MULTILINE)
+
+
+def uses_in_cpp(function: wp.Function) -> Use:
+    """The same of a function in C++, which writes through pointers that are not const."""
+    text = function.native_snippet
+    read = set(re.findall(r"wp::index\((\w+)", text))
+    return Use(read, {name for const, name in POINTER.findall(text) if not const})
+
+
 class Finder(ast.NodeVisitor):
     """Collects reads and writes of arrays, also through names that stand for a row of one."""
 
@@ -145,7 +155,7 @@ class Finder(ast.NodeVisitor):
             self.found.written.add(self.owner(node.args[0]))
         function = self.names.get(called.id) if isinstance(called, ast.Name) else None
         if isinstance(function, wp.Function) and function.func is not None:
-            inside = uses(function.func)
+            inside = uses_in_cpp(function) if function.native_snippet else uses(function.func)
             for given, taken in zip(node.args, parse(function.func).args.args, strict=False):
                 if self.owner(given):
                     for whole, part in ((self.found.read, inside.read), (self.found.written, inside.written)):

@@ -110,7 +110,7 @@ def setups() -> dict:
             dict(planner=dwa, comm=sight, collision="footprint", observation=ObservationConfig(map="known")),
             "hungarian",
         ),
-        "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "voronoi"),
+        "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "oracle"),
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),
     }  # fmt: skip

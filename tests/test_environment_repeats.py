@@ -3,6 +3,8 @@
 import pytest
 import torch
 from episodes import actions, equal, play, step
+from tensordict import TensorDict
+from torchrl.envs import EnvBase
 
 from maexp.envs import ExplorationEnv, PlannerConfig, make_map
 from maexp.kernels import shards as stepping
@@ -51,6 +53,24 @@ def test_episodes_of_an_env_differ_and_resets_are_partial(maps):
             continue
         assert torch.equal(before[name][[0, 2]], after[name][[0, 2]]), name
     assert not torch.equal(before["pose"][1], after["pose"][1])
+
+
+@pytest.mark.parametrize("teams", [[], [1], [0, 2], [0, 1, 2]])
+def test_a_reset_of_some_teams_gives_what_torchrl_would(maps, teams, monkeypatch):
+    """Also where the tensordict holds other keys, or none; what it held stays as it was."""
+    mask = torch.zeros(3, 1, dtype=torch.bool)
+    mask[teams] = True
+    found = []
+    for own in (ExplorationEnv._reset_proc_data, EnvBase._reset_proc_data):
+        monkeypatch.setattr(ExplorationEnv, "_reset_proc_data", own)
+        env = ExplorationEnv(maps[:2], num_envs=3, seed=2, local_steps=5)
+        after = step(env, env.reset().set("own", torch.ones(3, 2)), actions(3, 3, 1)[0])
+        held = after.clone()
+        again = env.reset(after.copy().set("_reset", mask))
+        assert equal(after, held)
+        found.append((again, env.reset(TensorDict({"_reset": mask}, [3]))))
+    for ours, theirs in zip(*found, strict=True):
+        assert set(ours.keys(True, True)) == set(theirs.keys(True, True)) and equal(ours, theirs)
 
 
 def test_evaluation_episodes_depend_on_their_number_alone(maps):

@@ -5,7 +5,8 @@ import pytest
 import torch
 import warp as wp
 
-from maexp.kernels import targets
+from maexp.kernels import blocks, targets
+from maexp.kernels.frontier import FREE, UNKNOWN
 from maexp.kernels.geodesic import STRAIGHT, TIGHT_FACTOR, UNREACHED, geodesic_distance
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import launch_on
@@ -25,20 +26,34 @@ def one_grid(width: int, height: int) -> NavGrids:
     return grids
 
 
+def wall_words_of(width: int) -> int:
+    return -(-width // 32)
+
+
 def test_a_block_of_millions_of_frontier_cells_has_its_target_in_the_middle():
     """Squares of multiples of 1,200 x 1,200 cells pass 2^31 by far."""
     side = 1200
     grids, row = one_grid(side, side), ints([0])
-    frontier = wp.full((1, side * side), 1, dtype=wp.uint8, device="cpu")
-    size, target = (wp.zeros((1, 1), dtype=wp.int32, device="cpu") for _ in range(2))
+    known = np.full((side, side), FREE, np.uint8)
+    known[::2] = UNKNOWN  # every other line: its neighbours are frontier cells
+    known, frontier = (wp.array(one.reshape(1, -1), dtype=wp.uint8, device="cpu") for one in (known, 0 * known))
+    size, target, kept = (wp.full((1, 1), value, dtype=wp.int32, device="cpu") for value in (0, 0, -1))
     sums = wp.zeros((1, 1, 2), dtype=wp.int64, device="cpu")
-    launch(targets._sum_frontier, (1, side), [grids, row, ints([side]), frontier], [size, sums])
-    assert size.numpy()[0, 0] == side**2 and (sums.numpy() == side**2 * (side - 1) // 2).all()
+    changed = ints(np.full((1, wall_words_of(side) * side), -1))
+    launch(
+        blocks._sum_frontier, (1, side), [grids, row, ints([side]), known, changed], [frontier, size, sums]
+    )  # fmt: skip
+    count = side**2 // 2
+    assert size.numpy()[0, 0] == count
+    assert sums.numpy()[0, 0].tolist() == [count * (side - 1) // 2, count * side // 2]
     reached = np.full((1, side * side), UNREACHED)
     corner, middle = 3 * side + 5, (side // 2 + 40) * side + side // 2 - 30
     reached[0, [corner, middle, side * side - 1]] = 7
     launch(
-        targets._place_targets, (1, 1), [grids, row, ints([side]), ints([1]), size, sums, ints(reached), 1, 1], [target]
+        blocks._place_targets, (1, 1),
+        [grids, row, ints([side]), ints([1]), size, sums, ints(reached), changed, row, ints(np.zeros((1, 1, 2))),
+         1, 1, 1],
+        [target, kept],
     )  # fmt: skip
     assert target.numpy()[0, 0] == middle
 

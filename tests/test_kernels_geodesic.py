@@ -152,6 +152,45 @@ def test_tight_cells_weigh_more():
         np.testing.assert_array_equal(search.distance.numpy()[item].reshape(height, width), want)
 
 
+GUARD = UNREACHED + 5  # any label would be lower
+
+
+def guarded(values: np.ndarray) -> tuple[np.ndarray, wp.array]:
+    """Rows between two rows of guards, all of them and the rows themselves as Warp sees them, without gaps."""
+    whole = np.full((len(values) + 2, values.shape[1]), GUARD, np.int32)
+    whole[1:-1] = values
+    return whole, wp.array(ptr=whole[1:].ctypes.data, shape=values.shape, dtype=wp.int32, device="cpu")
+
+
+@pytest.mark.parametrize("directed", [False, True])
+@pytest.mark.parametrize(("height", "width"), [(9, 12), (1, 30), (30, 1), (2, 2), (1, 1)])
+def test_searches_stay_within_their_arrays(height, width, directed):
+    """Grids as large as their arrays, without walls at the edges; what lies around the arrays is open, and guarded."""
+    cells, corners = height * width, [0, width - 1, (height - 1) * width, height * width - 1]
+    search = DistanceSearch(len(corners), cells)
+    whole = {}
+    for name in ("distance", "next", "previous"):
+        whole[name], view = guarded(getattr(search, name).numpy())
+        setattr(search, name, view)
+    search.sources.assign(np.array(corners, np.int32)[:, None])
+    search.stop.assign(np.array(corners[::-1] if directed else [-1] * 4, np.int32))
+    around = np.full((3, cells), geodesic.OPEN, np.uint8)
+    passable = wp.array(ptr=around[1:].ctypes.data, shape=(1, cells), dtype=wp.uint8, device="cpu")
+    lists = ([0] * 4, [0], [width], [height])
+    arrays = [wp.array(v, dtype=wp.int32, device="cpu") for v in lists]
+    for _ in range(2):  # the second begins by clearing
+        search.search(partial(wp.launch, device="cpu"), passable, *arrays)
+    for name, values in whole.items():
+        assert (values[[0, -1]] == GUARD).all(), name
+    assert (search.touched.numpy() >= 0).all() and (search.touched.numpy() < cells).all()
+    for item, corner in enumerate(corners):
+        want = oracle.geodesic_distance(np.ones((height, width), bool), [corner]).ravel()
+        got = search.distance.numpy()[item]
+        kept = [corners[::-1][item]] if directed else slice(None)
+        np.testing.assert_array_equal(got[kept], want[kept])
+        assert (got >= want).all()
+
+
 def test_large_open_grid_takes_less_than_the_promised_time():
     """100 ns per reached cell is promised, about 35 measured; ten times the promise fails, whatever else runs."""
     if wp.config.mode == "debug":

@@ -1,11 +1,15 @@
-"""Map merging against the oracle, and its laws."""
+"""Map merging and who sees whom against the oracle, and the laws of merging."""
+
+import math
 
 import numpy as np
 import pytest
 import torch
 from oracle import team
+from worlds import room
 
 import maexp.kernels as mk
+from maexp.envs import CommConfig, ExplorationEnv, RadarConfig, RobotConfig
 
 pytestmark = pytest.mark.kernels
 
@@ -100,3 +104,25 @@ def test_flags_of_any_team_survive_packing(robots):
     words = _pack(seen, 1)
     assert words.shape == (2, -(-robots // 32), 9) and words.dtype == torch.int32
     assert torch.equal(mk.unpack_flags(words, robots), seen)
+
+
+@pytest.mark.parametrize("reach", [1.5, 6.0, 40.0])
+@pytest.mark.parametrize("kind", ["lattice", "rotated"])
+def test_walls_block_sight_between_robots(kind, reach):
+    """A boundary point within half a diagonal of the spacing of the line; cells of any size, any direction."""
+    world = room(26, 19, kind, 4)
+    env = ExplorationEnv(
+        world, 3, 12, seed=5, robot=RobotConfig(length=0.4, width=0.3, collision_threshold=0.2),
+        radar=RadarConfig(range=reach), comm=CommConfig(line_of_sight=True), num_threads=1,
+    )  # fmt: skip
+    env.reset()
+    center, comm = (env.simulation.tensors[name].numpy() for name in ("center", "comm"))
+    width, blocked, pairs = math.sqrt(0.5) * world.resolution, 0, 0
+    for e in range(3):
+        for i in range(12):
+            for k in range(i):
+                gap = team.wall_gap(center[e, i, :2], center[e, k, :2], world.boundary[:, :2])
+                if abs(gap - width) > 1e-5:
+                    assert comm[e, i, k] == comm[e, k, i] == (gap > width), (gap, width)
+                    blocked, pairs = blocked + (gap < width), pairs + 1
+    assert 20 < blocked < pairs - 20

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from oracle import pace as oracle
 
-from maexp.kernels import pace, stopping, targets
+from maexp.kernels import outlook, pace, stopping
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, Robots
@@ -204,6 +204,36 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
     assert seen == {0, 1, 2}
 
 
+@wp.kernel(enable_backward=False)
+def _measure(
+    grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32), at: wp.array(dtype=wp.vec2), out: wp.array(dtype=float)
+):  # fmt: skip
+    k = wp.tid()
+    out[k] = pace.nearest_obstacle(grids, m, walls, 0, at[k])
+
+
+@pytest.mark.parametrize("m", [0, 1])
+@pytest.mark.parametrize("share", [0.02, 0.3])
+def test_the_nearest_obstacle_is_one_of_the_grid_alone(m, share):
+    """Also from places at its edges and beyond them; all bits around the rows of the grid are set."""
+    rng = np.random.default_rng(5)
+    height, width = SIZES[m]
+    words = -(-width // 32)
+    bits = np.zeros((height, 32 * words), bool)
+    bits[:, :width] = rng.random((height, width)) < share
+    around = np.full((3, height * words), -1, np.int32)
+    around[1] = np.packbits(bits, bitorder="little").view(np.int32)
+    walls = wp.array(ptr=around[1:].ctypes.data, shape=(1, height * words), dtype=wp.int32, device="cpu")
+    places = rng.uniform(-7, np.array([width, height]) + 7, (4000, 2))
+    got = wp.zeros(len(places), dtype=float, device="cpu")
+    launch(_measure, len(places), [nav_grids(), m, walls, array(places * CELL[m] + ORIGIN[m], wp.vec2)], [got])
+    centres = np.argwhere(bits)[:, ::-1] + 0.5
+    gaps = np.linalg.norm(places[:, None] - centres[None], axis=-1)
+    near = (np.abs(np.floor(places)[:, None] + 0.5 - centres[None]) <= pace.LOOK_CELLS).all(-1)
+    want = np.where(near, gaps, pace.LOOK_CELLS).min(axis=1, initial=pace.LOOK_CELLS)
+    np.testing.assert_allclose(got.numpy() / CELL[m], want, atol=1e-4)
+
+
 def test_what_is_to_be_seen_from_a_target_ends_at_walls():
     for seed in range(3):
         world = World(seed, obstacles=0.06)
@@ -211,10 +241,10 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
         target = np.stack([world.rng.integers(-1, known.size, blocks) for known in world.known])
         area, middle = wp.zeros((3, blocks), dtype=float), wp.zeros((3, blocks), dtype=wp.vec2)
         radius = 6.1
-        rays = [wp.zeros((targets.RAYS, 14), dtype=wp.vec2i), wp.zeros(targets.RAYS, dtype=wp.vec2)]
-        launch(targets._spread_rays, rays[0].shape, [], rays)
+        rays = [wp.zeros((outlook.RAYS, 14), dtype=kind) for kind in (wp.vec2i, wp.vec3)]
+        launch(outlook._spread_rays, rays[0].shape, [], rays)
         launch(
-            targets._look_around, (3, blocks),
+            outlook._look_around, (3, blocks),
             [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), array(target, wp.int32), *rays,
              radius],
             [area, middle],
@@ -224,6 +254,6 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
             want = (0.0, 0.0, 0.0)
             if target[e, k] >= 0:
                 place = target[e, k] % width, target[e, k] // width
-                want = oracle.look_around(world.known[e], *place, int(radius / cell), targets.RAYS)
+                want = oracle.look_around(world.known[e], *place, int(radius / cell), outlook.RAYS)
             got = area.numpy()[e, k], *(middle.numpy()[e, k] / cell)
             np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-3)

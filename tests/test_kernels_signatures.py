@@ -48,7 +48,8 @@ def test_no_argument_is_there_for_nothing():
     assert len(KERNELS) > 40 and len(FUNCTIONS) > 40
     for name, function in {**KERNELS, **FUNCTIONS}.items():
         taken = [one.arg for one in parse(function.func).args.args]
-        assert not set(taken) - uses(function.func).named, name
+        in_cpp = set(re.findall(r"\w+", getattr(function, "native_snippet", None) or ""))
+        assert not set(taken) - uses(function.func).named - in_cpp, name
 
 
 def test_one_dialect():

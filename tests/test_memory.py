@@ -1,5 +1,7 @@
 """Memory: what is counted before a batch is made is what it takes."""
 
+import math
+
 import pytest
 import torch
 import warp as wp
@@ -7,8 +9,10 @@ from torchrl.data import Bounded
 
 from maexp.agents.errors import UserError
 from maexp.agents.memory import check_batch_memory
-from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, make_map
-from maexp.envs.simulation import bytes_per_env
+from maexp.agents.policies import POLICIES
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map, simulation
+from maexp.envs.simulation import bytes_per_env, navigation_bytes
+from maexp.envs.targets import TargetTracker
 from maexp.kernels.geodesic import DistanceSearch
 from maexp.kernels.known_grid import KnownGrids
 from maexp.kernels.passable import PassableGrids
@@ -27,6 +31,35 @@ def test_memory_is_counted_before_it_is_taken(limited):
     for block in env.simulation.blocks:
         taken += sum(grid.capacity for grid in arrays_of(block.wavefront))
     assert bytes_per_env(env.settings, env.bank) * 6 == pytest.approx(taken, rel=0.02)
+
+
+@pytest.mark.parametrize("reach", [math.inf, 20.0])
+def test_what_a_policy_keeps_is_counted_before_it_is_taken(reach):
+    """Its navigation, and how often each robot went to each target in vain; maps of two sizes."""
+    env = ExplorationEnv(
+        [make_map("maze_small", 0), make_map("maze", 0)], num_envs=40, num_robots=3, comm=CommConfig(range=reach)
+    )
+    tracker = TargetTracker(env)
+    nav = tracker.nav
+    taken = sum(one.capacity for one in arrays_of(nav.known_grids, nav.passable, nav.paths, nav.blocks))
+    taken += sum(one.nbytes for one in tracker.state.values())
+    assert navigation_bytes(env.settings, env.bank) * 40 == pytest.approx(taken, rel=0.02)
+
+
+def test_a_policy_too_large_is_refused(monkeypatch):
+    env = ExplorationEnv(make_map("maze_small", 0), num_envs=4)
+    need = navigation_bytes(env.settings, env.bank)
+    monkeypatch.setattr(simulation, "free_memory", lambda device: 3 * need)
+    with pytest.raises(ValueError, match=r"num_envs=4 needs 0.0 GiB .*: lower num_envs to 3"):
+        POLICIES["cost_utility"](env)
+
+
+def test_an_env_that_shows_targets_counts_what_they_need():
+    sizes = []
+    for shown in (ObservationConfig(), ObservationConfig(targets=6)):
+        env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, observation=shown)
+        sizes.append(bytes_per_env(env.settings, env.bank))
+    assert sizes[1] - sizes[0] == navigation_bytes(env.settings, env.bank) > 40_000
 
 
 def arrays_of(*owners) -> list[wp.array]:

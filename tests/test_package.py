@@ -76,6 +76,7 @@ def test_the_wheel_holds_code_settings_and_policies(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {f"maexp/{path.relative_to(ROOT)}" for room in ROOMS for path in (ROOT / room).rglob("*.py")}
     wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
+    wanted.add("maexp/kernels/loops.h")
     shipped = [path for path in (ROOT / "agents" / "shipped").rglob("*") if path.is_file()]
     wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in shipped}
     assert len(shipped) >= 8 and wanted <= names, wanted - names

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from runtime_cases import Moment, moments
+from worlds import ways_to_blocks
 
 from maexp.agents.policies import classical
 from maexp.agents.runtime import CHOICES, TeamPlanner, choices, features, frontiers, values, ways
@@ -16,7 +17,7 @@ from maexp.agents.runtime.grid import FREE, UNKNOWN, read_grid
 from maexp.agents.runtime.team import read_team
 from maexp.envs import RobotConfig, target_view
 from maexp.envs import targets as env_targets
-from maexp.kernels import geodesic, targets, wavefront
+from maexp.kernels import geodesic, outlook, wavefront
 from maexp.kernels import ways as kernel_ways
 
 CASES = {
@@ -56,7 +57,7 @@ def test_numbers_are_those_of_the_kernels_and_policies():
         (ways, geodesic, ("STRAIGHT", "DIAGONAL", "TIGHT_FACTOR", "UNREACHED", "BLOCKED", "OPEN", "TIGHT")),
         (ways, wavefront, ("MARGIN_CELLS", "COMFORT")),
         (ways, kernel_ways, ("SNAP_CELLS",)),
-        (frontiers, targets, ("RAYS",)),
+        (frontiers, outlook, ("RAYS",)),
         (values, env_targets, ("BETA", "LEAST_GAIN")),
         (features, target_view, ("FAR", "WAY_AHEAD", "FEATURES")),
     ):
@@ -75,7 +76,7 @@ def test_targets_ways_and_gains_are_those_of_the_kernels(name):
         assert np.array_equal(scene.targets.size, nav.size[0, 0].numpy()[there >= 0])
         cells = scene.distance[0].size
         assert np.array_equal(scene.distance.reshape(-1, cells), nav.distance[0, alive, :cells].numpy())
-        travel = nav.travel()[0, alive][:, there >= 0].numpy()
+        travel = ways_to_blocks(nav)[0, alive][:, there >= 0].numpy()
         np.testing.assert_allclose(scene.travel, travel, rtol=1e-6)
         area, middle = (value[0, 0, there >= 0].numpy() for value in nav.look_around(nav.radar_range))
         disc = np.pi * (nav.radar_range / now.call["resolution"]) ** 2
@@ -113,7 +114,7 @@ def total_way(nav, goals) -> float:
     points = nav.points(nav.target.clamp_min(0))[0]
     gap = (points - torch.as_tensor(goals).unsqueeze(1)).norm(dim=-1)
     nearest = gap.masked_fill(nav.target[0, :1] < 0, torch.inf).argmin(-1)
-    return float(nav.travel()[0].gather(1, nearest.unsqueeze(1)).sum())
+    return float(ways_to_blocks(nav)[0].gather(1, nearest.unsqueeze(1)).sum())
 
 
 def test_trees_find_frontiers_as_those_of_the_kernels_do():

@@ -57,7 +57,7 @@ def test_steps_observations_and_plans_go_to_the_current_stream(planner, limited,
     assert {"_place_team", "_draw_points", "_observe_pose"} <= recorder.kernels("first")
     for recorder.now, policy in zip(("second", "third", "fourth"), chooser.values(), strict=True):
         td = policy(td)
-        assert {"_paint_points", "_search_distance", "_look_around"} <= recorder.kernels(recorder.now)
+        assert {"_paint_points", "_search_distance", "_look_from_targets"} <= recorder.kernels(recorder.now)
         td = env.step(td)["next"].exclude("reward")
         assert {"_plan_dwa", "_scan_free", "_draw_points"} <= recorder.kernels(recorder.now)
     env.step(td.update(act(env, torch.Generator().manual_seed(0))))

@@ -6,6 +6,7 @@ import pytest
 import torch
 from oracle.targets import columns as oracle_columns
 from torchrl.envs.utils import check_env_specs, step_mdp
+from worlds import ways_to_blocks
 
 from maexp.agents.algorithms.table import find_algorithm
 from maexp.agents.networks.actor import make_policy
@@ -137,6 +138,14 @@ def test_a_saved_state_goes_on_bit_for_bit(planner):
     other.load_state_dict(env.state_dict())
     for a, b in zip(play(env, 3, td.clone()), play(other, 3, td.clone()), strict=True):
         assert torch.equal(a[TARGETS], b[TARGETS])
+    state = env.state_dict()
+    wide = [name for name, value in state.items() if name.startswith("target") and value.dtype == torch.int32]
+    state |= {name: state[name].long() for name in wide}
+    assert wide
+    other.load_state_dict(state)  # a kernel would read wider numbers as others
+    assert all(value.dtype == env.state_dict()[name].dtype for name, value in other.state_dict().items())
+    a, b = (play(one, 2, td.clone())[-1] for one in (env, other))
+    assert torch.equal(a[TARGETS], b[TARGETS])
     with pytest.raises(ValueError, match="target"):
         other.load_state_dict(ExplorationEnv(MAPS, num_envs=4, num_threads=1).state_dict())
 
@@ -172,7 +181,7 @@ def test_features_agree_with_their_definitions(reach):
     view, robots = env.target_view, env.num_robots
     nav, state, sim = view.tracker.nav, view.state, env.simulation
     block = state["block"]
-    theirs = [nav.travel()[:, j : j + 1].expand(-1, robots, -1).gather(2, block) for j in range(robots)]
+    theirs = [ways_to_blocks(nav)[:, j : j + 1].expand(-1, robots, -1).gather(2, block) for j in range(robots)]
     ways = torch.stack(theirs, -1)
     speed = sim.tensors["pose"][..., 2].abs()
     area, _ = nav.look_around(nav.radar_range)

@@ -76,3 +76,10 @@ def act(env: ExplorationEnv, generator: torch.Generator):
     td["agents", "action", "region"] = torch.randint(64, (e, n), generator=generator)
     td["agents", "action", "offset"] = torch.rand(e, n, 2, generator=generator) * 2.0 - 1.0
     return td
+
+
+def ways_to_blocks(nav) -> torch.Tensor:
+    """Way from every robot of a `Navigation` to the target of every block [m]: float32 [E, N, K], infinite: none."""
+    ways = torch.full((*nav.way.shape[:2], nav.num_blocks + 1), torch.inf)
+    ways.scatter_(2, (nav.block + 1).expand(nav.way.shape), nav.way)  # entry 0 takes what fills up
+    return ways[..., 1:]

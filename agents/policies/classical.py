@@ -107,7 +107,7 @@ class FrontierPlanner:
 
     def look(self) -> Scene:
         """What there is to choose from."""
-        return self.tracker.look(compact=True)
+        return self.tracker.look()
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -135,7 +135,7 @@ class OraclePlanner(FrontierPlanner):
         scene, nav = super().look(), self.tracker.nav
         seen = torch.where(nav.known == UNKNOWN, UNKNOWN, FREE)
         truth = torch.where(self.open[nav.state["map_id"].long()].unsqueeze(1), seen, OBSTACLE).to(torch.uint8)
-        gain, middle = self.tracker.outlook(nav.cell, truth)
+        gain, middle = self.tracker.outlook(truth)
         return replace(scene, gain=gain, middle=middle)
 
 

@@ -1,4 +1,4 @@
-"""Frontiers, the targets they are gathered in and what can be seen from there: `maexp.kernels.frontier` and `targets`.
+"""Frontiers, the targets they are gathered in and what can be seen from there: `maexp.kernels.targets` and `outlook`.
 
 A frontier cell is a free one that shares an edge with an unknown one. Frontier cells are gathered in square blocks,
 each with one cell to go to.

@@ -11,7 +11,7 @@ import torch
 from maexp.envs import ExplorationEnv
 from maexp.kernels.shadows import BINS
 from maexp.kernels.shards import Shard
-from maexp.kernels.types import PIXELS
+from maexp.kernels.types import PIXEL_SHARED, PIXELS
 
 SAMPLE = 64  # robots that are looked at one by one
 
@@ -55,6 +55,7 @@ def count_sizes(env: ExplorationEnv, shard: Shard) -> dict[str, float]:
         "drawn_points": float(seen) / robots,
         "team_points": float(known) / robots,
         "pixels_per_point": float(shown["point_pixel"].mean()),
+        "shared_pixels": float((env.bank.arrays["point_pixel"] >= PIXEL_SHARED).mean()),
         "points_per_pixel": float(shown["pixel_point"][shown["pixel_point"] > 0].mean()),
         "track": float(torch.clamp(s["local_step"][part] + 1, max=sizes["T"]).double().mean()),
         "pixels_tested": _pixels_tested(env),

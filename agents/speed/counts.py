@@ -133,10 +133,10 @@ def draw_points(c: Counts) -> Cost:
     """Viewers of every point of the map; flags and pixels of what each robot and the team have seen."""
     share = 1 / c["robots"]
     known, drawn, pixels = c["team_points"], c["drawn_points"], c["pixels_per_point"]
-    flags = share * c["map_points"] * WORD + known * (2 * WORD + WORD * c["words"])
-    viewers = known * pixels * (2 * WORD + c["points_per_pixel"] * 2 * WORD)
-    moved = flags + drawn * pixels * (WORD + 1) + known * pixels * (WORD + 3) + viewers
-    return Cost(moved, share * c["map_points"] + drawn * 4 + known * (c["words"] + pixels * 4))
+    flags = share * c["map_points"] * WORD + known * (2 * WORD + pixels * WORD * c["words"])
+    viewers = known * pixels * c["shared_pixels"] * (2 * WORD + c["points_per_pixel"] * 2 * WORD)
+    moved = flags + drawn * pixels + known * pixels * (WORD + 2) + viewers
+    return Cost(moved, share * c["map_points"] + drawn * pixels * 4 + known * pixels * (c["words"] + 4))
 
 
 def list_bodies(c: Counts) -> Cost:

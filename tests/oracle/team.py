@@ -23,6 +23,16 @@ def merge_maps(seen, comm) -> np.ndarray:
     return known
 
 
+def wall_gap(a, b, boundary) -> float:
+    """Least distance of boundary points (B, 2) to the segment from a to b [m]; inf where there are none."""
+    a, along = np.asarray(a, np.float64), np.asarray(b, np.float64) - np.asarray(a, np.float64)
+    least = math.inf
+    for point in np.asarray(boundary, np.float64):
+        t = min(max(np.dot(point - a, along) / max(np.dot(along, along), 1e-12), 0.0), 1.0)
+        least = min(least, float(np.linalg.norm(point - a - t * along)))
+    return least
+
+
 def area_weights(spacing) -> np.ndarray:
     """Weight of each free point: spacing squared [m^2]."""
     return np.asarray([float(s) ** 2 for s in spacing])

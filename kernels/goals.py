@@ -1,0 +1,108 @@
+"""Goals of robots: where each goes that has chosen a target or none, and the region and offset of a point.
+
+Numbers at random come from (seed, env, episode, macro step) alone: no generator's state, and the same for env i in any
+batch.
+"""
+
+import warp as wp
+
+from maexp.kernels.known_grid import NavGrids, nav_center
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import REGIONS
+
+wp.set_module_options(MODULE_OPTIONS)
+
+# The finaliser of splitmix64 (Steele et al. 2014); in C++, for Warp's constants end below 2^63.
+UNIFORM = """
+    const wp::int32 parts[5] = {seed, env_id, episode, macro_step, index};
+    wp::uint64 key = 0;
+    for (int k = 0; k < 5; ++k)
+    {
+        key += (wp::uint64)(wp::int64)parts[k] + 0x9E3779B97F4A7C15ull;
+        key = (key ^ (key >> 30)) * 0xBF58476D1CE4E5B9ull;
+        key = (key ^ (key >> 27)) * 0x94D049BB133111EBull;
+        key = key ^ (key >> 31);
+    }
+    return (key >> 40) / 16777216.0f;
+"""
+
+
+@wp.func_native(UNIFORM)
+def keyed_uniform(seed: int, env_id: int, episode: int, macro_step: int, index: int) -> float:
+    """A number in [0, 1)."""
+    ...
+
+
+@wp.kernel
+def _draw_uniform(
+    # State in:
+    seed: wp.array(dtype=wp.int32),  # [1]
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    # Out:
+    draw: wp.array3d(dtype=wp.float32),  # [env, robot, number]
+):
+    e, i, k = wp.tid()
+    draw[e, i, k] = keyed_uniform(seed[0], env_id[e], episode[e], macro_step[e], i * draw.shape[2] + k)
+
+
+@wp.kernel
+def _aim(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    lower: wp.array(dtype=wp.vec2),  # [map]
+    upper: wp.array(dtype=wp.vec2),  # [map]
+    # State in:
+    seed: wp.array(dtype=wp.int32),  # [1]
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
+    macro_step: wp.array(dtype=wp.int32),  # [env]
+    # In:
+    chosen: wp.array2d(dtype=wp.int64),  # [env, robot], -1 = no target: it goes anywhere
+    # In and out:
+    cell: wp.array2d(dtype=wp.int64),  # [env, robot], where the target is; -1 without one
+    # Out:
+    toward: wp.array2d(dtype=wp.vec2),  # [env, robot], 0 without a target, else as it is
+    target: wp.array2d(dtype=wp.vec2),  # [env, robot] [m]
+):
+    e, i = wp.tid()
+    m = map_id[e]
+    if chosen[e, i] >= wp.int64(0):
+        target[e, i] = nav_center(grids, m, int(cell[e, i]))
+    else:
+        x = keyed_uniform(seed[0], env_id[e], episode[e], macro_step[e], 2 * i)
+        y = keyed_uniform(seed[0], env_id[e], episode[e], macro_step[e], 2 * i + 1)
+        cell[e, i] = wp.int64(-1)
+        toward[e, i] = wp.vec2(0.0, 0.0)
+        target[e, i] = lower[m] + wp.cw_mul(wp.vec2(x, y), upper[m] - lower[m])
+
+
+@wp.func
+def split(at: float, lower: float, side: float):
+    """Number of the interval that a coordinate lies in, of `REGIONS`, and where in it, from -1 to 1."""
+    share = (at - lower) / wp.max(side, 1.0e-9) * float(REGIONS)
+    index = wp.clamp(wp.floor(share), 0.0, float(REGIONS - 1))
+    return int(index), wp.clamp((share - index) * 2.0 - 1.0, -1.0, 1.0)
+
+
+@wp.kernel
+def _to_action(
+    # Map:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    lower: wp.array(dtype=wp.vec2),  # [map]
+    upper: wp.array(dtype=wp.vec2),  # [map]
+    # In:
+    point: wp.array2d(dtype=wp.vec2),  # [env, robot] [m]
+    # Out:
+    region: wp.array2d(dtype=wp.int64),  # [env, robot]
+    offset: wp.array2d(dtype=wp.vec2),  # [env, robot], from -1 to 1
+):
+    e, i = wp.tid()
+    low = lower[map_id[e]]
+    side = upper[map_id[e]] - low
+    x, right = split(point[e, i][0], low[0], side[0])
+    y, up = split(point[e, i][1], low[1], side[1])
+    region[e, i] = wp.int64(x * REGIONS + y)
+    offset[e, i] = wp.vec2(right, up)

@@ -1,0 +1,109 @@
+"""What a planner knows of its env: the team's grid, targets and ways to them, places as actions, open ground."""
+
+import numpy as np
+import pytest
+import torch
+from mazes import OFFSET, REGION, make_env
+from oracle.grid import frontier_cells, geodesic_distance
+from worlds import ways_to_blocks
+
+from maexp.envs import RobotConfig, make_map
+from maexp.envs.navigation import Navigation
+from maexp.envs.targets import keyed_uniform
+from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.geodesic import UNREACHED
+
+
+def test_navigation_shows_what_the_team_knows():
+    env = make_env(3)
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    for e in range(3):
+        shot = env.snapshot(e)
+        place = shot["map"]
+        side = int(round(place.extent[1][0] - place.extent[0][0])) + 1
+        known = np.zeros((side, side), np.uint8)
+        for points, seen, kind in (
+            (place.free, shot["seen_free"], FREE), (place.boundary, shot["seen_boundary"], OBSTACLE)
+        ):  # fmt: skip
+            cells = np.round(points[seen.any(axis=0)][:, :2] - np.array(place.extent[0])).astype(int)
+            known[cells[:, 1], cells[:, 0]] = kind
+        got = nav.known[e, 0].numpy()[: side * side].reshape(side, side)
+        np.testing.assert_array_equal(got, known)
+        want = frontier_cells(known == FREE, known == OBSTACLE)
+        np.testing.assert_array_equal(nav.frontier[e, 0].numpy()[: side * side].reshape(side, side) != 0, want)
+        assert nav.size[e, 0].sum() == want.sum() > 0
+        for cell in nav.target[e, 0][nav.target[e, 0] >= 0].tolist():
+            assert known.flat[cell] == FREE
+    assert (known == UNKNOWN).any()
+
+
+def test_travel_and_points_of_targets():
+    env = make_env(2, robot=RobotConfig(collision_threshold=0.1))  # nothing is tight: plain distances
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    travel = ways_to_blocks(nav)
+    for e in range(2):
+        w = int(nav.width[nav.state["map_id"][e]])
+        known = nav.known[e, 0].numpy()[: w * w].reshape(w, w)
+        for i in range(3):
+            x, y = np.floor(nav.centers()[e, i].numpy() + 0.5).astype(int)
+            want = geodesic_distance(known == FREE, [y * w + x]).ravel()
+            target = nav.target[e, 0]
+            for k in (target >= 0).nonzero().ravel().tolist():
+                far = want[target[k]]
+                assert travel[e, i, k] == (np.inf if far == UNREACHED else pytest.approx(far / 10))
+                point = nav.points(nav.target)[e, 0, k]
+                assert point.tolist() == [int(target[k]) % w, int(target[k]) // w]
+    assert travel.isfinite().any()
+
+
+def test_actions_mean_the_points_they_came_from():
+    env = make_env(3)
+    env.reset()
+    nav = Navigation(env)
+    points = keyed_uniform(env, 2) * 36.0
+    region, offset = nav.to_action(points)
+    td = env.reset()
+    td[REGION], td[OFFSET] = region, offset
+    env.step(td)
+    torch.testing.assert_close(env.simulation.tensors["goal"], points, atol=1e-4, rtol=0)
+    region, offset = nav.to_action(points + 1000.0)
+    assert (region == 63).all() and (offset == 1.0).all()
+
+
+def test_open_ground_is_where_no_known_obstacle_is_near():
+    env = make_env(12, planner="dwa", maps=[make_map("indoor_small", 1)])
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    ends = nav.centers() + 2.0 * (keyed_uniform(env, 2) - 0.5)
+    found = nav.leads_through_open_ground(ends)
+    width, radius = int(nav.width[0]), 1.2 * 3.0 * 0.06
+    for e in range(12):
+        at = (nav.known[e, 0] == OBSTACLE).nonzero()[:, 0].numpy()
+        walls = np.stack([at % width, at // width], -1)
+        for i in range(3):
+            places = np.linspace(nav.centers()[e, i].numpy(), ends[e, i].numpy(), 7)
+            cells = np.floor((places - nav.origin[0].numpy()) / float(nav.cell_size[0]))
+            cells = cells.clip(0, [width - 1, int(nav.height[0]) - 1])
+            gaps = np.linalg.norm(cells[:, None] - walls[None], axis=-1).min(1) * float(nav.cell_size[0])
+            assert bool(found[e, i]) == bool((gaps >= radius).any())
+    assert found.any() and not found.all()
+
+
+def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
+    env = make_env(2)
+    env.reset()
+    nav = Navigation(env)
+    nav.update()
+    place, reach = nav.centers(), torch.ones(2, env.num_robots)
+    nowhere = torch.full((2, env.num_robots), -1)
+    for name, values in (
+        ("grow_trees", (5, 2.0)), ("waypoints", (nowhere, place, reach)), ("leads_through_open_ground", (place,)),
+    ):  # fmt: skip
+        getattr(nav, name)(*values)
+        with nav.only(torch.tensor([1])), pytest.raises(RuntimeError, match=f"{name} is about all envs"):
+            getattr(nav, name)(*values)
