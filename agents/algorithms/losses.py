@@ -4,6 +4,9 @@ All read a Collector batch [envs, T], or its flattened team steps once advantage
 apart (one probability ratio per robot, over its whole action) and write loss_objective, loss_entropy,
 loss_critic (and loss_kl), plus what one likes to log. A robot that had collided decides nothing: its actions are
 left out of all that concerns the policy, its values are learned like any other.
+
+A loss has two sides, the policy's and the critic's. Neither needs the other, unless the critic reads what the policy's
+encoder has just made: so each may be asked for by itself, in a thread of its own.
 """
 
 import torch
@@ -89,6 +92,32 @@ class LivingRobots:
     def __init__(self, *args, mask_collided: bool = True, **settings):
         super().__init__(*args, **settings)
         self.mask_collided = mask_collided
+        self._has_critic = False  # for TorchRL's forward: `critic_terms` has what concerns the critic
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether the critic reads what the policy's encoder made."""
+        return SEEN in self.critic_network.in_keys
+
+    def forward(self, batch: TensorDictBase) -> TensorDictBase:
+        """All terms, each a scalar; advantages are estimated where there are none."""
+        if self.tensor_keys.advantage not in batch.keys(True):
+            batch = write_advantages(self, batch.copy())
+        terms = self.policy_terms(batch)
+        if self.is_shared:  # with its graph
+            batch = batch.copy().set(SEEN, self._seen)
+        return terms.update(self.critic_terms(batch))
+
+    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
+        """What the policy learns from, and statistics; `batch` has advantages."""
+        return super().forward(batch)
+
+    def critic_terms(self, batch: TensorDictBase) -> TensorDict:
+        """What the critic learns from, and how much of the returns it explains; `batch` has their targets."""
+        loss, clipped, explained = self.loss_critic(batch.copy())
+        terms = {"loss_critic": self.critic_coeff * loss.mean(), "value_clip_fraction": clipped}
+        terms["explained_variance"] = explained
+        return TensorDict({name: value for name, value in terms.items() if value is not None})
 
     def find_living(self, batch: TensorDictBase) -> Tensor:
         """Whose actions count, bool [*, robots]."""
@@ -107,19 +136,8 @@ class LivingRobots:
         alive = self._alive  # the shape given is that of the advantages selected
         acted = tensordict.copy()
         log_weight, dist, kl, behaviour = super()._log_weight(acted, alive.shape)
-        self.share(acted, tensordict)
+        self.__dict__["_seen"] = acted.get(SEEN, None)
         return select_living(log_weight, alive), dist, select_living(kl, alive), behaviour
-
-    def share(self, acted: TensorDictBase, batch: TensorDictBase) -> None:
-        """Give a critic that shares the policy's encoder what that has just made of the states, with its graph."""
-        if SEEN in self.critic_network.in_keys:
-            batch.set(SEEN, acted.get(SEEN))
-
-    def with_advantage(self, batch: TensorDictBase) -> TensorDictBase:
-        """The batch; with advantages where it had none and TorchRL's estimator would not find what the critic reads."""
-        if SEEN not in self.critic_network.in_keys or self.tensor_keys.advantage in batch.keys(True):
-            return batch
-        return write_advantages(self, batch.copy())
 
     def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
         return select_living(dist.entropy().unsqueeze(-1), self._alive)
@@ -177,8 +195,8 @@ class KLPenalty(LivingRobots):
             extra["loss_kl"] = self.kl_coeff * self.mean_divergence(tensordict, terms[1])
         return terms
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return super().forward(self.with_advantage(tensordict)).update(self._extra)
+    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
+        return super().policy_terms(batch).update(self._extra)
 
     def adapt_penalty(self, divergence: float) -> None:
         """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""
@@ -218,8 +236,7 @@ class NormalisedValues:
 class TRPOLoss(RobotValues, NormalisedValues, LivingRobots, PPOLoss):
     """Unclipped surrogate with its divergence from the acting policy, for a trust-region step.
 
-    `surrogate` gives the two terms a trust-region step needs and leaves its parts in `terms`, to be logged;
-    `forward` adds the critic's, so that any loop may use the loss.
+    `surrogate` gives the two terms a trust-region step needs and leaves its parts in `terms`, to be logged.
     """
 
     default_value_estimator = ValueEstimators.MAGAE
@@ -265,7 +282,7 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
     def _log_probs(self, tensordict: TensorDictBase):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(acted := tensordict.select(*self.actor_network.in_keys))
-        self.share(acted, tensordict)
+        self.__dict__["_seen"] = acted.get(SEEN, None)
         log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
         return sum(log_probs.values(True, True)).unsqueeze(-1), dist
 
@@ -276,26 +293,16 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
         value = value.get(self.tensor_keys.value)
         explained = 1 - (target - value.detach()).var() / target.var().clamp_min(1e-8)
         target, value, _ = self._critic_loss_inputs(target, value, None)
-        return self.critic_coeff * distance_loss(target, value, loss_function=self.loss_critic_type), None, explained
+        return distance_loss(target, value, loss_function=self.loss_critic_type), None, explained
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self.with_advantage(tensordict.copy())
-        if self.tensor_keys.advantage not in tensordict.keys(True):
-            self.value_estimator(
-                tensordict,
-                params=self.critic_network_params.detach(),
-                target_params=self.target_critic_network_params,
-            )
-        advantage = self._maybe_normalize_advantage(tensordict.get(self.tensor_keys.advantage), tensordict)
-        log_prob, dist = self._log_probs(tensordict)
+    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
+        advantage = self._maybe_normalize_advantage(batch.get(self.tensor_keys.advantage), batch)
+        log_prob, dist = self._log_probs(batch)
         entropy = self._get_entropy(dist).mean()
-        critic, _, explained = self.loss_critic(tensordict)
         terms = {
             "loss_objective": -(select_living(log_prob, self._alive) * advantage).mean(),
             "loss_entropy": -self.entropy_coeff * entropy,
-            "loss_critic": critic.mean(),
             "entropy": entropy.detach(),
-            "kl": self.mean_divergence(tensordict, dist).detach(),
-            "explained_variance": explained,
+            "kl": self.mean_divergence(batch, dist).detach(),
         }
-        return TensorDict(terms | self.pull(tensordict, dist), batch_size=[])
+        return TensorDict(terms | self.pull(batch, dist))

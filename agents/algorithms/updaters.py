@@ -6,7 +6,7 @@ holds the optimizers; its state_dict continues a run bit for bit.
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,13 +14,15 @@ from torch import Tensor
 
 from maexp.agents.algorithms.advantages import look, write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
+from maexp.agents.algorithms.threads import Both, at_once
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN
+from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
 from maexp.agents.networks.encoder import compact, pools_pictures
 
 LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
 CALIBRATION_ROUNDS = 5
 CHUNK = 256  # team steps at a time where memory matters more than speed
+Terms = Callable[[TensorDictBase], TensorDict]
 QUIET = ("composite_entropy", "max_ratio", "mean_ratio", "value_clip_fraction")
 
 
@@ -184,49 +186,50 @@ class Updater:
     def learn_values(self, steps: list[TensorDictBase], meter: Meter) -> None:
         """One pass of the critic alone."""
         for parts in self.minibatches(steps, self.settings.minibatch_size):
-            for part in parts if SEEN in self.loss.critic_network.in_keys else ():
+            for part in parts if self.loss.is_shared else ():
                 part.set(SEEN, look(self.loss, part, CHUNK))
-            meter.add(self._step_critic([self.loss.loss_critic(part) for part in parts]))
+            meter.add(self.descend(self.loss.critic_terms, parts, "critic"))
 
-    def _step_critic(self, terms: list[tuple]) -> dict[str, float]:
-        loss = sum(term[0].mean() for term in terms) / len(terms)
-        check_finite("loss_critic", loss)
-        self.critic_optimizer.zero_grad()
-        loss.backward()
-        norm = self.clip(self.critic_params, "critic")
-        self.critic_optimizer.step()
-        variance = sum(term[2].mean().item() for term in terms) / len(terms)
-        return {"loss_critic": loss.item(), "critic_gradient_norm": norm, "explained_variance": variance}
+    def descend(self, terms: Terms, parts: list[TensorDictBase], *sides: str) -> dict[str, float]:
+        """A gradient step of the "policy", the "critic" or both on the mean of `terms`; returns what is logged."""
+        outputs = [terms(part) for part in parts]
+        names = [name for name in outputs[0].keys() if name.startswith("loss_")]
+        losses = {name: sum(out[name] for out in outputs) / len(outputs) for name in names}
+        for name, value in losses.items():
+            check_finite(name, value)
+        mine = {
+            "policy": (self.policy_optimizer, self.policy_params, "gradient_norm"),
+            "critic": (self.critic_optimizer, self.critic_params, "critic_gradient_norm"),
+        }
+        for side in sides:
+            mine[side][0].zero_grad()
+        sum(losses.values()).backward()
+        norms = {mine[side][2]: self.clip(mine[side][1], side) for side in sides}
+        for side in sides:
+            mine[side][0].step()
+        return summary(outputs) | norms
 
 
 class GradientUpdater(Updater):
     """Epochs of Adam on minibatches: clipped algorithms (several epochs) and A2C (one)."""
 
     def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
-        for _ in range(self.settings.epochs):
-            for parts in self.minibatches(steps, self.settings.minibatch_size):
-                meter.add(self._step([self.loss(part) for part in parts]))
+        small = TARGETS in self.loss.actor_network.in_keys and self.policy_params[0].device.type == "cpu"
+        with at_once(small and not self.loss.is_shared) as both:
+            for _ in range(self.settings.epochs):
+                for parts in self.minibatches(steps, self.settings.minibatch_size):
+                    meter.add(self._step(parts, both))
         if getattr(self.loss, "kl_coeff", 0) > 0:
             self.loss.adapt_penalty(meter.means()["kl"])
 
-    def _step(self, outputs: list[TensorDict]) -> dict[str, float]:
-        losses = {
-            name: sum(out[name] for out in outputs) / len(outputs)
-            for name in outputs[0].keys()
-            if name.startswith("loss_")
-        }
-        for name, value in losses.items():
-            check_finite(name, value)
-        self.policy_optimizer.zero_grad()
-        self.critic_optimizer.zero_grad()
-        sum(losses.values()).backward()
-        norms = {
-            "gradient_norm": self.clip(self.policy_params, "policy"),
-            "critic_gradient_norm": self.clip(self.critic_params, "critic"),
-        }
-        self.policy_optimizer.step()
-        self.critic_optimizer.step()
-        return summary(outputs) | norms
+    def _step(self, parts: list[TensorDictBase], both: Both) -> dict[str, float]:
+        if self.loss.is_shared:
+            return self.descend(self.loss, parts, "policy", "critic")
+        policy, critic = both(
+            lambda: self.descend(self.loss.policy_terms, parts, "policy"),
+            lambda: self.descend(self.loss.critic_terms, parts, "critic"),
+        )
+        return policy | critic
 
 
 class TrustRegionUpdater(Updater):
