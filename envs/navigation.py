@@ -6,6 +6,7 @@ envs at once, on the env's device, without a loop over envs or robots.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -246,7 +247,8 @@ class Navigation:
     def _spread_rays(self, radius: float) -> list[wp.array]:
         """The rays of a radius [m], computed once: their cells and what those count."""
         if radius not in self._rays:
-            shape = (outlook.RAYS, int(radius / float(self.cell_size.min())) + 2)
+            across = math.hypot(int(self.width.max()), int(self.height.max()))  # no ray stays in a grid for longer
+            shape = (outlook.RAYS, int(min(radius / float(self.cell_size.min()), across)) + 2)
             rays = [wp.zeros(shape, dtype=kind, device=str(self.device)) for kind in (wp.vec2i, wp.vec3)]
             finish_filling(self.device)
             self.launch(outlook._spread_rays, shape, inputs=[], outputs=rays)

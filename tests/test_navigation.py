@@ -5,6 +5,7 @@ import pytest
 import torch
 from mazes import OFFSET, REGION, make_env
 from oracle.grid import frontier_cells, geodesic_distance
+from oracle.pace import look_around
 from worlds import ways_to_blocks
 
 from maexp.envs import RobotConfig, make_map
@@ -12,6 +13,7 @@ from maexp.envs.navigation import Navigation
 from maexp.envs.targets import keyed_uniform
 from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.geodesic import UNREACHED
+from maexp.kernels.outlook import RAYS
 
 
 def test_navigation_shows_what_the_team_knows():
@@ -107,3 +109,19 @@ def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
         getattr(nav, name)(*values)
         with nav.only(torch.tensor([1])), pytest.raises(RuntimeError, match=f"{name} is about all envs"):
             getattr(nav, name)(*values)
+
+
+def test_a_radius_beyond_the_map_costs_no_more_than_the_map():
+    """Nothing known, looked at from a corner: the longest rays there are."""
+    env = make_env(2)
+    nav = Navigation(env)
+    unknown = torch.full_like(nav.known, UNKNOWN)
+    area, middle = nav.look_around(1e12, torch.zeros(2, 1, 1, dtype=torch.int64), unknown)
+    ((rays, _),) = nav._rays.values()
+    for e, m in enumerate(nav.state["map_id"].tolist()):
+        w, h = int(nav.width[m]), int(nav.height[m])
+        total, *way = look_around(np.full((h, w), UNKNOWN), 0, 0, w + h, RAYS)
+        assert area[e, 0, 0].item() == pytest.approx(total, rel=1e-4) and total > 0.7 * w * h
+        cell = float(nav.cell_size[m])
+        np.testing.assert_allclose(middle[e, 0, 0].numpy() / cell, way, rtol=1e-4)
+        assert rays.shape[1] <= np.hypot(nav.width.max(), nav.height.max()) + 2
