@@ -100,7 +100,7 @@ def look_from(
     `RAYS` rays go out cell by cell, as far as the radius or a known obstacle; a cell of a ray stands for the share
     of its circle that falls to one ray.
     """  # fmt: skip
-    reach = int(wp.min(radius / grids.cell[m], float(ray_cell.shape[1] - 1)))  # rays end where every grid has ended
+    reach = int(wp.min(radius / grids.cell[m], float(ray_cell.shape[1] - 1)))  # no ray is longer
     found = look(known, row, cell, grids.width[m], grids.height[m], reach, ray_cell, ray_part)
     total = wp.float32(found[0])
     middle = wp.vec2(wp.float32(found[1]), wp.float32(found[2])) * (grids.cell[m] / wp.max(total, 1.0e-6))

@@ -281,3 +281,22 @@ def test_values_of_collided_robots_are_learned_too():
     before = loss(batch)["loss_critic"]
     batch[TARGET][~alive] += 1e3
     assert loss(batch)["loss_critic"] > 1.5 * before
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_weight_of_the_critics_loss(name):
+    losses, moved = [], []
+    for weight in (0.7, 1.4, 0.0):
+        _, critic, loss, batch = setup(name, critic_coeff=weight)
+        before = [one.detach().clone() for one in critic.parameters()]
+        losses.append(loss(batch)["loss_critic"].item())
+        ALGORITHMS[name].make_updater(loss, ALGORITHMS[name].configure(critic_coeff=weight)).update(batch)
+        moved.append(any(not torch.equal(one, old) for one, old in zip(critic.parameters(), before, strict=True)))
+    assert losses[1] == pytest.approx(2 * losses[0]) and losses[0] > 0 == losses[2]
+    assert moved == [True, True, False]
+
+
+def test_a_batch_of_one_env_without_advantages():
+    """TorchRL's estimator takes any leading shape."""
+    _, _, loss, batch = setup("mappo")
+    assert loss(batch[0])["loss_critic"].item() == pytest.approx(loss(batch[:1])["loss_critic"].item(), rel=1e-4)

@@ -6,7 +6,7 @@ import torch
 from mazes import OFFSET, REGION, make_env
 from oracle.grid import frontier_cells, geodesic_distance
 from oracle.pace import look_around
-from worlds import ways_to_blocks
+from worlds import room, ways_to_blocks
 
 from maexp.envs import RobotConfig, make_map
 from maexp.envs.navigation import Navigation
@@ -113,8 +113,11 @@ def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
 
 def test_a_radius_beyond_the_map_costs_no_more_than_the_map():
     """Nothing known, looked at from a corner: the longest rays there are."""
-    env = make_env(2)
+    env = make_env(2, maps=[room(16, 23), room(40, 11, spacing=0.4)])
+    env.reset()
     nav = Navigation(env)
+    nav.update()
+    assert len(nav.cell_size.unique()) == len(nav.state["map_id"].unique()) == 2
     unknown = torch.full_like(nav.known, UNKNOWN)
     area, middle = nav.look_around(1e12, torch.zeros(2, 1, 1, dtype=torch.int64), unknown)
     ((rays, _),) = nav._rays.values()

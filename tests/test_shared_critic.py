@@ -1,5 +1,7 @@
 """Critics of targets that read what the policy's encoder made of the observation (`model.critic_encoder`)."""
 
+import copy
+
 import pytest
 import torch
 
@@ -65,6 +67,14 @@ def test_values_are_those_of_the_states(name):
     with loss.critic_network_params.to_module(loss.critic_network):
         value = loss.critic_network(batch["next"].copy().set(SEEN, look))[key]
     assert torch.allclose(following, value, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", SHARING)
+def test_a_loss_can_be_copied_after_an_update(name):
+    """It keeps no graph of what it looked at last."""
+    loss, row, batch = build(name)
+    row.make_updater(loss).update(batch)
+    assert torch.equal(copy.deepcopy(loss)(batch)["loss_critic"], loss(batch)["loss_critic"])
 
 
 @pytest.mark.parametrize("name", SHARING)

@@ -5,8 +5,8 @@ apart (one probability ratio per robot, over its whole action) and write loss_ob
 loss_critic (and loss_kl), plus what one likes to log. A robot that had collided decides nothing: its actions are
 left out of all that concerns the policy, its values are learned like any other.
 
-A loss has two sides, the policy's and the critic's. Neither needs the other, unless the critic reads what the policy's
-encoder has just made: so each may be asked for by itself, in a thread of its own.
+A loss has two sides, the policy's and the critic's. Once there are advantages neither needs the other, unless the
+critic reads what the policy's encoder has just made: so each may be asked for by itself, in a thread of its own.
 """
 
 import torch
@@ -100,13 +100,20 @@ class LivingRobots:
         return SEEN in self.critic_network.in_keys
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
-        """All terms, each a scalar; advantages are estimated where there are none."""
+        """All terms; advantages are estimated where there are none."""
         if self.tensor_keys.advantage not in batch.keys(True):
-            batch = write_advantages(self, batch.copy())
+            batch = self.estimate(batch.copy())
         terms = self.policy_terms(batch)
         if self.is_shared:  # with its graph
-            batch = batch.copy().set(SEEN, self._seen)
+            batch = batch.copy().set(SEEN, self.__dict__.pop("_seen"))
         return terms.update(self.critic_terms(batch))
+
+    def estimate(self, batch: TensorDictBase) -> TensorDictBase:
+        """Write advantages into the batch, of shape [envs, T] where the critic reads what the policy's encoder made."""
+        if self.is_shared:  # TorchRL's estimator would not find that
+            return write_advantages(self, batch)
+        networks = dict(params=self.critic_network_params.detach(), target_params=self.target_critic_network_params)
+        return self.value_estimator(batch, **networks)
 
     def policy_terms(self, batch: TensorDictBase) -> TensorDict:
         """What the policy learns from, and statistics; `batch` has advantages."""
@@ -115,8 +122,8 @@ class LivingRobots:
     def critic_terms(self, batch: TensorDictBase) -> TensorDict:
         """What the critic learns from, and how much of the returns it explains; `batch` has their targets."""
         loss, clipped, explained = self.loss_critic(batch.copy())
-        terms = {"loss_critic": self.critic_coeff * loss.mean(), "value_clip_fraction": clipped}
-        terms["explained_variance"] = explained
+        weight = self.critic_coeff or 0.0  # TorchRL makes None of 0
+        terms = {"loss_critic": (weight * loss).mean(), "value_clip_fraction": clipped, "explained_variance": explained}
         return TensorDict({name: value for name, value in terms.items() if value is not None})
 
     def find_living(self, batch: TensorDictBase) -> Tensor:
@@ -136,8 +143,13 @@ class LivingRobots:
         alive = self._alive  # the shape given is that of the advantages selected
         acted = tensordict.copy()
         log_weight, dist, kl, behaviour = super()._log_weight(acted, alive.shape)
-        self.__dict__["_seen"] = acted.get(SEEN, None)
+        self.keep_seen(acted)
         return select_living(log_weight, alive), dist, select_living(kl, alive), behaviour
+
+    def keep_seen(self, acted: TensorDictBase) -> None:
+        """Keep what the policy's encoder has just made, with its graph, for a critic that reads it."""
+        if self.is_shared:
+            self.__dict__["_seen"] = acted.get(SEEN)
 
     def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
         return select_living(dist.entropy().unsqueeze(-1), self._alive)
@@ -282,7 +294,7 @@ class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
     def _log_probs(self, tensordict: TensorDictBase):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(acted := tensordict.select(*self.actor_network.in_keys))
-        self.__dict__["_seen"] = acted.get(SEEN, None)
+        self.keep_seen(acted)
         log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
         return sum(log_probs.values(True, True)).unsqueeze(-1), dist
 

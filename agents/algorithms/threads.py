@@ -17,7 +17,7 @@ def at_once(wanted: bool) -> Iterator[Both]:
     """Inside, two tasks run at once: the second in a thread of its own, each with half of torch's threads.
 
     They must not write what the other reads; random numbers are the first one's. Where it is not wanted, or torch has a
-    single thread, they run one after the other, with the same results.
+    single thread, they run one after the other. With two threads results are those of a single one, bit for bit.
     """
     threads = torch.get_num_threads()
     if not wanted or threads == 1:

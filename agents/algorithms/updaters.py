@@ -197,16 +197,16 @@ class Updater:
         losses = {name: sum(out[name] for out in outputs) / len(outputs) for name in names}
         for name, value in losses.items():
             check_finite(name, value)
-        mine = {
+        by_side = {
             "policy": (self.policy_optimizer, self.policy_params, "gradient_norm"),
             "critic": (self.critic_optimizer, self.critic_params, "critic_gradient_norm"),
         }
         for side in sides:
-            mine[side][0].zero_grad()
+            by_side[side][0].zero_grad()
         sum(losses.values()).backward()
-        norms = {mine[side][2]: self.clip(mine[side][1], side) for side in sides}
+        norms = {by_side[side][2]: self.clip(by_side[side][1], side) for side in sides}
         for side in sides:
-            mine[side][0].step()
+            by_side[side][0].step()
         return summary(outputs) | norms
 
 
