@@ -90,7 +90,7 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
             return torch.cat([loss.critic_network(part.copy()).get(key) for part in states.split(chunk)])
 
     inputs = loss.critic_network.in_keys
-    if SEEN in inputs and SEEN not in batch.keys(True):
+    if loss.is_shared and SEEN not in batch.keys(True):
         batch.set(SEEN, look(loss, batch.flatten(), chunk).unflatten(0, batch.shape))
     value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
     last = loss.bare_estimator.tensor_keys.terminated  # "done" where the horizon is finite
@@ -101,7 +101,7 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
     following = torch.cat((value[:, 1:], torch.zeros_like(value[:, :1])), dim=1)
     if ends.any():
         after = batch["next"].select(*inputs, *loss.actor_network.in_keys, strict=False)[ends]
-        if SEEN in inputs:
+        if loss.is_shared:
             after.set(SEEN, look(loss, after, chunk))
         following[ends] = values(after.select(*inputs))
     batch.set(key, value)
