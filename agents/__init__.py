@@ -6,12 +6,13 @@ Names are looked up on first use, so that `maexp maps ...` need not wait for Tor
 from maexp.envs.lazy import lazy_names
 
 _HOMES = {
-    "make_policy": "networks.actor",
+    "make_env": "command_env",
+    "make_policy": "training.make",
     "make_critic": "algorithms.table",
     "make_loss": "algorithms.table",
     "ALGORITHMS": "algorithms.table",
     "ModelConfig": "settings.model",
 }
-__all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_loss", "make_policy"]
+__all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_env", "make_loss", "make_policy"]
 
 __getattr__ = lazy_names(__name__, _HOMES)

@@ -31,11 +31,13 @@ from maexp.agents.settings.schema import (
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
+    LookaheadConfig,
     ObservationConfig,
     PointCloudMap,
     RadarConfig,
     RewardConfig,
     RobotConfig,
+    TargetsConfig,
     make_map,
 )
 from maexp.envs.config import STARTS
@@ -151,6 +153,8 @@ def make_env(
         reward=RewardConfig(**given(cfg.reward)),
         observation=ObservationConfig(**given(cfg.observation)),
         comm=CommConfig(**given(cfg.comm)),
+        targets=TargetsConfig(**given(cfg.targets)),
+        lookahead=LookaheadConfig(**given(cfg.lookahead)),
         local_steps=scenario.local_steps,
         macro_steps=scenario.macro_steps,
         collision=scenario.collision,
@@ -160,7 +164,7 @@ def make_env(
 
 
 def choose_starts(cfg: CommonSettings, num_robots: int) -> str | np.ndarray:
-    """`scenario.starts` for an env: drawn, fixed, or the poses that its file holds.
+    """`scenario.starts` for an env: drawn, together, fixed, or the poses that its file holds.
 
     Raises:
         ValueError: the file holds no such poses.

@@ -36,12 +36,20 @@ VERBS = {
     "evaluate": Verb(
         "plays held-out episodes with a trained team or a classical policy",
         ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate checkpoint=RUN render=true render_envs=4",
-         "maexp evaluate policy=universal,nearest_frontier scenario=maze"),
+         "maexp evaluate policy=universal,nearest_frontier scenario=maze",
+         "maexp evaluate policy=cost_utility scenario.success_coverage=0.99 scenario.macro_steps=45"),
     ),
     "benchmark": Verb(
         "compares algorithms and classical policies over scenarios and seeds, in one table; resumable",
         ("maexp benchmark preset=smoke", "maexp benchmark scenarios=maze,indoor_small algorithms=mappo policies=random",
          "maexp benchmark resume=outputs/DATE/RUN"),
+    ),
+    "suite": Verb(
+        "plays frozen worlds with any policy, one score beside random and a reference, and checks results of others",
+        ("maexp suite list", "maexp suite show minival", "maexp suite run minival policy=universal",
+         "maexp suite run minival policy=my_module:MyPlanner", "maexp suite verify FOLDER"),
+        ("task", "place"),
+        ("list", "show", "run", "verify", "freeze"),
     ),
     "view": Verb(
         "shows a run, a recorded episode or a map in 3D: window, picture or browser",

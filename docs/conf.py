@@ -5,7 +5,7 @@ from importlib import metadata
 project = "MAexp"
 release = metadata.version("maexp")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "log"]
 html_theme = "furo"
 html_title = f"MAexp {release}"
 html_static_path = ["static"]

@@ -16,11 +16,14 @@ _HOMES = {
     "RadarConfig": "config",
     "RewardConfig": "config",
     "RobotConfig": "config",
+    "LookaheadConfig": "config",
+    "TargetsConfig": "config",
     "check_map": "checker",
     "import_map": "importing",
     "make_map": "scenarios",
     "parallel_env": "apis",
     "split": "scenarios",
+    "team_env": "apis",
     "vector_env": "apis",
 }
 __all__ = [
@@ -34,11 +37,14 @@ __all__ = [
     "RadarConfig",
     "RewardConfig",
     "RobotConfig",
+    "LookaheadConfig",
+    "TargetsConfig",
     "check_map",
     "import_map",
     "make_map",
     "parallel_env",
     "split",
+    "team_env",
     "vector_env",
 ]
 

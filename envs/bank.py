@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from maexp.envs.config import RadarConfig
 from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
+from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.types import PIXEL_SHARED, PIXELS
 
 CELLS_PER_RANGE = 5
@@ -24,7 +25,8 @@ class MapBank:
 
     ``arrays`` holds every field of `kernels.types.Maps`; ``order[m]`` the permutation from the sorted
     free (``order_boundary``: boundary) points back to the map's own order; the counts bound how many
-    points can ever be in range of a robot, so that buffers of that size cannot overflow.
+    points can ever be in range of a robot, so that buffers of that size cannot overflow. ``grids`` are the navigation
+    grids of maps that have theirs from elsewhere, as `nav_grid.bank_nav_grids` gives them.
     """
 
     maps: list[PointCloudMap]
@@ -36,6 +38,7 @@ class MapBank:
     free_in_range: int
     boundary_in_range: int
     occluders_in_range: int
+    grids: tuple[NavGrids, int] | None = None
 
     def tensors(self, device: torch.device) -> dict[str, torch.Tensor]:
         """The arrays as tensors on ``device``."""

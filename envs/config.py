@@ -7,8 +7,9 @@ from typing import Literal
 
 from maexp.envs.scenarios import Scenario
 
-STARTS = ("drawn", "fixed")
-"""Where robots start, besides poses that are given: drawn at every reset, or drawn once for each map and kept."""
+STARTS = ("drawn", "together", "fixed")
+"""Where robots start, besides poses that are given: drawn at every reset, each by itself or all beside each other, or
+drawn once for each map and kept."""
 
 @dataclass(frozen=True)
 class RobotConfig:
@@ -107,6 +108,43 @@ class CommConfig:
         return self.line_of_sight or math.isfinite(self.range)
 
 
+@dataclass(frozen=True)
+class TargetsConfig:
+    """How robots share targets out, with any policy that chooses among them.
+
+    ``distinct``: robots that hear each other go to different targets, farther apart than their bodies; else each goes
+    where it likes best. ``spare`` says what robots do for which no target is left then: ``wait`` where they are, or go
+    ``home`` to where they started.
+    """
+
+    distinct: bool = True
+    spare: Literal["wait", "home"] = "wait"
+
+
+@dataclass(frozen=True)
+class LookaheadConfig:
+    """How `policy=lookahead` and the reference `clairvoyant` plan (docs/lookahead.md).
+
+    Each robot tries ``candidates`` targets, its own choice among them, in a simulated future of ``horizon``
+    decisions, the first among them, in which ``rollout_policy`` plays on. A branch is worth what it covers, on average
+    over that time, and ``rest`` times what it has covered at its end; less ``loss`` for every robot lost; and ``prior``
+    times what the target is worth to `cost_utility`. All of it counts in radar discs. The best branch is taken if it is
+    worth ``margin`` more than the own choice. ``unknown`` says what is taken to stand where nobody has looked: ``free``
+    ground, what the ``nearest`` known cell holds, or what the map predictor says (``predicted``).
+    """
+
+    rollout_policy: str = "cost_utility"
+    candidates: int = 5
+    horizon: int = 1
+    unknown: Literal["free", "nearest", "predicted"] = "free"
+    margin: float = 0.02
+    loss: float = 1.0
+    rest: float = 1.0
+    prior: float = 0.7
+
+
+MOST_CANDIDATES = 64
+MOST_HORIZON = 100
 MOST_TARGETS = 256  # that a robot is shown
 CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
@@ -194,6 +232,28 @@ def check_comm(config: CommConfig) -> CommConfig:
     """The range may be infinite but not negative."""
     if not config.range >= 0.0:
         raise ValueError(f"comm.range={config.range} must be 0 or more metres (inf: everyone hears everyone)")
+    return config
+
+
+def check_targets(config: TargetsConfig) -> TargetsConfig:
+    """The settings must be known."""
+    if not isinstance(config.distinct, bool):
+        raise ValueError(f"targets.distinct={config.distinct!r} must be true or false")
+    _check_choice("targets.spare", config.spare, ("wait", "home"))
+    return config
+
+
+def check_lookahead(config: LookaheadConfig) -> LookaheadConfig:
+    """Counts must be whole and within reason, weights finite. Whether the rollout policy is one, the planner checks."""
+    for name, most in (("candidates", MOST_CANDIDATES), ("horizon", MOST_HORIZON)):
+        value = getattr(config, name)
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+            raise ValueError(f"lookahead.{name}={value!r} must be a whole number from 1 to {most}")
+    for name in ("margin", "loss", "rest", "prior"):
+        value = getattr(config, name)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
+            raise ValueError(f"lookahead.{name}={value!r} must be a finite number, 0 or more")
+    _check_choice("lookahead.unknown", config.unknown, ("free", "nearest", "predicted"))
     return config
 
 

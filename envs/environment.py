@@ -1,39 +1,38 @@
 """The TorchRL env: a batch of teams that explore point-cloud maps."""
 
-import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from maexp.envs.bank import build_bank
+from maexp.envs.bank import MapBank, build_bank
 from maexp.envs.config import (
     STARTS,
     CommConfig,
+    LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
     RobotConfig,
+    TargetsConfig,
 )
+from maexp.envs.copies import describe, rebuild
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.settings import complete_settings, positive_count
+from maexp.envs.settings import EnvSettings, complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
-from maexp.envs.starts import check_room, check_starts, fixed_starts
-from maexp.envs.target_view import TargetView
+from maexp.envs.starts import check_gathering, check_room, check_starts, fixed_starts
+from maexp.envs.target_view import TargetView, draw_targets
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
+from maexp.kernels.reward import MARKS
 from maexp.kernels.state import STATE
 from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, REGIONS
-
-LATER = {"starts": math.inf, "covered_sum": 0}
-"""State that versions before November 2026 did not save, and what stands for it: starts are drawn, sums begin here."""
-EARLIER = {"target": "waypoint", "raw": "unscaled"}
-"""What saved states of earlier versions call some arrays."""
 
 PICTURES = (("agents", "observation", "map"), ("team", "map"))
 """Observations that are pictures."""
@@ -56,15 +55,16 @@ class ExplorationEnv(EnvBase):
         num_robots: robots in a team, N.
         device: "cpu" or "cuda".
         seed: key of all random numbers: env i's episode k depends on (seed, first_env + i, k) alone.
-        robot, radar, planner, reward, observation, comm: see `maexp.envs.config`.
+        robot, radar, planner, reward, observation, comm, targets, lookahead: see `maexp.envs.config`.
         local_steps: control steps of 0.1 s in one ``env.step``.
         macro_steps: ``env.step`` calls in an episode before it is truncated.
         collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
         success_coverage: coverage that ends an episode as a success.
         num_threads: CPU threads of the simulation; results do not depend on it.
         first_env: number of the first env in the random keys, where several processes share one batch of envs.
-        starts: "drawn" anew at every reset; "fixed": drawn once for each map, from (seed, map) alone, and kept; or
-            poses, as for `set_starts`.
+        starts: "drawn" anew at every reset; "together": a place for the team is drawn at every reset, in which robots
+            stand beside each other, as far from walls and from each other as always; "fixed": drawn once for each map,
+            from (seed, map) alone, and kept; or poses, as for `set_starts`.
 
     Raises:
         ValueError: a setting is out of its range (named, with its value).
@@ -86,6 +86,8 @@ class ExplorationEnv(EnvBase):
     reward_config = _setting("reward", "The `RewardConfig`.")
     observation_config = _setting("observation", "The `ObservationConfig`.")
     comm_config = _setting("comm", "The `CommConfig`.")
+    targets_config = _setting("targets", "The `TargetsConfig`.")
+    lookahead_config = _setting("lookahead", "The `LookaheadConfig`.")
 
     def __init__(
         self,
@@ -101,6 +103,8 @@ class ExplorationEnv(EnvBase):
         reward: RewardConfig | None = None,
         observation: ObservationConfig | None = None,
         comm: CommConfig | None = None,
+        targets: TargetsConfig | None = None,
+        lookahead: LookaheadConfig | None = None,
         local_steps: int | None = None,
         macro_steps: int | None = None,
         collision: str = "centre",
@@ -112,29 +116,38 @@ class ExplorationEnv(EnvBase):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
         settings = complete_settings(
             maps, num_envs, num_robots, device, seed, robot=robot, radar=radar, planner=planner, reward=reward,
-            observation=observation, comm=comm, local_steps=local_steps, macro_steps=macro_steps, collision=collision,
-            success_coverage=success_coverage, num_threads=num_threads, first_env=first_env,
+            observation=observation, comm=comm, targets=targets, lookahead=lookahead, local_steps=local_steps,
+            macro_steps=macro_steps, collision=collision, success_coverage=success_coverage, num_threads=num_threads,
+            first_env=first_env,
         )  # fmt: skip
-        super().__init__(device=settings.device, batch_size=torch.Size([settings.num_envs]))
-        self.settings = settings
         for m in maps:
             check_room(m, [r.collision_threshold for r in settings.robots])
-        self.bank = build_bank(maps, settings.radars)
-        self.maps = self.bank.maps
+        self._set_up(settings, build_bank(maps, settings.radars), starts)
+
+    def _set_up(self, settings: EnvSettings, bank: MapBank, starts: str | np.ndarray | torch.Tensor = "drawn") -> None:
+        """Build everything of an env from its complete settings and its maps."""
+        EnvBase.__init__(self, device=settings.device, batch_size=torch.Size([settings.num_envs]))
+        self.settings, self.bank, self.maps = settings, bank, bank.maps
         check_memory(settings, self.bank)
-        self.simulation = build_simulation(settings, self.bank)
+        together = isinstance(starts, str) and starts == "together"
+        if together:
+            for m in self.maps:
+                check_gathering(m, [r.collision_threshold for r in settings.robots])
+        self.simulation = build_simulation(settings, self.bank, together)
         self._hook: tuple[Callable, int] | None = None
-        self._fixed = isinstance(starts, str) and starts == "fixed"
+        self.starts = starts if isinstance(starts, str) else "drawn"  # unless poses are given
         self._fix_starts()
         if not isinstance(starts, str):
             self.set_starts(starts)
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
-        targets = settings.observation.targets
-        self.target_view = TargetView(self, targets) if targets else None
+        shown = settings.observation.targets
+        self.target_view = TargetView(self, shown) if shown else None
+        if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
+            self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
-        self.observation_spec = observation_spec(e, n, self.device, settings.observation.pictures, targets)
-        self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device)
+        self.observation_spec = observation_spec(e, n, self.device, settings.observation.pictures, shown)
+        self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
 
@@ -213,7 +226,7 @@ class ExplorationEnv(EnvBase):
             return action["region"], action["offset"]
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
-        return self.target_view.take(action["target"])
+        return self.target_view.take(action["target"], action.get("preference", None))
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors
@@ -269,7 +282,7 @@ class ExplorationEnv(EnvBase):
             "episode_reward": s["episode_reward"].clone(),
             "episode_reward_unscaled": s["unscaled"].sum(-1),
         }
-        for k, mark in enumerate(("85", "95")):
+        for k, mark in enumerate(MARKS):
             info[f"coverage_step_{mark}"] = s["milestone_step"][:, k : k + 1].clone()
             info[f"mutual_overlap_{mark}"] = s["milestone_overlap"][:, k : k + 1].clone()
             info[f"path_length_{mark}"] = s["milestone_path"][:, :, k].clone()
@@ -301,7 +314,7 @@ class ExplorationEnv(EnvBase):
         self._fix_starts()
 
     def set_starts(self, poses: np.ndarray | torch.Tensor | Sequence | None) -> None:
-        """Where the robots stand at every following reset; None: drawn anew, or "fixed" if the env was made so.
+        """Where the robots stand at every following reset; None: drawn anew, as the env was made.
 
         Args:
             poses: centre x, y [m] and heading [rad] of every robot, float [N, 3] for all envs or [E, N, 3].
@@ -316,7 +329,7 @@ class ExplorationEnv(EnvBase):
             given.copy_(torch.from_numpy(check_starts(self, poses)))
 
     def _fix_starts(self) -> None:
-        if self._fixed:
+        if self.starts == "fixed":
             fixed = fixed_starts(self, int(self.simulation.tensors["seed"]))
             self.simulation.map_starts.copy_(torch.from_numpy(fixed))
 
@@ -334,21 +347,25 @@ class ExplorationEnv(EnvBase):
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
-        earlier = {name: torch.full_like(own[name], value) for name, value in LATER.items()}
-        state_dict = earlier | {EARLIER.get(name, name): value for name, value in state_dict.items()}
         wanted = {name: own[name] for name in STATE}
         wanted |= {} if self.target_view is None else self.target_view.state_dict()
         wrong = [n for n, one in wanted.items() if n not in state_dict or state_dict[n].shape != one.shape]
         if wrong:
             raise ValueError(
                 f"the saved simulator state does not fit this env ({', '.join(wrong[:3])}): "
-                "use the maps, num_envs and num_robots it was saved with"
+                "use the maps, num_envs, num_robots and version of MAexp it was saved with"
             )
         for name in STATE:
             own[name].copy_(state_dict[name])
         self._fix_starts()
         if self.target_view is not None:
             self.target_view.load_state_dict(state_dict)
+
+    def __reduce__(self):
+        return rebuild, describe(self)
+
+    def __deepcopy__(self, memo: dict) -> "ExplorationEnv":
+        return rebuild(*describe(self))  # with the same maps: nothing changes them
 
     # Looking in
 

@@ -1,11 +1,14 @@
 """Metrics of finished episodes and their summary (docs/concepts.md, Metrics; paper, section III-C)."""
 
+import re
 from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy.stats import bootstrap
 from tensordict import TensorDictBase
+
+from maexp.kernels.reward import MARKS
 
 RESAMPLES = 5000
 GROUPED_RESAMPLES = 2000  # of maps, seeds and episodes: each takes a weight for every episode
@@ -30,7 +33,8 @@ def episode_metrics(
     Returns:
         float64 [episodes] per metric; NaN where an episode has no value (a coverage it never reached).
         ``reward_variance`` is the population standard deviation over robots of the episode's reward without
-        the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m].
+        the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m],
+        ``longest_path`` the way of the robot that drove farthest. Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
     metrics = {
@@ -41,8 +45,9 @@ def episode_metrics(
         "success_rate": succeeded(final["coverage"][:, 0], success_coverage).double().cpu().numpy(),
         "collisions": info["collided"].sum(axis=1),
         "path_length": info["path_length"].mean(axis=1),
+        "longest_path": info["path_length"].max(axis=1),
     }
-    for mark in ("85", "95"):
+    for mark in MARKS:
         steps = info[f"coverage_step_{mark}"][:, 0]
         reached = steps >= 0
         metrics[f"coverage_step_{mark}"] = np.where(reached, steps, np.nan)
@@ -53,20 +58,29 @@ def episode_metrics(
     return metrics
 
 
-def resample_weights(*factors: np.ndarray) -> np.ndarray:
+def in_reach(metric: str, success_coverage: float) -> bool:
+    """Whether an episode can tell a metric of `episode_metrics`: at `success_coverage` it is over, and no mark beyond
+    is reached but by chance."""
+    mark = re.search(r"_(\d+)(_|$)", metric)
+    return mark is None or int(mark[1]) <= round(100 * success_coverage, 6)
+
+
+def resample_weights(*factors: np.ndarray, seed: int = 0) -> np.ndarray:
     """How often each episode counts in each resample of a bootstrap of groups, float32 [GROUPED_RESAMPLES, episodes].
 
     Args:
         factors: what each episode belongs to, labels [episodes] each: its map, the seed of the training. Every factor
             is resampled with replacement by itself, and the episodes within each combination (Owen 2007). One label
             for all changes nothing.
+        seed: of the drawing: what is drawn apart from something else needs another one.
     """
-    return _resample_weights(*(tuple(np.unique(labels, return_inverse=True)[1].ravel().tolist()) for labels in factors))
+    codes = (np.unique(labels, return_inverse=True)[1] for labels in factors)
+    return _resample_weights(seed, *(tuple(one.ravel().tolist()) for one in codes))
 
 
-@lru_cache(maxsize=4)
-def _resample_weights(*factors: tuple[int, ...]) -> np.ndarray:
-    rng = np.random.default_rng(0)
+@lru_cache(maxsize=32)
+def _resample_weights(seed: int, *factors: tuple[int, ...]) -> np.ndarray:
+    rng = np.random.default_rng(seed)
     codes = np.array(factors)
     counts = [max(one) + 1 for one in factors]
     often = [rng.multinomial(count, np.full(count, 1 / count), size=GROUPED_RESAMPLES) for count in counts]

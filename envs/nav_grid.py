@@ -119,5 +119,7 @@ def list_voids(stand_in: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def bank_nav_grids(bank: MapBank, device: str = "cpu") -> tuple[NavGrids, int]:
     """`stack_nav_grids` for the maps of a bank, points in the bank's order."""
+    if bank.grids is not None:
+        return bank.grids
     orders = zip(bank.maps, bank.order_free, bank.order_boundary, strict=True)
     return stack_nav_grids([build_nav_grid(m).reorder(free, boundary) for m, free, boundary in orders], device)

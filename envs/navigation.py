@@ -378,12 +378,21 @@ class Navigation:
         return target
 
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
-        points = points.float().contiguous()
-        region = torch.empty(points.shape[:2], dtype=torch.int64, device=points.device)
-        offset = torch.empty_like(points)
-        values = self.arrays | {
-            "point": view(points, wp.vec2), "region": view(region), "offset": view(offset, wp.vec2),
-        }  # fmt: skip
-        launch_named(self.launch, goals._to_action, tuple(region.shape), "region offset", values)
-        return region, offset
+        """`to_action` of this env's goals [m], float [E, N, 2]."""
+        return _to_action(points, self.arrays, self.launch)
+
+
+def to_action(env: ExplorationEnv, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
+    arrays = {"map_id": view(env.simulation.tensors["map_id"])}
+    arrays |= {name: view(env.simulation.map_tensors[name], wp.vec2) for name in ("lower", "upper")}
+    return _to_action(points, arrays, launch_on(env.device))
+
+
+def _to_action(points: torch.Tensor, arrays: dict, launch: Launch) -> tuple[torch.Tensor, torch.Tensor]:
+    points = points.float().contiguous()
+    region = torch.empty(points.shape[:2], dtype=torch.int64, device=points.device)
+    offset = torch.empty_like(points)
+    values = arrays | {"point": view(points, wp.vec2), "region": view(region), "offset": view(offset, wp.vec2)}
+    launch_named(launch, goals._to_action, tuple(region.shape), "region offset", values)
+    return region, offset

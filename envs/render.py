@@ -8,6 +8,7 @@ than eight have numbers beside their robots, since colours alone do not tell so 
 """
 
 import colorsys
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -232,6 +233,8 @@ def _draw_moving(snapshot: dict, raster: MapRaster, picture: Image.Image) -> Ima
         box = (x - radius, y - radius, x + radius, y + radius)
         if len(centers) > _MOST_CIRCLES:
             break
+        if radius > math.hypot(*large.size):  # all outside of the picture, and drawn point by point
+            continue
         draw.ellipse(box, outline=(*robot_colour(i), 150), width=max(1, round(1.5 * unit)))
     corners, part = np.array(large.size), max(smallest_robot(len(centers)) / SMALLEST_ROBOT, 0.35)
     for i, goal in enumerate(raster.to_pixels(snapshot["goal"]) * _AA):

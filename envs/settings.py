@@ -9,14 +9,18 @@ import torch
 
 from maexp.envs.config import (
     CommConfig,
+    LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
     RobotConfig,
+    TargetsConfig,
     check_comm,
+    check_lookahead,
     check_observation,
     check_reward,
+    check_targets,
     complete_planner,
     complete_radar,
     complete_robot,
@@ -48,6 +52,8 @@ class EnvSettings:
     reward: RewardConfig
     observation: ObservationConfig
     comm: CommConfig
+    targets: TargetsConfig
+    lookahead: LookaheadConfig
 
     @property
     def episode_steps(self) -> int:
@@ -68,6 +74,8 @@ def complete_settings(
     reward: RewardConfig | None,
     observation: ObservationConfig | None,
     comm: CommConfig | None,
+    targets: TargetsConfig | None,
+    lookahead: LookaheadConfig | None,
     local_steps: int | None,
     macro_steps: int | None,
     collision: str,
@@ -100,20 +108,24 @@ def complete_settings(
     scenario = find_scenario(maps[0].scenario)
     device = _device(device)
     local_steps = positive_count("local_steps", scenario.local_steps if local_steps is None else local_steps)
-    if macro_steps is None:
-        macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario)
-    macro_steps = positive_count("macro_steps", macro_steps)
     if collision not in ("centre", "footprint"):
         raise ValueError(f"collision={collision!r} is unknown: choose centre or footprint")
     if not 0.0 < success_coverage <= 1.0:
         raise ValueError(f"success_coverage={success_coverage} must lie in (0, 1]")
     robots = tuple(complete_robot(r, scenario) for r in per_robot("robot", robot, RobotConfig, num_robots))
     radars = tuple(complete_radar(r, scenario) for r in per_robot("radar", radar, RadarConfig, num_robots))
+    if macro_steps is None:
+        team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
+        macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario, team, local_steps)
+    macro_steps = positive_count("macro_steps", macro_steps)
+    check_bodies(maps, robots)
     planner = complete_planner(one_config("planner", planner, PlannerConfig), scenario)
     reward = check_reward(one_config("reward", reward, RewardConfig))
     observation = one_config("observation", observation, ObservationConfig)
     check_observation(observation, planner)
     comm = check_comm(one_config("comm", comm, CommConfig))
+    targets = check_targets(one_config("targets", targets, TargetsConfig))
+    lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))
     threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
     return EnvSettings(
         scenario=scenario,
@@ -133,7 +145,22 @@ def complete_settings(
         reward=reward,
         observation=observation,
         comm=comm,
+        targets=targets,
+        lookahead=lookahead,
     )
+
+
+def check_bodies(maps: Sequence[PointCloudMap], robots: Sequence[RobotConfig]) -> None:
+    """Raise ValueError if a robot is longer than one of the maps."""
+    for m in maps:
+        sides = [high - low for low, high in zip(*m.extent, strict=True)]
+        for name in ("length", "width"):
+            size = max(getattr(robot, name) for robot in robots)
+            if size > max(sides):
+                raise ValueError(
+                    f"robot.{name}={size:g} m does not fit on map {m.name} of {sides[0]:.4g} x {sides[1]:.4g} m: "
+                    f"give metres, as robot.{name}=0.5"
+                )
 
 
 def positive_count(name: str, value: int) -> int:

@@ -27,14 +27,14 @@ TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""
 
 
-def build_simulation(settings: EnvSettings, bank: MapBank) -> Simulation:
-    """The simulation of an env with these settings on these maps."""
+def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = False) -> Simulation:
+    """The simulation of an env with these settings on these maps; ``together``: teams start in one place."""
     simulation = Simulation(
         maps=bank.tensors(settings.device),
         num_maps=len(bank.maps),
         robots=robot_tensors(settings),
         weights=reward_weights(settings),
-        settings=step_settings(settings),
+        settings=step_settings(settings, together),
         sizes=sizes(settings, bank),
         device=settings.device,
         seed=settings.seed,
@@ -86,7 +86,7 @@ def reward_weights(settings: EnvSettings) -> RewardWeights:
     return weights
 
 
-def step_settings(settings: EnvSettings) -> Settings:
+def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
     """What a local step does."""
     planner, comm = settings.planner, settings.comm
     return Settings(
@@ -102,6 +102,7 @@ def step_settings(settings: EnvSettings) -> Settings:
         line_of_sight=comm.line_of_sight,
         draw_known=settings.observation.map == "known",
         success_coverage=settings.success_coverage,
+        together=together,
     )
 
 

@@ -5,15 +5,14 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from maexp.envs.target_view import FEATURES
 from maexp.kernels.observe import picture_shapes
+from maexp.kernels.reward import MARKS
 from maexp.kernels.types import REGIONS
 
 INFO_ENV = {
     "coverage": torch.float32,
     "coverage_auc": torch.float32,
-    "coverage_step_85": torch.int32,
-    "coverage_step_95": torch.int32,
-    "mutual_overlap_85": torch.float32,
-    "mutual_overlap_95": torch.float32,
+    **{f"coverage_step_{mark}": torch.int32 for mark in MARKS},
+    **{f"mutual_overlap_{mark}": torch.float32 for mark in MARKS},
     "local_steps": torch.int32,
 }
 """Entries of ``info`` of shape [E, 1]. ``coverage_auc``: mean coverage over the local steps of a full episode, as if
@@ -26,8 +25,7 @@ INFO_ROBOT = {
     **{f"reward_{term}": torch.float32 for term in REWARD_TERMS},
     "collided": torch.bool,
     "path_length": torch.float32,
-    "path_length_85": torch.float32,
-    "path_length_95": torch.float32,
+    **{f"path_length_{mark}": torch.float32 for mark in MARKS},
     "episode_reward": torch.float32,
     "episode_reward_unscaled": torch.float32,
 }
@@ -80,10 +78,13 @@ def _value(shape, dtype, device):
     return Unbounded(shape=shape, dtype=dtype, device=device)
 
 
-def action_spec(envs: int, robots: int, direct: bool, device: torch.device) -> Composite:
-    """Region and offset of every robot's goal, or its controls where the planner is ``direct``."""
+def action_spec(envs: int, robots: int, direct: bool, device: torch.device, targets: int = 0) -> Composite:
+    """Which target every robot takes, where it is shown some; else region and offset of its goal, or its controls
+    where the planner is ``direct``."""
     if direct:
         action = {"control": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device)}
+    elif targets:
+        action = {"target": Categorical(targets, shape=(envs, robots), dtype=torch.int64, device=device)}
     else:
         action = {
             "region": Categorical(REGIONS**2, shape=(envs, robots), dtype=torch.int64, device=device),

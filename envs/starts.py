@@ -9,7 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.kernels.types import START_CLEARANCE
+from maexp.kernels.types import BESIDE, START_CLEARANCE
 
 NO_ROOM = "use fewer robots, a smaller robot.collision_threshold or a larger map"
 
@@ -31,6 +31,37 @@ def check_room(m: PointCloudMap, thresholds: list[float]) -> None:
             f"map {m.name} has room for {room} of num_robots={len(thresholds)} robots with {need:g} m of clearance: "
             + NO_ROOM
         )
+
+
+def check_gathering(m: PointCloudMap, thresholds: list[float]) -> None:
+    """MapError unless the team fits in one place, each beside another one, as `kernels.reset.gather_team` places it."""
+    need = START_CLEARANCE * np.array(thresholds)
+    far = cKDTree(m.boundary).query(m.free)[0] if len(m.boundary) else np.full(len(m.free), np.inf)
+    points, far = m.free[far >= need.min(), :2].astype(np.float64), far[far >= need.min()]
+    most = 0
+    for start in np.random.default_rng(0).permutation(np.flatnonzero(far >= need[0])):
+        most = max(most, _gather(points, far, need, start))
+        if most == len(need):
+            return
+    raise MapError(
+        f"map {m.name} has room for {most} of num_robots={len(need)} robots that start together, {need.max():g} m from "
+        f"walls and each other: use scenario.starts=drawn, {NO_ROOM}"
+    )
+
+
+def _gather(points: np.ndarray, far: np.ndarray, need: np.ndarray, start: int) -> int:
+    """How many robots find room from a point on; `far` is how far points are from walls [m]."""
+    order = np.linalg.norm(points - points[start], axis=-1).argsort(kind="stable")
+    order = order[: 200 * len(need)]  # the others stand near
+    points, far, places = points[order], far[order], [points[start]]
+    for i in range(1, len(need)):
+        gaps = np.linalg.norm(points[:, None] - np.array(places), axis=-1)
+        room = np.maximum(need[i], need[:i])
+        fits = (far >= need[i]) & (gaps >= room).all(-1) & (gaps <= BESIDE * room).any(-1)
+        if not fits.any():
+            return i
+        places.append(points[fits.argmax()])
+    return len(need)
 
 
 def fixed_starts(env, seed: int) -> np.ndarray:

@@ -8,9 +8,11 @@ features of a candidate contain what the classical planner `cost_utility` would 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
+from tensordict import TensorDictBase
 
 from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, plan_in_turn, value_targets
 from maexp.kernels.teamwork import compare_with_others, gather_gain
@@ -66,15 +68,16 @@ class TargetView:
             "cell": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # and grid cells
             "point": torch.zeros((*shape, count, 2), device=device),  # and where they are [m]
             "toward": torch.zeros((*shape, count, 2), device=device),  # middle of the unknown, from there [m]
+            "way": torch.zeros((*shape, count), device=device),  # how far it is to drive there [m]
             "mask": torch.zeros((*shape, count), dtype=torch.bool, device=device),
         }
 
     @torch.no_grad()
     def observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-        """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them there are.
+        """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them may be chosen.
 
-        Without any (the robot has collided, or knows no way to a frontier) the first candidate stands for driving
-        anywhere; its features are 0. ``mask`` int32 [E]: look at these envs only, the others show none.
+        Without any (the robot has collided, or knows no way to a frontier) the first stands for driving anywhere, and
+        is the one choice; its features are 0. ``mask`` int32 [E]: look at these envs only, the others show nothing.
         """
         if mask is None or bool(mask.all()):
             return self._look()
@@ -98,28 +101,45 @@ class TargetView:
         some[..., value.shape[-1] :] = False
         s["block"], s["mask"] = scene.block.gather(2, best), some
         s["cell"] = scene.cells().gather(2, best)
+        s["way"] = torch.where(some, scene.travel.gather(2, best), 0.0)
         s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
-        travel = torch.where(some, scene.travel.gather(2, best), 0.0) / nav.radar_range
+        travel = s["way"] / nav.radar_range
         near = _Near(self, s, scene, best, some, travel)
         columns = near.plan() | near.way() | near.worth() | near.bearings() | near.team()
         features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
-        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": some.clone()}
+        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": first_if_none(some)}
 
-    def take(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def take(
+        self, index: torch.Tensor, preference: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """Send every robot to a candidate, int64 [E, N]; region int64 [E, N] and offset float32 [E, N, 2] of the goals.
+
+        With `targets.distinct` a robot gets another one where the one that is named is taken.
+
+        Args:
+            index: int64 [E, N], what each robot wants.
+            preference: float32 [E, N, M], what it thinks of its candidates, where it gets another one; None: those of
+                the highest value first.
 
         Raises:
             ValueError: an index that is none.
         """
         if bool(((index < 0) | (index >= self.count)).any()):
             raise ValueError(f"action target={int(index.min())}..{int(index.max())}: give 0 to {self.count - 1}")
-        s, index = self.state, index.unsqueeze(-1)
-        found = s["mask"].gather(2, index).squeeze(-1)
-        s["has_last"], s["last"] = found, _pick(s["point"], index).squeeze(2)
-        chosen = torch.where(found, s["block"].gather(2, index).squeeze(-1), -1)
+        s = self.state
+        named = torch.arange(self.count, device=index.device) == index.unsqueeze(-1)
+        there = s["mask"] & (s["mask"] & named).any(-1, keepdim=True)  # who names what is not there drives anywhere
+        if preference is None:
+            preference = -torch.arange(self.count, device=index.device).float()
+        preference = torch.where(named, torch.inf, preference.nan_to_num())
+        preference = torch.where(there, preference, -torch.inf)
+        chosen, waits = self.tracker.share(preference, s["way"], s["point"])
+        index = chosen.clamp_min(0).unsqueeze(-1)
+        s["has_last"], s["last"] = chosen >= 0, _pick(s["point"], index).squeeze(2)
+        block = torch.where(chosen >= 0, s["block"].gather(2, index).squeeze(-1), -1)
         cell = s["cell"].gather(2, index).squeeze(-1)
-        return self.tracker.take(chosen, cell, _pick(s["toward"], index).squeeze(2))
+        return self.tracker.take(block, cell, _pick(s["toward"], index).squeeze(2), waits)
 
     def forget(self) -> None:
         """Another policy acts: nobody knows which targets its robots go to."""
@@ -232,6 +252,24 @@ class _Near:
             "mates": mates.sum(-1) / 4.0,
         }
         return {name: value.unsqueeze(-1).float() for name, value in columns.items()}
+
+
+def first_if_none(mask: torch.Tensor) -> torch.Tensor:
+    """``mask`` [*, M], with the first entry where there is none: it stands for driving anywhere."""
+    first = torch.arange(mask.shape[-1], device=mask.device) == 0
+    return mask | (first & ~mask.any(-1, keepdim=True))
+
+
+def draw_targets(
+    draw: Callable[[TensorDictBase | None], TensorDictBase], tensordict: TensorDictBase | None = None
+) -> TensorDictBase:
+    """A random action as ``draw`` draws it, but of the targets that ``tensordict`` shows, if it shows any."""
+    drawn = draw(tensordict)
+    mask = drawn.get(("agents", "observation", "targets_mask"), None)
+    if mask is not None:
+        chances = first_if_none(mask).flatten(0, -2).float()
+        drawn["agents", "action", "target"] = torch.multinomial(chances, 1).view(mask.shape[:-1])
+    return drawn
 
 
 def _best(value: torch.Tensor, count: int) -> torch.Tensor:

@@ -12,6 +12,7 @@ import warp as wp
 from maexp.envs.navigation import Navigation
 from maexp.kernels import goals, targets
 from maexp.kernels.launches import launch_named, launch_on, view
+from maexp.kernels.sharing import share_targets
 from maexp.kernels.teamwork import choose_in_turn
 from maexp.kernels.types import DT
 
@@ -110,7 +111,9 @@ class TargetTracker:
 
     Attributes:
         state: tensors that later decisions depend on: ``dwell`` [E, N, K], ``chosen`` [E, N, 1] (-1 = none),
-            ``stood`` [E, N, 2] [m], ``counted`` [E], the macro step that `dwell` was last counted in.
+            ``stood`` [E, N, 2] [m], ``counted`` [E], the macro step that `dwell` was last counted in, ``home``
+            [E, N, 2], where robots started [m]; NaN before the first look.
+        body: float32 [E, N], radius of a circle around a robot [m]: what it takes up, whichever way it stands.
     """
 
     def __init__(self, env: ExplorationEnv):
@@ -123,12 +126,17 @@ class TargetTracker:
             "chosen": torch.full((*shape, 1), -1, device=device),
             "stood": torch.zeros((*shape, 2), device=device),
             "counted": torch.full((env.num_envs,), -1, dtype=torch.int32, device=device),
+            "home": torch.full((*shape, 2), torch.nan, device=device),
         }
+        robots = env.simulation.robot_tensors
+        half = 0.5 * torch.hypot(robots["length"], robots["width"])
+        self.body = torch.maximum(half, robots["collision_threshold"])
 
     def look(self) -> Scene:
         """Bring everything up to date with the env, and give up what led nowhere (once a macro step)."""
         nav, robots = self.nav, self.env.num_robots
         nav.update()
+        self._note_home()
         area, middle = nav.look_from_targets()
         return Scene(
             travel=self._give_up(nav.way, nav.point, nav.block),
@@ -151,8 +159,28 @@ class TargetTracker:
         disc = self.disc[self.nav.state["map_id"]].view(-1, 1, 1)
         return (area / disc).expand(-1, self.env.num_robots, -1)
 
+    def share(
+        self, preference: torch.Tensor, travel: torch.Tensor, points: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The target of each robot: what it likes best; with `targets.distinct` as far as the robots that it hears
+        leave it that (`maexp.kernels.sharing`).
+
+        Args:
+            preference: float32 [E, N, K], the highest first, the first of equals; -inf: out of reach.
+            travel: float32 [E, N, K], way there [m].
+            points: float32 [E, N, K, 2], where they are [m].
+
+        Returns:
+            int64 [E, N], -1 = none; bool [E, N], robots that get to targets and have none, for others take those.
+        """
+        some = (preference > -torch.inf).any(-1)
+        if not self.env.targets_config.distinct:
+            return torch.where(some, preference.argmax(-1), -1), torch.zeros_like(some)
+        chosen = share_targets(preference, travel, points, self.nav.state["comm"], self.nav.pick(self.body))
+        return chosen, some & (chosen < 0)
+
     def take(
-        self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor
+        self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Remember a choice and turn it into goals.
 
@@ -160,14 +188,38 @@ class TargetTracker:
             chosen: int64 [E, N], the target of each robot; -1 = none: it drives anywhere.
             cell: int64 [E, N], where that is; any where there is none.
             toward: float32 [E, N, 2], the middle of what is to be seen from there, from the target [m].
+            waits: bool [E, N], robots that do not drive anywhere, but as `targets.spare` says; None: none does.
 
         Returns:
             region int64 [E, N] and offset float32 [E, N, 2].
         """
+        self.state["chosen"] = chosen.long().unsqueeze(-1).clone()
+        return self.goals(chosen, cell, toward, waits)
+
+    def goals(
+        self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What `take` returns, without remembering the choice."""
         chosen, cell, toward = chosen.long().contiguous(), cell.long().clone(), toward.float().clone()
-        self.state["chosen"] = chosen.unsqueeze(-1).clone()
         target = self.nav.aim(chosen, cell, toward)
-        return self.nav.to_action(self._approach(cell, target, toward))
+        goal = self._approach(cell, target, toward)
+        if waits is not None and self.env.targets_config.distinct:
+            goal = torch.where(waits.unsqueeze(-1), self._rest(), goal)
+        return self.nav.to_action(goal)
+
+    def _rest(self) -> torch.Tensor:
+        """Where robots wait for which no target is left [m], float32 [E, N, 2].
+
+        Who stands on the way of another to a target is nearer to it, and has got it (`maexp.kernels.sharing`): a robot
+        that waits where it is stands in nobody's way.
+        """
+        return self.state["home"] if self.env.targets_config.spare == "home" else self.nav.centers()
+
+    def _note_home(self) -> None:
+        """Remember where the robots stand whose episode begins, or that are seen for the first time."""
+        home, at = self.nav.pick(self.state["home"]), self.nav.centers()
+        begins = (self.nav.state["macro_step"] == 0).view(-1, 1, 1) | home.isnan()
+        self.state["home"] = self.nav.put(self.state["home"], torch.where(begins, at, home))
 
     def drive(self, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""

@@ -9,7 +9,7 @@ import warp as wp
 
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import ERROR_START, PI, START_CLEARANCE, Maps, Robots, point_xy
+from maexp.kernels.types import BESIDE, ERROR_START, PI, START_CLEARANCE, Maps, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
@@ -33,6 +33,45 @@ def start_is_free(
         room = wp.max(need, START_CLEARANCE * robots.collision_threshold[e, other])
         if wp.length(center[e, other] - p) < room:
             return False
+    return True
+
+
+@wp.func
+def find_beside(
+    maps: Maps, robots: Robots, e: int, i: int, first: int, count: int, center: wp.array2d(dtype=wp.vec3)
+) -> int:
+    """The free point nearest to robot 0 where robot i has room beside one of robots 0 .. i - 1; -1: there is none.
+
+    Both keep so far from walls that none fits between two places beside each other.
+    """
+    best = int(-1)
+    nearest = wp.float32(wp.inf)
+    for j in range(first, first + count):
+        p = maps.free[j]
+        gap = wp.length(p - center[e, 0])
+        if gap < nearest:
+            if start_is_free(maps, robots, e, i, j, p, center):
+                for other in range(i):
+                    larger = wp.max(robots.collision_threshold[e, i], robots.collision_threshold[e, other])
+                    if wp.length(center[e, other] - p) <= BESIDE * START_CLEARANCE * larger:
+                        nearest = gap
+                        best = j
+    return best
+
+
+@wp.func
+def gather_team(
+    maps: Maps, robots: Robots, e: int, start: int, first: int, count: int, center: wp.array2d(dtype=wp.vec3)
+) -> bool:
+    """Place robot 0 at free point ``start`` and the others beside it; whether there is room for all."""
+    if not start_is_free(maps, robots, e, 0, start, maps.free[start], center):
+        return False
+    center[e, 0] = maps.free[start]
+    for i in range(1, center.shape[1]):
+        point = find_beside(maps, robots, e, i, first, count, center)
+        if point < 0:
+            return False
+        center[e, i] = maps.free[point]
     return True
 
 
@@ -61,6 +100,7 @@ def _place_team(
     robots: Robots,
     # Settings:
     num_maps: int,
+    together: int,
     # State in:
     seed: wp.array(dtype=wp.int32),  # [1]
     env_id: wp.array(dtype=wp.int32),  # [env]
@@ -76,7 +116,7 @@ def _place_team(
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
 ):
     """Draw the map of a new episode and, where none is given, a start for every robot: clear of walls and of the
-    others, any heading."""
+    others, any heading; or a place where the team starts ``together``."""
     e = wp.tid()
     if mask[e] == 0:
         return
@@ -97,6 +137,21 @@ def _place_team(
             if given:
                 start = starts[e, i]
             put_robot(e, i, wp.vec2(start[0], start[1]), start[2], robots, pose, center)
+        return
+    if together != 0:
+        shift = wp.randi(rng, 0, count)
+        gathered = wp.bool(False)
+        for k in range(TRIES + count):  # crowded: the first that fits after a random one
+            place = first + (k + shift) % count
+            if k < TRIES:
+                place = first + wp.randi(rng, 0, count)
+            gathered = gather_team(maps, robots, e, place, first, count, center)
+            if gathered:
+                break
+        if not gathered:
+            wp.atomic_or(error, e, ERROR_START)
+        for i in range(pose.shape[1]):
+            put_robot(e, i, point_xy(center[e, i]), PI * (2.0 * wp.randf(rng) - 1.0), robots, pose, center)
         return
     for i in range(pose.shape[1]):
         point = int(-1)
@@ -158,7 +213,7 @@ def _clear_env(
     local_step[e] = 0
     macro_step[e] = 0
     terminated[e] = 0
-    for k in range(2):
+    for k in range(milestone_step.shape[1]):
         milestone_step[e, k] = -1
         milestone_overlap[e, k] = 0.0
 
@@ -194,7 +249,7 @@ def _clear_robots(
     crashed[e, i] = 0
     path_length[e, i] = 0.0
     episode_reward[e, i] = 0.0
-    for k in range(2):
+    for k in range(milestone_path.shape[2]):
         milestone_path[e, i, k] = 0.0
     for k in range(terms.shape[2]):
         terms[e, i, k] = 0.0

@@ -24,6 +24,9 @@ UNCOVERED = 0
 COVERED = 1
 GAINED = 2
 """What the time term counts: -(1 - coverage), -coverage as the paper prints, or what is gained for the rest."""
+MARKS = (85, 95, 99)
+"""Coverages [%] whose first moment is noted: the last axis of the milestones."""
+_SHARES = wp.types.vector(len(MARKS), float)(*(mark / 100 for mark in MARKS))
 
 
 @wp.struct
@@ -148,8 +151,8 @@ def _close_step(
     milestone_path: wp.array3d(dtype=wp.float32),  # [env, robot, mark]
     terminated: wp.array(dtype=wp.int32),  # [env]
 ):
-    """Count the local step, sum up the coverage, note when 85 % and 95 % are reached, end the episode on success or
-    when all collided."""
+    """Count the local step, sum up the coverage, note which of `MARKS` are reached, end the episode on success or when
+    all collided."""
     e = wp.tid()
     if active[e] == 0:
         return
@@ -158,11 +161,8 @@ def _close_step(
     coverage = float(covered[e]) / float(maps.total_weight[map_id[e]])
     covered_before[e] = covered[e]
     covered_sum[e] = covered_sum[e] + wp.int64(covered[e])
-    for k in range(2):
-        mark = float(0.85)
-        if k == 1:
-            mark = 0.95
-        if milestone_step[e, k] < 0 and coverage >= mark:
+    for k in range(milestone_step.shape[1]):
+        if milestone_step[e, k] < 0 and coverage >= _SHARES[k]:
             milestone_step[e, k] = step
             milestone_overlap[e, k] = float(shared[e]) / float(covered[e])
             for i in range(collided.shape[1]):

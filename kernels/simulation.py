@@ -33,6 +33,7 @@ class Settings:
     line_of_sight: bool  # whether walls block communication
     draw_known: bool  # pictures show what robots know, not what they have seen
     success_coverage: float  # share at which an episode ends
+    together: bool  # teams start in one place
     dt: float = DT  # of a local step [s]
 
 

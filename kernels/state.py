@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from maexp.kernels.reward import TERMS
+from maexp.kernels.reward import MARKS, TERMS
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Robots
 
@@ -25,7 +25,7 @@ AXES = {
     "P": ("free", "as F where communication is limited, else 1"),
     "Q": ("boundary", "as B where communication is limited, else 1"),
     "R": ("term", "terms of the reward"),
-    "M": ("mark", "coverage of 85 % and of 95 %"),
+    "M": ("mark", "coverages of `reward.MARKS`: 85, 95 and 99 %"),
     "T": ("step", "local steps that a trajectory remembers; step t stands at t % T"),
     "S": ("slot", "entries of a list of robots, N"),
     "V": ("slot", "entries of a list of visible points"),
@@ -212,7 +212,7 @@ def axis_sizes(
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
         "O": max(nearby, 1), "G": body_pixels, "T": track, "R": TERMS, "D": 3 * BINS,
-        "S": num_robots, "M": 2, "1": 1,
+        "S": num_robots, "M": len(MARKS), "1": 1,
     }  # fmt: skip
 
 

@@ -44,6 +44,7 @@ DT = 0.1
 """Length of a local step [s]."""
 
 START_CLEARANCE = 3.0
+BESIDE = 1.5  # robots that start together stand at most so many clearances from another one
 """Starts keep this many collision thresholds from the boundary and from other robots."""
 
 PI = 3.14159265358979

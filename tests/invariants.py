@@ -5,6 +5,7 @@ where it is and what it hit, and keeps its own flags, sums and rewards. `check_s
 the env hands out.
 """
 
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -50,7 +51,7 @@ class Life:
     old: dict = field(default_factory=dict)  # the state after the last local step
     terms: np.ndarray = None  # [N, len(COUNTED)], of this macro step
     total: np.ndarray = None  # [N], of the episode
-    milestone: list = field(default_factory=list)  # (local step, overlap, paths) at 85 % and 95 %
+    milestone: list = field(default_factory=list)  # (local step, overlap, paths) at 85, 95 and 99 %
     macro_steps: int = 0
     over: bool = False  # terminated: nothing moves any more
     finished: bool = False  # terminated or truncated at the end of a macro step
@@ -119,7 +120,7 @@ class Watch:
         total = int(env.simulation.map_tensors["total_weight"][state["map_id"][e]])
         seen = np.zeros((robots, len(place.free)), bool)
         life = self.lives[e] = Life(place, total, int(state["episode"][e]), seen)
-        life.milestone = [(-1, 0.0, np.zeros(robots, np.float32))] * 2
+        life.milestone = [(-1, 0.0, np.zeros(robots, np.float32))] * 3
         life.terms, life.total = np.zeros((robots, len(COUNTED))), np.zeros(robots)
         self.episodes += 1
         assert now["local_step"] == 0 and not now["collided"].any() and not now["path_length"].any()
@@ -235,7 +236,7 @@ class Watch:
             np.full(len(found), v * cfg.success * won), -v * cfg.collision * (now["crashed"] != 0),
         ], axis=1)  # fmt: skip
         self.successes += int(won)
-        for k, mark in enumerate((0.85, 0.95)):
+        for k, mark in enumerate((0.85, 0.95, 0.99)):
             if life.milestone[k][0] < 0 and life.coverage >= np.float32(mark):
                 shared = weight[life.seen.sum(0) > 1].sum() / life.covered
                 life.milestone[k] = (int(now["local_step"]), shared, now["path_length"].copy())
@@ -283,13 +284,14 @@ class Watch:
         assert int(info["local_steps"]) == now["local_step"]
         assert np.array_equal(info["collided"].cpu().numpy(), now["collided"] != 0)
         assert np.array_equal(info["path_length"].cpu().numpy(), now["path_length"])
-        for (step, shared, paths), mark in zip(life.milestone, ("85", "95"), strict=True):
+        for (step, shared, paths), mark in zip(life.milestone, ("85", "95", "99"), strict=True):
             assert int(info[f"coverage_step_{mark}"]) == step
             overlap = float(info[f"mutual_overlap_{mark}"])
             assert 0.0 <= overlap <= 1.0 and math.isclose(overlap, shared, abs_tol=1e-5 if life.place.exact else 0.04)
             assert np.array_equal(info[f"path_length_{mark}"].cpu().numpy(), paths)
-        first, second = life.milestone[0][0], life.milestone[1][0]
-        assert second == -1 or 0 < first <= second
+        steps = [step for step, *_ in life.milestone]
+        for first, second in itertools.pairwise(steps):
+            assert second == -1 or 0 < first <= second
         for value in after.values(True, True):
             assert not value.is_floating_point() or bool(value.isfinite().all()), "a value is not finite"
 

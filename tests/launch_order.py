@@ -112,6 +112,8 @@ def setups() -> dict:
         ),
         "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "oracle"),
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
+        "rollouts": (dict(planner=wavefront), "lookahead"),
+        "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),
     }  # fmt: skip
 

@@ -10,11 +10,12 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.baseline import ALIKE, Baseline, describe_changes, load_baseline, write_episodes
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.results import FORMAT
 
 TINY = ["evaluate", "policy=random,nearest_frontier", "scenario.held_out=[70,71]", "scenario.macro_steps=2",
         "scenario.local_steps=5", "num_robots=2", "num_envs=4", "episodes=4",
         "device=cpu", "num_threads=1"]  # fmt: skip
-RUN = {"scenario": "maze_small", "maps": ["a", "b"], "seed": 0, "episodes": 2, "steps": [300]}
+RUN = {"format": FORMAT, "scenario": "maze_small", "maps": ["a", "b"], "seed": 0, "episodes": 2, "steps": [300]}
 MAPS = np.array(["a", "a", "b", "b"])
 
 
@@ -58,6 +59,12 @@ def test_changes_are_paired_and_maps_have_their_own(saved):
         f"voronoi N=2 less {saved}: -10.0 points of coverage over time [-10.0, -10.0], "
         "+0 steps to 95 % [+0, +0], +0.00 robots lost [+0.00, +0.00]."
     ]
+
+
+def test_results_of_another_format_are_a_sentence(saved):
+    (saved / "results.json").write_text(json.dumps({"run": RUN | {"format": "maexp-results-0"}}))
+    with pytest.raises(UserError, match=f"no folder of maexp evaluate with episodes.csv and .* of kind {FORMAT}"):
+        load_baseline(str(saved))
 
 
 @pytest.mark.parametrize("name", ALIKE)

@@ -1,9 +1,8 @@
-"""`maexp bench`: what it measures and counts, what it compares, how it refuses."""
+"""`maexp bench`: what it measures, what it compares, how it refuses."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -11,8 +10,6 @@ from maexp.agents.cli import main
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, move_sweeps
 from maexp.agents.speed import kernels
-from maexp.agents.speed.census import count_moment
-from maexp.agents.speed.counts import FORMULAS, kernel_cost
 from maexp.agents.speed.scale import large_maze
 from maexp.agents.speed.shared import spread, sweep_points
 from maexp.envs import ExplorationEnv, make_map
@@ -62,7 +59,7 @@ def test_env_measures_the_planner_that_is_asked_for(capsys):
     assert [line.split()[:3] for line in lines if "this machine" in line] == [["this", "machine,", "dwa"]]
 
 
-def test_kernels_are_timed_counted_and_compared(capsys):
+def test_kernels_are_timed_and_compared(capsys):
     words = ["bench", "kernels", *TINY, "num_robots=2", "planner=dwa"]
     assert main([*words, "hydra.run.dir=first"]) == 0
     first = report("first", "bench_kernels.json")
@@ -71,10 +68,8 @@ def test_kernels_are_timed_counted_and_compared(capsys):
     assert {row["stage"] for row in first["rows"]} == {"goal", "local step", "observe", "reset"}
     for row in first["rows"]:
         assert 0 < row["in_place_us"]["p10"] <= row["in_place_us"]["median"] <= row["in_place_us"]["p90"]
-        assert row["alone_us"]["median"] > 0 and row["bytes"] > 0
-        assert row["share_of_copy"] == pytest.approx(
-            row["bytes"] / (1e-6 * row["in_place_us"]["median"]) / first["ceilings"]["copy_bytes_per_second"]
-        )
+        assert row["alone_us"]["median"] > 0
+    assert all(one > 0 for one in first["ceilings"].values())
     # an earlier run in which one kernel was ten times as fast, all beyond doubt
     for row in first["rows"]:
         factor = 0.1 if row["kernel"] == "scan_free" else 1.0
@@ -168,49 +163,7 @@ def test_bad_input_gives_a_sentence(case, capsys):
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("settings", ["planner=dwa", "planner=direct"])
-def test_every_kernel_of_the_plain_step_has_a_formula(settings):
-    cfg = compose_config("bench", ["task=kernels", *TINY, "num_robots=2", settings])
-    env = kernels.make_env(cfg, [make_map("maze_small", 0)], 2)
-    steps = kernels.record_steps(env, env.simulation.shards[0])
-    assert {step.kernel for step in steps} <= set(FORMULAS)
-
-
-def test_counts_agree_with_the_definitions():
-    """Points in range and seen, by brute force over the whole map."""
-    env = ExplorationEnv(make_map("maze_small", 0), num_envs=3, num_robots=2, seed=4, num_threads=1)
-    env.rollout(2)
-    counts = count_moment(env, env.simulation.shards[0], env.simulation.tensors["active"])
-    rows = []
-    for e in range(3):
-        shot = env.snapshot(e)
-        others = shot["center"][::-1]
-        for i, at in enumerate(shot["center"]):
-            free, boundary = (np.linalg.norm(p[:, :2] - at, axis=1) for p in (shot["map"].free, shot["map"].boundary))
-            outline = np.linalg.norm(others[i] - at) <= 10 + 2.5
-            least, most = (boundary <= 10).sum(), (boundary <= 10).sum() + 10 * outline
-            rows.append(((free <= 10).sum(), shot["visible"][i].sum(), least, most))
-    free_in, visible, least, most = np.mean(rows, axis=0)
-    assert counts["free_in"] == pytest.approx(free_in, abs=0.5) and counts["visible"] == pytest.approx(visible)
-    assert least - 0.5 <= counts["occluders"] <= most + 0.5
-    assert counts["free_in"] <= counts["free_near"] and counts["undecided"] <= counts["free_in"]
-    assert counts["undecided"] > 0 and counts["pair_tests"] >= counts["undecided"]
-    assert counts["team_points"] * 2 * 3 == sum(
-        int((env.simulation.tensors[f"seen_{k}"] != 0).sum()) for k in ("free", "boundary")
-    )
-
-
-def test_cost_grows_with_what_is_met():
-    env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=2, num_threads=1)
-    env.rollout(2)
-    counts = count_moment(env, env.simulation.shards[0], env.simulation.tensors["active"])
-    more = counts | {"free_near": 2 * counts["free_near"], "pair_tests": 2 * counts["pair_tests"]}
-    assert kernel_cost("_scan_free", more).operations > kernel_cost("_scan_free", counts).operations
-    assert kernel_cost("_scan_free", more).bytes > kernel_cost("_scan_free", counts).bytes
-    assert kernel_cost("_unknown", counts) is None
-
-
-def test_counting_and_timing_change_nothing():
+def test_timing_changes_nothing():
     """What is timed is put back: the same moment for every lap, in place and alone."""
     env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=3, num_threads=1)
     env.rollout(1)
@@ -218,7 +171,7 @@ def test_counting_and_timing_change_nothing():
     shard = env.simulation.shards[0]
     steps = kernels.record_steps(env, shard)
     run = kernels.Runner(env.device, None)
-    run.in_place(steps, 0.01, lambda: count_moment(env, shard, before["active"]))
+    run.in_place(steps, 0.01)
     run.alone(steps, 0.01)
     scratch = ("mask", "nearby")  # `record_steps` marks all envs; the planner's list is written before it is read
     for name, value in env.simulation.tensors.items():

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from maexp.agents.benchmark.cell import CellResult
-from maexp.agents.benchmark.differences import differences_markdown, find_best, subtract
+from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.benchmark.table import (
     ROWS,
@@ -25,9 +25,11 @@ from maexp.agents.benchmark.table import (
 def column(policy: str, seed: int = 0, **values: list[float]):
     names = [row.metric for row in ROWS]
     episodes = {name: np.array(values.get(name, [0.5, 0.7]), dtype=float) for name in names}
-    return pool_column(policy, "held_out", [(seed, episodes)])
+    return pool_column(policy, "held_out", [(seed, episodes)], [np.array(["a", "b"])])
 
 
+ZERO = {"mean": 0.0, "ci95": [0.0, 0.0]}
+APART = {"ippo": {row.metric: ZERO for row in ROWS} | {"collisions": ZERO}}
 ER, CS = (next(row for row in ROWS if row.label == label) for label in ("ER", "CS85"))
 
 
@@ -74,6 +76,17 @@ def test_markdown_and_latex_mark_the_best(tables):
     assert len(widths) == 1 and latex.count("{tabular}") == 2
 
 
+def test_rows_of_99_percent_stand_where_episodes_go_on_until_then(tables):
+    for goal, count in ((0.95, 0), (0.99, 1)):
+        text, latex, out = table_markdown(tables, goal=goal), table_latex(tables, goal=goal), StringIO()
+        print_tables(tables, Console(file=out, width=80), goal)
+        assert text.count("\n| CS99") == text.count("\n| to 99") == 2 * count
+        assert (" CS99 " in out.getvalue()) == bool(count)
+        assert latex.count("& CS99") == 2 * count and rf"\multirow{{{3 * (8 + 2 * count)}}}" in latex
+        assert ("to 99, steps" in differences_markdown("voronoi", APART, goal)) == bool(count)
+        assert ("to 99, steps" in differences_text("maze", "voronoi", APART, goal)[1]) == bool(count)
+
+
 def test_the_terminals_table_fits_100_columns(tables):
     wide = [1400.0, 2999.0]
     tables["maze"].append(column("potential_field", reward_variance=wide, coverage_step_85=wide, coverage_step_95=wide))
@@ -87,11 +100,10 @@ def test_the_terminals_table_fits_100_columns(tables):
 # Less the best classical planner
 
 
-def played(policy: str, coverage: list, seed: int = 0, maps: list | None = None) -> tuple[Cell, CellResult]:
+def played(policy: str, coverage: list, seed: int = 0, maps: list = ("a", "b")) -> tuple[Cell, CellResult]:
     values = np.array(coverage)
     episodes = {"coverage_auc": values, "coverage_step_95_censored": -100 * values, "collisions": 0 * values}
-    names = None if maps is None else np.array(maps)
-    return Cell("maze", policy, seed), CellResult(episodes, np.zeros(1), values[:, None], {}, names)
+    return Cell("maze", policy, seed), CellResult(episodes, np.zeros(1), values[:, None], {}, np.array(maps))
 
 
 def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training():
@@ -103,7 +115,7 @@ def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training
     unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8], 1, maps)]
     found = subtract("ippo", unlike, planner)["coverage_auc"]
     assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
-    assert subtract("ippo", [played("ippo", [0.5], 7)], planner) == {}
+    assert subtract("ippo", [played("ippo", [0.5, 0.5], 7)], planner) == {}
     text = differences_markdown("voronoi", {"ippo": subtract("ippo", alike, planner)})
     assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
 

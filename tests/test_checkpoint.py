@@ -9,12 +9,20 @@ import torch
 
 from maexp.agents.errors import UserError
 from maexp.agents.training import checkpoint
-from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, load_checkpoint, save_checkpoint
+from maexp.agents.training.checkpoint import (
+    FORMAT,
+    find_checkpoint,
+    list_checkpoints,
+    load_checkpoint,
+    save_checkpoint,
+)
 from maexp.envs import files
 
 
 def state(number: int) -> dict:
-    return {"overrides": ["seed=1"], "iteration": number, "policy": {"weights": torch.full((5,), float(number))}}
+    settings = {"scenario": {"name": "maze"}, "planner": {"name": "dwa"}}
+    words = {"overrides": ["seed=1"], "settings": settings, "followers": [], "maps": {}}
+    return words | {"iteration": number, "policy": {"weights": torch.full((5,), float(number))}}
 
 
 @pytest.fixture
@@ -65,8 +73,14 @@ def test_nothing_to_find(tmp_path):
     with pytest.raises(UserError, match="holds no whole checkpoint"):
         find_checkpoint(tmp_path)
     torch.save({"model": 1}, tmp_path / "other.pt")
-    with pytest.raises(UserError, match="not a checkpoint of MAexp"):
+    with pytest.raises(UserError, match=f"no checkpoint of the kind {FORMAT}"):
         find_checkpoint(tmp_path / "other.pt")
+
+
+def test_one_of_another_format_is_a_sentence(tmp_path):
+    path = save_checkpoint(tmp_path, state(1) | {"format": "maexp-checkpoint-0"}, 1, keep=1)
+    with pytest.raises(UserError, match=f"no checkpoint of the kind {FORMAT}: train again"):
+        load_checkpoint(path)
 
 
 def test_code_in_a_file_is_never_run(tmp_path):

@@ -158,21 +158,6 @@ def change(policy) -> None:
             p.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
 
 
-def test_a_state_saved_before_the_observation_had_a_key_goes_on_alike(make_experience):
-    _, experience = make_experience()
-    experience.next()  # 2 of an episode's 3 steps: time has passed
-    state, random = experience.state_dict(), torch.get_rng_state()
-    first = [one.clone() for one in experience.next()]
-    seen = state["0"]["seen"]
-    new = [f"agents/observation/{name}" for name in ("time_left", "alive")]
-    state["0"]["seen"] = {key: value for key, value in seen.items() if key not in new}
-    assert len(state["0"]["seen"]) == len(seen) - 2
-    experience.load_state_dict(state)
-    torch.set_rng_state(random)
-    assert not differing(experience.next(), first)
-    assert (first[0]["agents", "observation", "time_left"][:, 0] < 0.5).all()
-
-
 @pytest.fixture
 def handed_over(monkeypatch) -> list[int]:
     """Sizes [bytes] of what is written to worker processes as they start."""

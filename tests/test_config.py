@@ -13,11 +13,13 @@ from maexp.agents.settings.overrides import find_override, make_overrides, quote
 from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
 from maexp.envs.config import (
     CommConfig,
+    LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
     RobotConfig,
+    TargetsConfig,
     complete_planner,
     complete_radar,
     complete_robot,
@@ -86,13 +88,17 @@ def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
     assert complete_radar(radar, row) == complete_radar(RadarConfig(), row), "conf/radar/lidar.yaml"
     whole = complete_planner(PlannerConfig(name=planner), row)
     assert complete_planner(PlannerConfig(**given(cfg.planner)), row) == whole, f"conf/planner/{planner}.yaml"
-    for group, kind in (("reward", RewardConfig), ("observation", ObservationConfig), ("comm", CommConfig)):
+    kinds = {
+        "reward": RewardConfig, "observation": ObservationConfig, "comm": CommConfig, "targets": TargetsConfig,
+        "lookahead": LookaheadConfig,
+    }  # fmt: skip
+    for group, kind in kinds.items():
         assert given(cfg[group]) == asdict(kind()), f"conf/{group}"
 
 
 def test_every_verb_composes():
     for verb in SCHEMAS:
-        words = ["task=list"] if verb in ("maps", "policies", "bench") else []
+        words = ["task=list"] if verb in ("maps", "policies", "bench", "suite") else []
         assert compose_config(verb, words).hydra.run.dir.endswith(f"-{verb}")
 
 

@@ -8,6 +8,7 @@ from torchrl.envs.utils import step_mdp
 from worlds import room
 
 import maexp.kernels as mk
+from maexp.agents.policies import POLICIES
 from maexp.agents.training.collect import make_collector
 from maexp.envs import ExplorationEnv, PlannerConfig
 
@@ -56,6 +57,18 @@ def test_the_radar_agrees(device):
         there = mk.visible_points(*(one.to(device) for one in (free, obstacles, origin)), **arguments)
         assert there.device.type == device and 0 < here.sum() < len(free)
         assert (there.cpu() != here).sum() <= 1  # a point within 1e-6 of a threshold may fall either way
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_branches_agree(device):
+    """Worlds of what teams know, and what is played in them, on a GPU as on the CPU."""
+    found = []
+    for where in ("cpu", device):
+        env = ExplorationEnv([room(30, 22)], num_envs=2, num_robots=3, device=where, seed=3, local_steps=5)
+        state = POLICIES["lookahead"](env)(env.reset())
+        found.append(state["agents", "action"].cpu())
+    torch.testing.assert_close(found[0]["offset"], found[1]["offset"], rtol=1e-3, atol=2e-3)
+    assert torch.equal(found[0]["region"], found[1]["region"])
 
 
 class FixedActions(TensorDictModuleBase):

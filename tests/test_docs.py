@@ -8,13 +8,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 import torch
 from tensordict.nn import set_composite_lp_aggregate
 from tensordict.nn.probabilistic import composite_lp_aggregate
 
 from maexp.agents.algorithms import ALGORITHMS
-from maexp.envs import SCENARIOS, PlannerConfig, RobotConfig
+from maexp.envs import SCENARIOS, ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig, make_map
 from maexp.envs.config import ROBOT_KINDS
 from maexp.envs.specs import REWARD_TERMS
 from maexp.envs.target_view import FEATURES
@@ -69,7 +70,8 @@ def test_readme():
 
 
 def test_own_training_loop():
-    (code,) = blocks("docs/torchrl.md", "python")
+    code, of_a_command = blocks("docs/torchrl.md", "python")
+    assert "make_env(" in of_a_command  # compared with the command's own in test_command_env.py
     assert len([line for line in code.splitlines() if line.strip()]) <= 30
     names = run_block(code, "docs/torchrl.md")
     assert names["batch"].shape == (4, 6) and names["log_prob"].shape == (4, 6, 3)
@@ -100,24 +102,42 @@ def test_episode_files_and_recorders(tmp_path, monkeypatch):
     assert (tmp_path / "logs" / "films" / "videos" / "film_0.pt").is_file()
 
 
-def test_own_scenario():
+def test_the_planner_of_the_arena_is_the_example_and_short():
+    (code,) = blocks("docs/arena.md", "python")
+    assert code == (ROOT / "docs" / "examples" / "policies" / "nearest.py").read_text()
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+
+
+def test_own_policies():
+    """A network chooses among the targets shown, and a class of NumPy arrays says where in metres."""
     names = run_block(blocks("docs/extending.md", "python")[0], "docs/extending.md")
+    env = ExplorationEnv(make_map("maze_small", 0), num_robots=2, observation=ObservationConfig(targets=6))
+    chosen = names["Network"](env)(env.reset())["agents", "action", "target"]
+    assert chosen.shape == (1, 2) and (chosen >= 0).all()
+    grid = np.full((1, 3, 4), -1, np.int8)
+    grid[0, 1, 1:3] = 0
+    seen = {"alive": [True], "grid": grid, "resolution": 1.0, "origin": (0.0, 0.0), "poses": np.zeros((1, 1, 3))}
+    assert names["Nearest"]().act(seen).tolist() == [[1.5, 1.5]]
+
+
+def test_own_scenario():
+    names = run_block(blocks("docs/extending.md", "python")[1], "docs/extending.md")
     assert names["env"].maps[0].name == "ring_3"
     assert torch.isfinite(names["env"].rollout(1)["next", "agents", "reward"]).all()
 
 
 def test_own_planner():
-    names = run_block(blocks("docs/extending.md", "python")[1], "docs/extending.md")
+    names = run_block(blocks("docs/extending.md", "python")[2], "docs/extending.md")
     assert names["coverage"]["n"] == 2 and 0.1 < names["coverage"]["mean"] <= 1.0
 
 
 def test_own_algorithm():
-    names = run_block(blocks("docs/extending.md", "python")[2], "docs/extending.md")
+    names = run_block(blocks("docs/extending.md", "python")[3], "docs/extending.md")
     assert not names["loss"].team_value and names["logged"]["gradient_norm"] > 0
 
 
 def test_every_block_of_extending_is_tested():
-    assert len(blocks("docs/extending.md", "python")) == 3
+    assert len(blocks("docs/extending.md", "python")) == 4
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is absent: diffs are not checked")

@@ -4,11 +4,13 @@ import importlib.util
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import open3d
 import pytest
+from small_suite import make_small_suite
 from worlds import room
 
 from maexp.agents.cli import VERBS, main
@@ -20,7 +22,8 @@ from maexp.envs.importing.report import ImportReport
 ROOT = Path(__file__).resolve().parents[1]
 HAS_ONNX = all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript", "safetensors"))
 HAS_BAGS = importlib.util.find_spec("rosbags") is not None
-PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"]
+LOG = ROOT / "docs" / "log"  # what was run once, with the code of its day
+PAGES = [*(page for page in sorted((ROOT / "docs").rglob("*.md")) if LOG not in page.parents), ROOT / "README.md"]
 PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger
@@ -49,8 +52,8 @@ ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
 """Words that need a cluster or another project's plugin; the rest of the command is run without them."""
 WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
 NOT_OURS = (
-    "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.golden", "MAEXP_",
-    "python -m maexp.envs.scenarios.", "python -m maexp.agents.runtime",
+    "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.", "MAEXP_",
+    "python -m maexp.agents.runtime",
 )  # fmt: skip
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""
 
@@ -89,6 +92,11 @@ COMMANDS = [line for line in shown() if line.startswith("maexp")]
 
 def small(line: str) -> list[str]:
     """The words of a command, with what it stands for, and small."""
+    if line.startswith("maexp suite "):
+        line = line.replace("run minival", "run small.yaml").replace("mine.yaml", "small.yaml")
+        line = line.replace("FOLDER", "outputs/mine")
+        given = "verify" not in line or "suite=" in line
+        return [*shlex.split(line)[1:], *([] if given else ["suite=small.yaml"])]
     for name, meaning in MEANT.items():
         line = re.sub(rf"(?<![A-Za-z_]){re.escape(name)}(?![A-Za-z_])", meaning, line)
     words = [word for word in shlex.split(line)[1:] if not word.startswith(ELSEWHERE)]
@@ -109,6 +117,8 @@ def small(line: str) -> list[str]:
 
 def set_stage(words: list[str]) -> None:
     """Earlier commands of a page made what this one reads, and none made what it is to write."""
+    if words[0] == "suite" and "outputs/mine" in "".join(words[2:]) and not Path("outputs/mine").exists():
+        assert main(["suite", "run", "small.yaml", "policy=random", "hydra.run.dir=outputs/mine"]) == 0
     for name, value in (word.split("=", 1) for word in words if "=" in word):
         place = Path(value)
         if name == "hydra.run.dir" and place.is_dir():
@@ -145,6 +155,13 @@ def folder(tmp_path_factory) -> Path:
             room(30, 21, spacing=0.2).save(place / name)
     export_ros_map(room(8, 6, spacing=0.1), place / "cupboard.yaml")
     (place / "scan.xyz").write_text("1 2 nan\n" + "\n".join(f"{i % 9} {i // 9} 0" for i in range(90)))
+    make_small_suite(place / "small.yaml")
+    shutil.copy(ROOT / "docs" / "examples" / "policies" / "nearest.py", place)
+    page = (ROOT / "docs" / "extending.md").read_text()
+    (place / "my_robots.py").write_text(re.findall(r"`my_robots.py`:\n\n```python\n(.*?)```", page, re.DOTALL)[0])
+    (place / "my_module.py").write_text("from maexp.agents.policies import POLICIES\n\nmake = POLICIES['voronoi']\n")
+    (place / "nearest").write_text(f"#!/bin/sh\nexec {sys.executable} -m maexp.agents.policies.guest nearest:Nearest\n")
+    (place / "nearest").chmod(0o755)
     header = "VERSION 0.7|FIELDS x y z|SIZE 4 4 4|TYPE F F F|COUNT 1 1 1|WIDTH 100|HEIGHT 1|POINTS 100|DATA ascii"
     (place / "truncated.pcd").write_text("\n".join([*header.split("|"), "1 2 3", ""]))
     with pytest.MonkeyPatch.context() as patch:

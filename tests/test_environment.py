@@ -133,18 +133,45 @@ def test_truncation_apart_from_termination(maps):
 def test_success_terminates_once_and_the_rest_of_the_macro_step_is_frozen():
     env = ExplorationEnv(open_room(15.0), num_envs=4, num_robots=2, radar=RadarConfig(range=7.0), local_steps=30,
                          robot=RobotConfig(collision_threshold=0.2), macro_steps=40)  # fmt: skip
+    torch.manual_seed(0)
     td = env.reset()
     for _ in range(40):
         td = env.rand_action(td)
         td = env.step(td)["next"]
-        if td["terminated"].any():
+        done = (td["info", "coverage"] >= 0.95)[:, 0]
+        assert not (done & ~td["terminated"][:, 0]).any()
+        if done.any():
             break
-    done = td["terminated"][:, 0]
     assert done.any(), "no team explored an open room in 40 macro steps"
     i = int(done.int().argmax())
     torch.testing.assert_close(td["info", "reward_success"][i], torch.full((2,), 100.0 * 60.0 / 7000.0))
     assert td["info", "local_steps"][i] == td["info", "coverage_step_95"][i]
     assert not td["truncated"][i]
+
+
+def test_an_episode_that_goes_on_to_99_percent_pays_for_it_there():
+    """The marks come one after another; the reward of success comes with the end, not at 95 %."""
+    env = ExplorationEnv(open_room(15.0), num_envs=6, num_robots=2, radar=RadarConfig(range=7.0), local_steps=4,
+                         robot=RobotConfig(collision_threshold=0.2),
+                         macro_steps=200, success_coverage=0.99)  # fmt: skip
+    torch.manual_seed(0)
+    td, paid, passed = env.reset(), torch.zeros(6, 2), torch.zeros(6, dtype=torch.bool)
+    for _ in range(200):
+        td = env.step(env.rand_action(td))["next"]
+        paid += td["info", "reward_success"]
+        passed |= (td["info", "coverage_step_95"] > 0).squeeze(-1) & ~td["done"].squeeze(-1)
+        assert not paid[~td["terminated"].squeeze(-1)].any(), "paid before the end"
+        if td["done"].all():
+            break
+    info = td["info"]
+    done = (info["coverage"] >= 0.99).squeeze(-1)
+    assert (done & passed).any(), "nobody went on from 95 to 99 %"
+    torch.testing.assert_close(paid[done], torch.full((int(done.sum()), 2), 100.0 * 60.0 / 7000.0))
+    steps = torch.cat([info[f"coverage_step_{mark}"] for mark in (85, 95, 99)], dim=1)[done & passed]
+    assert (steps.diff(dim=1) >= 0).all() and (steps[:, 1] < steps[:, 2]).all()
+    assert torch.equal(info["coverage_step_99"][done], info["local_steps"][done])
+    assert torch.equal(info["path_length_99"][done], info["path_length"][done])
+    assert (info["coverage_step_99"][~done] == -1).all()
 
 
 @pytest.mark.parametrize("every", [None, 7])

@@ -2,10 +2,12 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from maexp.agents import make_policy
 from maexp.agents.build import import_files, load_maps
@@ -14,12 +16,12 @@ from maexp.agents.commands.evaluate import describe_episodes
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
-from maexp.agents.evaluation.results import paired_differences
+from maexp.agents.evaluation.results import COLUMNS, paired_differences, print_results
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map
-from maexp.envs.metrics import resample_weights, summarise
+from maexp.envs.metrics import episode_metrics, in_reach, resample_weights, summarise
 
 POINTCLOUD = ("scenario=pointcloud", "policy=random")
 
@@ -99,6 +101,37 @@ def test_random_numbers_go_on_as_if_nothing_had_happened(env):
     assert torch.equal(torch.rand(4), wanted)
     assert (evaluate(policy, env, 4, seed=1).episodes["path_length"] == first).all()
     assert (evaluate(policy, env, 4, seed=2).episodes["path_length"] != first).any()
+
+
+def test_the_longest_way_and_the_marks_of_an_episode():
+    """The longest of three robots' ways; 99 % was reached once, and counts with the limit where it was not."""
+    team, count = [2, 1], 2
+    info = {name: torch.zeros(team) for name in ("coverage", "coverage_auc")} | {
+        name: torch.zeros(count, 3) for name in ("episode_reward_unscaled", "episode_reward", "collided")
+    }  # fmt: skip
+    for mark in (85, 95, 99):
+        info |= {f"{name}_{mark}": torch.full(team, -1) for name in ("coverage_step", "mutual_overlap")}
+    info |= {f"path_length_{mark}": torch.zeros(count, 3) for mark in (85, 95, 99)}
+    info["path_length"] = torch.tensor([[1.0, 5.0, 3.0], [4.0, 0.0, 2.0]])
+    info["coverage_step_99"], info["mutual_overlap_99"] = torch.tensor([[70], [-1]]), torch.tensor([[0.25], [0.0]])
+    found = episode_metrics(TensorDict(info, [count]), 90)
+    assert found["longest_path"].tolist() == [5.0, 4.0] and found["path_length"].tolist() == [3.0, 2.0]
+    assert found["coverage_step_99_censored"].tolist() == [70.0, 90.0]
+    np.testing.assert_array_equal(found["coverage_step_99"], [70.0, np.nan])
+    np.testing.assert_array_equal(found["mutual_overlap_99"], [0.25, np.nan])
+
+
+@pytest.mark.parametrize(("goal", "shown"), [(0.95, False), (0.99, True), (1.0, True)])
+def test_marks_beyond_the_end_of_an_episode_are_not_shown(goal, shown, capsys):
+    assert in_reach("coverage_step_99_censored", goal) == in_reach("path_length_99", goal) == shown
+    assert in_reach("coverage_step_95", goal) and in_reach("coverage_auc", goal)
+    assert not in_reach("mutual_overlap_95", 0.9)
+    value = {name: np.ones(2) for name in COLUMNS}
+    one = EvaluationResult("random", 3, value, 1.0, np.array(["a", "b"]), success_coverage=goal)
+    print_results([one], "maze")
+    assert ("99 % at step" in capsys.readouterr().out) == shown
+    teams = [replace(one, policy="trained", learned=True), replace(one, policy="voronoi")]
+    assert ("+0 steps to 99 %" in describe_differences(teams, {3: "voronoi"})[0]) == shown
 
 
 @pytest.mark.parametrize("name", ["random", "nearest_frontier"])

@@ -47,9 +47,9 @@ def play(env: ExplorationEnv, steps: int = 5):
         seen = td["agents", "observation"]
         yield seen, ours, now, {"velocities": speed, "time_left": left}, last
         index = torch.as_tensor(draw.integers(0, seen["targets_mask"].sum(-1).min(), (1, env.num_robots)))
-        last = env.target_view.state["point"][0, torch.arange(env.num_robots), index[0]].numpy().astype(float)
         td["agents", "action", "target"] = index
         td = env.step(td)["next"]
+        last = env.target_view.state["last"][0].numpy().astype(float)
         if td["done"].any():
             break
 

@@ -21,7 +21,7 @@ from maexp.agents.benchmark.cell import read_result, write_result
 from maexp.agents.benchmark.plan import Cell, cell_folder
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.results import write_results
+from maexp.agents.evaluation.results import FORMAT, write_results
 from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import ExplorationEnv, MapError, PointCloudMap, make_map
@@ -55,7 +55,9 @@ class Results:
 
 
 def state(number: int) -> dict:
-    return {"overrides": [], "iteration": number, "policy": {"weights": torch.full((100_000,), float(number))}}
+    settings = {"scenario": {"name": "maze"}, "planner": {"name": "dwa"}}
+    words = {"overrides": [], "settings": settings, "followers": [], "maps": {}}
+    return words | {"iteration": number, "policy": {"weights": torch.full((100_000,), float(number))}}
 
 
 def write(what: str, number: int) -> None:
@@ -68,9 +70,10 @@ def write(what: str, number: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         values = np.full(50_000, float(number))
         arrays = {"coverage_step_85": values, "curve_seconds": values, "curve_coverage": values}
+        arrays["maps"] = np.full(3, "a")
         write_result(folder, "held_out", arrays, {
             "random": {"coverage_step_85": {}},
-            "run": {"maps": [], "commit": None, "seconds": 1.0, "numbers": [number] * 20_000},
+            "run": {"format": FORMAT, "maps": [], "commit": None, "seconds": 1.0, "numbers": [number] * 20_000},
         })  # fmt: skip
     else:
         save_checkpoint(Path("."), state(number), number, keep=2, best=True)
@@ -250,6 +253,7 @@ def hostile_states(saved: dict) -> dict[str, object]:
         "unknown overrides": saved | {"overrides": ["colour=red"]},
         "wrong values": saved | {"settings": saved["settings"] | {"num_robots": "three"}},
         "no settings": saved | {"settings": 7},
+        "another format": saved | {"format": "maexp-checkpoint-0"},
         "settings without a scenario": saved | {"settings": {"planner": {"name": "dwa"}}},
         "another shape": saved | {"policy": policy | {first: torch.zeros(3)}},
         "no tensor": saved | {"policy": policy | {first: "weights"}},

@@ -18,6 +18,7 @@ from maexp.agents.irsim.mapping import TeamGrid
 from maexp.agents.irsim.odometry import Odometry
 from maexp.agents.irsim.people import Walkers
 from maexp.agents.irsim.simulator import Scan
+from maexp.agents.policies import POLICIES
 
 ABSENT = "THE EXTRA maexp[irsim] IS NOT INSTALLED: no trial is run"
 ANGLES = np.linspace(-math.pi, math.pi, 180, endpoint=False)
@@ -216,7 +217,7 @@ def test_a_short_trial(world, disturbed):
         assert not np.allclose(moments[0].people, moments[2].people)
     else:
         assert trial.drift == pytest.approx(0.0, abs=1e-9) and trial.errors < 0.01
-        curve, _ = ours.run_ours(env, "nearest_frontier", 0)
+        curve, _ = ours.run_ours(env, POLICIES["nearest_frontier"](env), 0)
         assert len(curve) == 41 and abs(curve[0] - trial.coverage[0]) < 0.05
         again = run_trial(world, "nearest_frontier", starts, trial_config)
         assert again.coverage == trial.coverage
@@ -236,9 +237,51 @@ def test_the_command(world, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "out" / "film.gif").is_file() and (tmp_path / "out" / "coverage.png").is_file()
 
 
+WALKERS = """
+import numpy as np
+seen = []
+
+class Right:
+    \"\"\"Robot 0 goes to the right edge of the grid, the others stay.\"\"\"
+    def reset(self, episode):
+        self.episode = episode
+    def act(self, observation):
+        seen.append((self.episode, observation))
+        goals = np.full(observation["poses"].shape[:1] + (2,), np.nan)
+        right = observation["origin"][0] + observation["grid"].shape[2] * observation["resolution"]
+        goals[0] = right, observation["poses"][0, 0, 1]
+        return goals
+
+def inside(env):
+    return lambda td: td
+"""
+
+
+def test_a_foreign_policy_plays_here_too(world, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("irsim", reason=ABSENT)
+    monkeypatch.chdir(tmp_path)
+    world.save(tmp_path / "floor.npz")
+    (tmp_path / "walkers.py").write_text(WALKERS)
+    words = ["irsim", "floor.npz", "policy=walkers:Right", "num_robots=2", "seconds=6", "beams=60"]
+    assert main([*words, "hydra.run.dir=out"]) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    ways = results["results"]["ir-sim"]["path_length"]
+    assert ways[0] > 1.0 and ways[1] == pytest.approx(0.0, abs=0.05)
+    episode, seen = sys.modules["walkers"].seen[0]
+    assert (episode["num_robots"], episode["seconds"], episode["decision_seconds"]) == (2, 6.0, 2.0)
+    assert seen["grid"].dtype == np.int8 and set(np.unique(seen["grid"])) == {-1, 0, 100}
+    ours_first = next(one for _, one in sys.modules["walkers"].seen if one["resolution"] == world.resolution)
+    assert set(ours_first) == set(seen)
+    assert all(np.shape(seen[key])[:1] == np.shape(ours_first[key])[:1] for key in seen)
+    assert np.allclose(seen["poses"], ours_first["poses"], atol=1e-4), "both begin in one place"
+    assert main([*words[:2], "policy=walkers:inside"]) == 2
+    assert "plays on tensordicts of our simulator's env: maexp irsim takes a class with act" in capsys.readouterr().err
+
+
 BAD = {
     "needs a floor": [],
     "policy=best is unknown": ["floor.npz", "policy=best"],
+    "policy=oracle looks into our simulator": ["floor.npz", "policy=oracle"],
     "num_robots=0": ["floor.npz", "num_robots=0"],
     "people=-1": ["floor.npz", "people=-1"],
     "does not exist": ["nowhere.yaml"],

@@ -6,6 +6,7 @@ from kernel_source import arguments, kernels, uses
 from worlds import act, room
 
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.envs.simulation import TRACK_LENGTH
 from maexp.envs.specs import REWARD_TERMS
 from maexp.kernels import step
 from maexp.kernels.observe import picture_shapes
@@ -57,9 +58,10 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
     free, boundary = max(len(m.free) for m in env.maps), max(len(m.boundary) for m in env.maps)
     lengths = {
         "E": envs, "N": robots, "W": words, "F": free, "B": boundary, "H": words if limited else 1,
-        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 2, "1": 1,
+        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 3, "1": 1,
         "R": len(REWARD_TERMS),
-        "V": bank.free_in_range, "O": bank.boundary_in_range, "T": 3 * env.macro_steps + 1, "D": 384,
+        "V": bank.free_in_range, "O": bank.boundary_in_range, "D": 384,
+        "T": min(3 * env.macro_steps + 1, TRACK_LENGTH),
     }  # fmt: skip
     vectors = {"vec2f": (2,), "vec3f": (3,), "vec4f": (4,)}
     for name, field in FIELDS.items():

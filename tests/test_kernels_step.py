@@ -262,16 +262,32 @@ def test_counts_reward_and_end(episode):
         assert (after.terminated != 0) == over and (after.active != 0) == (not over)
 
 
-def test_milestones(episode):
-    env, moments = episode
-    for line in moments:
-        for k, share in enumerate((0.85, 0.95)):
-            reached = [m for m in line[1:] if m.coverage >= share]
+def test_milestones():
+    """Each share is noted in the local step that reaches it, with the overlap and the ways of that moment."""
+    env = ExplorationEnv(
+        [room(17, 11, "mixed", 1), room(13, 14, "rotated", 2)], 4, 2, seed=5, radar=RadarConfig(range=8.0),
+        robot=RobotConfig(collision_threshold=0.2), local_steps=1, macro_steps=1000, success_coverage=1.0,
+    )  # fmt: skip
+    generator, lines = torch.Generator().manual_seed(3), [[] for _ in range(4)]
+    env.reset()
+    actions = [act(env, generator) for _ in range(20)]
+    for step in range(160):
+        env.step(actions[step // 8].clone())
+        for e, line in enumerate(lines):
+            line.append(moment(env, e))
+    counts = [0, 0, 0]
+    for line in lines:
+        weights = team.area_weights(line[0].map.free_spacing)
+        shares = [team.coverage(now.seen_free, weights) for now in line]
+        for k, mark in enumerate((0.85, 0.95, 0.99)):
+            reached = [now for now, share in zip(line, shares, strict=True) if share >= mark - 1e-9]
             assert line[-1].milestone_step[k] == (reached[0].step if reached else -1)
             if reached:
-                weights = team.area_weights(reached[0].map.free_spacing)
+                counts[k] += reached[0] is not line[0]
                 want = team.mutual_overlap(reached[0].seen_free, weights)
                 np.testing.assert_allclose(line[-1].milestone_overlap[k], want, rtol=1e-5)
+                np.testing.assert_array_equal(line[-1].milestone_path[:, k], reached[0].path_length)
+    assert min(counts) >= 1, f"marks reached on the way: {counts}"
 
 
 def test_what_robots_know_travels_one_hop_a_step(episode):

@@ -254,7 +254,7 @@ def test_compact_pictures_serve_in_place_of_pictures(env, share):
     for network, head in zip(networks, heads, strict=True):
         awake(network)
         plain, found = (network(one.clone())[head] for one in (td, pooled))
-        torch.testing.assert_close(found, plain)
+        torch.testing.assert_close(found, plain, rtol=5e-6, atol=1e-5)  # sums of hundreds, in another order
         slopes = [torch.autograd.grad(value.square().mean(), [*network.parameters()], allow_unused=True)
                   for value in (plain, found)]  # fmt: skip
         for one, other in zip(*slopes, strict=True):

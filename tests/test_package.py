@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from lonely import PLAN_WITH_A_POLICY, share_packages
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("kernels", "envs", "agents", "conf")
@@ -39,13 +40,24 @@ def test_imports_go_one_way():
 
 
 def test_rooms_of_agents_import_only_those_before_them():
-    order = "runtime settings networks algorithms policies evaluation training irsim benchmark speed commands".split()
+    order = "runtime settings networks algorithms policies evaluation training irsim benchmark suites speed commands"
+    order = order.split()
     agents = ROOT / "agents"
     assert set(order) == {path.parent.name for path in agents.glob("*/*.py")}
     for place, room in enumerate(order):
         text = "".join(path.read_text() for path in (agents / room).glob("*.py"))
         used = set(re.findall(r"from maexp\.agents\.(\w+)[. ]", text)) & set(order)
         assert used <= set(order[: place + 1]), room
+
+
+@pytest.mark.parametrize("name", ["torchrl", "tensordict"])
+def test_torchrl_is_bounded_by_what_is_tested(name):
+    """Losses, collectors and estimators build on it; the next minor version is tried before it is allowed."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = next(one for one in map(Requirement, project["dependencies"]) if one.name == name)
+    pinned = re.search(rf"^{name}==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)[1]
+    major, minor, _ = map(int, pinned.split("."))
+    assert pinned in wanted.specifier and f"{major}.{minor + 1}.0" not in wanted.specifier
 
 
 def test_constraints_name_exact_versions():
@@ -76,10 +88,12 @@ def test_the_wheel_holds_code_settings_and_policies(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     wanted = {f"maexp/{path.relative_to(ROOT)}" for room in ROOMS for path in (ROOT / room).rglob("*.py")}
     wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
+    wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in (ROOT / "conf" / "_suite").glob("*.csv")}
     wanted.add("maexp/kernels/loops.h")
-    shipped = [path for path in (ROOT / "agents" / "shipped").rglob("*") if path.is_file()]
+    folders = [ROOT / "agents" / name for name in ("shipped", "predictors")]
+    shipped = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
     wanted |= {f"maexp/{path.relative_to(ROOT)}" for path in shipped}
-    assert len(shipped) >= 8 and wanted <= names, wanted - names
+    assert len(shipped) >= 12 and wanted <= names, wanted - names
 
 
 @pytest.mark.slow

@@ -10,12 +10,12 @@ from mazes import OFFSET, REGION, make_env
 from maexp.agents.policies.classical import (
     CLASSICAL,
     FrontierPlanner,
-    _prefer,
-    choose_by_area,
-    choose_by_assignment,
-    choose_by_force,
-    choose_by_utility,
-    choose_nearest,
+    _worthwhile,
+    rank_by_area,
+    rank_by_assignment,
+    rank_by_force,
+    rank_by_utility,
+    rank_nearest,
 )
 from maexp.envs import RobotConfig, make_map
 from maexp.envs.targets import Scene, plan_in_turn, value_targets
@@ -24,7 +24,7 @@ from maexp.envs.targets import Scene, plan_in_turn, value_targets
 def test_goals_under_dwa_are_in_sight_and_in_reach():
     env = make_env(4, planner="dwa", clearance=4.0)  # no place of these corridors is open ground then
     td = env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     reach = 0.5 * 2.0 * 2.0**2 + 0.75  # two seconds from standstill
     for _ in range(3):
         td[REGION], td[OFFSET] = planner(td["agents", "observation", "pose"])
@@ -81,27 +81,32 @@ INF = float("inf")
 
 
 def test_targets_with_little_to_see_wait():
-    scene = replace(scene_of([[[1.0, 2.0, INF], [1.0, INF, INF]]]), gain=torch.tensor([[[0.2, 0.4, 0.4]] * 2]))
-    assert _prefer(scene).travel.tolist() == [[[INF, 2.0, INF], [1.0, INF, INF]]]
+    """They come last, the nearest first, where a robot gets to others."""
+    scene = scene_of([[[5.0, 2.0, INF, 1.0], [1.0, INF, INF, 3.0]]])
+    scene = replace(scene, gain=torch.tensor([[[0.2, 0.4, 0.4, 0.2]] * 2]))
+    assert _worthwhile(scene).tolist() == [[[False, True, False, False], [True, False, False, True]]]
+    for rank in (rank_nearest, rank_by_area, rank_by_assignment):
+        first = rank(scene)[0, 0]
+        assert first.argsort(descending=True).tolist() == [1, 3, 0, 2] and first[2] == -INF
 
 
 def test_utility_weighs_what_is_to_be_seen_against_the_way():
     gain = torch.tensor([[[0.2, 0.4]]])
     near, far = (replace(scene_of([[[1.0, way]]]), gain=gain) for way in (10.0, 400.0))
-    assert choose_by_utility(near).tolist() == [[1]]
-    assert choose_by_utility(far).tolist() == [[0]]
+    assert rank_by_utility(near).argmax(-1).tolist() == [[1]]
+    assert rank_by_utility(far).argmax(-1).tolist() == [[0]]
     torch.testing.assert_close(value_targets(near), torch.tensor([[[0.2 - 0.003, 0.4 - 0.03]]]))
 
 
 def test_voronoi_keeps_to_the_own_area_and_ignores_the_dead():
     travel = [[[1.0, 5.0, 9.0], [2.0, 4.0, 3.0], [7.0, 8.0, 8.0]]]
-    assert choose_by_area(scene_of(travel)).tolist() == [[0, 2, 0]]
-    assert choose_by_area(scene_of(travel, alive=[[False, True, True]])).tolist()[0][1:] == [0, 0]
+    assert rank_by_area(scene_of(travel)).argmax(-1).tolist() == [[0, 2, 0]]
+    assert rank_by_area(scene_of(travel, alive=[[False, True, True]])).argmax(-1).tolist()[0][1:] == [0, 0]
 
 
 def test_hungarian_takes_the_least_total_and_shares_none():
     scene = scene_of([[[1.0, 2.0, INF], [1.5, 9.0, INF]], [[INF, 3.0, INF], [INF, 1.0, INF]]])
-    assert choose_by_assignment(scene).tolist() == [[1, 0], [1, 1]]
+    assert rank_by_assignment(scene).argmax(-1).tolist() == [[1, 0], [1, 1]]
 
 
 def test_choices_in_turn_spread_the_team():
@@ -135,7 +140,7 @@ def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(nam
         alive[:, lost], way[:, lost] = False, INF
         scene = scene_of(way[:, kept].tolist(), [[points] * len(kept)], alive=alive[:, kept].tolist(),
                          nav=Places(at[:, kept].tolist(), ways))  # fmt: skip
-        return CLASSICAL[name](scene)[0].tolist()
+        return CLASSICAL[name](scene)[0].argmax(-1).tolist()
 
     whole, living = choose([0, 1, 2]), [i for i in range(3) if i not in lost]
     assert [whole[i] for i in living] == choose(living)
@@ -145,18 +150,18 @@ def test_force_turns_toward_the_larger_pull_and_away_from_others():
     ways = torch.tensor([[[[3.0, 0.0], [-3.0, 0.0]]] * 2])
     travel, size = [[[5.0, 5.0], [5.0, 5.0]]], [[[4.0, 5.0], [4.0, 5.0]]]
     alone = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [50.0, 0.0]]], ways))
-    assert choose_by_force(alone).tolist() == [[1, 1]]
+    assert rank_by_force(alone).argmax(-1).tolist() == [[1, 1]]
     close = scene_of(travel, size=size, nav=Places([[[0.0, 0.0], [-2.0, 0.0]]], ways))
-    assert choose_by_force(close).tolist() == [[0, 1]]
+    assert rank_by_force(close).argmax(-1).tolist() == [[0, 1]]
     dead = scene_of(travel, size=size, alive=[[True, False]], nav=close.nav)
-    assert choose_by_force(dead).tolist()[0][0] == 1
+    assert rank_by_force(dead).argmax(-1).tolist()[0][0] == 1
 
 
 def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_left():
     env = make_env(1, num_robots=1)
     env.reset()
     env.simulation.tensors["macro_step"].fill_(1)
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     planner.tracker.nav.update()
     here = planner.tracker.nav.centers().unsqueeze(2)
     travel = torch.full((1, 1, planner.tracker.nav.num_blocks), INF)
@@ -178,7 +183,7 @@ def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_le
 def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
     env = make_env(1, num_robots=2)
     env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     planner.tracker.nav.update()
     travel = torch.full((1, 2, planner.tracker.nav.num_blocks), INF)
     travel[..., :2] = torch.tensor([9.0, 20.0])
@@ -199,7 +204,7 @@ def test_goals_lie_beyond_the_target_as_far_as_a_robot_gets(speed, drive):
     """Two seconds at 2 m/s^2 and at most 8 m/s."""
     env = make_env(1)
     env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     env.simulation.tensors["pose"][..., 2] = speed
     gap = torch.tensor([2.0, 9.0, 30.0])
     target = planner.tracker.nav.centers() + torch.stack([torch.zeros(3), gap], -1)
@@ -214,7 +219,7 @@ def test_how_far_goals_lie_is_each_robots_own():
     kinds = [("differential", 0.5), ("differential", 8.0), ("omnidirectional", 8.0)]
     env = make_env(1, robot=[RobotConfig(kind=kind, max_speed=speed, max_accel=2.0) for kind, speed in kinds])
     env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     env.simulation.tensors["slip"][:, 2] = 3.0
     target = planner.tracker.nav.centers()
     toward = torch.tensor([6.0, 0.0]).expand(1, 3, 2)
@@ -230,7 +235,7 @@ def test_under_dwa_goals_lie_beyond_near_targets_in_open_ground_only(scenario, c
     """Four seconds from standstill at 2 m/s^2 outdoors, two in a maze, whose corridors are open to small clearances."""
     env = make_env(2, planner="dwa", clearance=clearance, maps=[make_map(scenario, 0)])
     env.reset()
-    planner = FrontierPlanner(env, choose_nearest)
+    planner = FrontierPlanner(env, rank_nearest)
     nav = planner.tracker.nav
     nav.update()
     cell, x = float(nav.cell_size[0]), torch.tensor([1.0, 0.0])

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from tools.gallery import draw_gallery
+from tools.map_statistics import measure_map, rasterise
 
 from maexp.envs.checker import check_map
 from maexp.envs.scenarios import SCENARIOS, make_map, split
-from maexp.envs.scenarios.gallery import draw_gallery
 from maexp.envs.scenarios.lattice import wall_points
-from maexp.envs.scenarios.statistics import measure_map, rasterise
 from maexp.envs.scenarios.table import find_scenario
 
 GENERATED = [name for name, scenario in SCENARIOS.items() if scenario.build is not None]

@@ -1,4 +1,4 @@
-"""A run says what it ran: resolved values, how a checkpoint's settings meet new words, and older checkpoints."""
+"""A run says what it ran: resolved values, how a checkpoint's settings meet new words."""
 
 import warnings
 from dataclasses import asdict
@@ -12,8 +12,7 @@ from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import make_env, make_learner, model_settings
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.settings import legacy
-from maexp.agents.settings.compose import compose_config, compose_recipe, settings_of
+from maexp.agents.settings.compose import compose_config, compose_recipe
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, flatten, resolve, to_yaml
 from maexp.agents.settings.runs import continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
@@ -145,21 +144,12 @@ def test_a_group_chosen_anew_is_todays():
         k: v for k, v in today.items() if k.startswith("planner.")
     }
     assert play(saved, "planner=dwa")["planner.clearance_factor"] == 9.0, "the planner that it was"
-    assert play(saved, "planner.name=wavefront")["planner.clearance_factor"] == today["planner.clearance_factor"]
 
 
 def test_what_a_scenario_supplies_can_be_set_there():
     saved = save(radar__range=99.0)
     assert play(saved, "scenario.max_speed=3", "scenario.radar_range=5").items() >= {
         "robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 1.5}.items()  # fmt: skip
-
-
-def test_older_names_of_groups():
-    saved = save("algorithm.preset=reference", "model.preset=paper")
-    assert saved["settings"]["algorithm"]["lr"] == 0.0001 and saved["settings"]["model"]["channels"] == 32
-    del saved["settings"], saved["followers"]
-    with pytest.warns(UserWarning, match="an earlier version"):
-        assert play(saved, "checkpoint=run.pt")["model.channels"] == 32
 
 
 def test_the_wheelbase_follows_the_body():
@@ -180,50 +170,7 @@ def test_a_value_that_is_no_longer_known_is_named():
         play(saved)
 
 
-# Older checkpoints
-
-
-def test_a_checkpoint_of_words_alone_keeps_the_defaults_of_its_time(monkeypatch):
-    old = ["planner=dwa", "reward.overlap=0.5", "radar.range=77", legacy._wheelbase]
-    monkeypatch.setattr(legacy, "OLD_DEFAULTS", old)
-    saved = {"overrides": ["radar.range=8", "scenario=indoor_small"]}
-    with pytest.warns(UserWarning, match=r"run.pt was written by .*planner=dwa, reward.overlap=0.5, radar.range=77"):
-        after = play(saved)
-    assert (after["planner.name"], after["reward.overlap"], after["radar.range"]) == ("dwa", 0.5, 8.0)
-    assert after["robot.wheelbase"] == SCENARIOS["indoor_small"].body_length
-    with pytest.warns(UserWarning, match="an earlier version"):
-        after = play(saved, "scenario=maze", "planner=wavefront")
-    assert after["robot.wheelbase"] == SCENARIOS["maze"].body_length and after["planner.name"] == "wavefront"
-    assert settings_of(saved)["reward.overlap"] == 0.5
-
-
-def test_a_setting_that_came_later_keeps_what_was_before(monkeypatch):
-    saved = save(radar__range=99.0)
-    del saved["settings"]["reward"]["time_on"]
-    monkeypatch.setattr(legacy, "OLD_DEFAULTS", ["reward.time_on=covered", "radar.range=5", "planner=dwa"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        after = play(saved)
-    assert (after["reward.time_on"], after["radar.range"], after["planner.name"]) == ("covered", 99.0, "wavefront")
-
-
-def test_old_defaults_compose_for_every_scenario():
-    for scenario in BUILT:
-        words = [f"scenario={scenario}"]
-        settings = resolve(compose_config("train", [*legacy.old_defaults(words), *words]))
-        assert settings["robot"]["wheelbase"] == SCENARIOS[scenario].body_length
-        assert settings["planner"]["name"] == "dwa"
-        assert settings["planner"]["clearance_factor"] == SCENARIOS[scenario].clearance_factor
-
-
-def test_dwas_clearance_was_the_scenarios():
-    saved = {"overrides": ["scenario=indoor_small"]}
-    with pytest.warns(UserWarning, match="an earlier version"):
-        assert play(saved)["planner.clearance_factor"] == 4.2
-        assert play(saved, "scenario=maze")["planner.clearance_factor"] == 4.0
-        assert play(saved, "planner=wavefront")["planner.clearance_factor"] == 2.0
-        assert play({"overrides": ["planner=wavefront"]})["planner.clearance_factor"] == 2.0
-        assert "planner.clearance_factor" not in play({"overrides": ["planner=direct"]})
+def test_the_papers_clearance_follows_the_scenario():
     for saved in (save("preset=paper", "scenario=maze"), save("planner=paper", "scenario=maze")):
         assert play(saved)["planner.clearance_factor"] == 4.0
         assert play(saved, "scenario=indoor_small")["planner.clearance_factor"] == 4.2
@@ -299,4 +246,3 @@ def test_maps_that_changed_are_named():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_changed_maps(saved, maps[:1])
-        warn_of_changed_maps({}, maps)

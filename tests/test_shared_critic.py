@@ -57,7 +57,7 @@ def test_values_are_those_of_the_states(name):
     key = TEAM_VALUE if loss.team_value else VALUE
     kept, anew = write_advantages(loss, batch.copy()), write_advantages(loss, batch.copy().exclude(SEEN))
     assert torch.allclose(kept[key], anew[key], atol=1e-5) and kept[key].std() > 0
-    loss.bare_estimator.set_keys(terminated="terminated")  # the horizon is no end: what follows a state is valued
+    loss.finite_horizon = False  # the horizon is no end: what follows a state is valued
     kept = write_advantages(loss, batch.copy())
     following, done = kept["next", *key], batch["next", "done"]
     assert done[:, 1].all() and not batch["next", "terminated"].any()
@@ -97,7 +97,6 @@ def encoder_keys(loss) -> list[str]:
 
 
 def test_an_encoder_is_shared_only_where_asked_for():
-    """As in older checkpoints, which do not know the setting."""
     default = ModelConfig(action="targets").critic_encoder
     loss, *_ = build("mappo", default)
     assert default == "own" and encoder_keys(loss)

@@ -96,9 +96,9 @@ def test_a_foreign_folder_and_two_of_one_name_are_sentences(tmp_path, monkeypatc
     (tmp_path / "file").write_text("")
     shutil.copytree(SHIPPED / "universal", "mine/universal")
     for policy, part in (
-        ("empty", "empty is not the folder of a policy: No such file"),
-        ("file", "policy=file is a file: give the folder that maexp export wrote"),
-        ("universal,mine/universal", "names universal twice"),
+        ("empty", "policy=empty is a folder without a policy: it holds neither the contract.json of maexp export"),
+        ("file", "policy=file is a file and no checkpoint: give a run's folder, or that of an exported policy"),
+        ("universal,universal", "names universal twice"),
     ):
         assert main(["evaluate", f"policy={policy}"]) == 2
         told = capsys.readouterr().err

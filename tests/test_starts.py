@@ -99,22 +99,12 @@ def test_a_resumed_env_goes_on_bit_for_bit(maps, starts):
     assert all(torch.equal(a, b) for a, b in zip(want, got, strict=True))
 
 
-def test_a_state_from_before_starts_could_be_given_draws_them(maps):
-    env, old = make(maps, seed=3), make(maps, seed=3)
-    old.reset()
-    saved = {name: value for name, value in old.state_dict().items() if name != "starts"}
-    env.set_starts(POSES)
-    env.load_state_dict(saved)
-    env.reset(), old.reset()
-    np.testing.assert_array_equal(where(env), where(old))
-
-
 @pytest.mark.parametrize(
     "poses, words",
     [
         ([[4.0, 8.0]], r"starts has shape \(1, 2\): give x, y, heading as \[2, 3\]"),
         (np.zeros((3, 2, 3)), r"shape \(3, 2, 3\).*\[2, 2, 3\]"),
-        ("here", "starts='here' is unknown: choose drawn, fixed or poses"),
+        ("here", "starts='here' is unknown: choose drawn, together, fixed or poses"),
         ([["a", "b", "c"]] * 2, "must be numbers"),
         ([POSES[0], [7.0, math.nan, 0.0]], r"env 0, robot 1 .*not finite"),
         ([POSES[0], [0.0, 0.0, 0.0]], r"env 0, robot 1 \(x=0 m, y=0 m.*in a wall of map maze_small_0"),

@@ -101,12 +101,6 @@ def test_damaged_episodes_are_refused_in_a_sentence(episode_file, changes, wante
     assert str(episode_file) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_episodes_of_earlier_versions_are_read(episode_file):
-    waypoint = Episode.load(episode_file).waypoint
-    loaded = Episode.load(spoil(episode_file, waypoint=None, target=waypoint))
-    np.testing.assert_array_equal(loaded.waypoint, waypoint)
-
-
 def test_truncated_and_foreign_files_are_refused(episode_file, tmp_path):
     content = episode_file.read_bytes()
     for cut in (0, 10, len(content) // 2, len(content) - 5):

@@ -50,8 +50,8 @@ def moment(env: ExplorationEnv, index: int) -> SimpleNamespace:
     state = env.simulation.tensors
     fields = {name: state[name][index].cpu().numpy().copy() for name in (
         "pose", "slip", "control", "waypoint", "collided", "crashed", "discovered", "overlap", "terms", "unscaled",
-        "covered", "shared", "local_step", "active", "terminated", "milestone_step", "milestone_overlap", "path_length",
-        "map_id",
+        "covered", "shared", "local_step", "active", "terminated", "milestone_step", "milestone_overlap",
+        "milestone_path", "path_length", "map_id",
     )}  # fmt: skip
     now = SimpleNamespace(**env.snapshot(index) | fields | {"step": int(fields["local_step"])})
     m = int(fields["map_id"])

@@ -93,7 +93,8 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
     if loss.is_shared and SEEN not in batch.keys(True):
         batch.set(SEEN, look(loss, batch.flatten(), chunk).unflatten(0, batch.shape))
     value = values(batch.select(*inputs).flatten()).unflatten(0, batch.shape)
-    last = loss.bare_estimator.tensor_keys.terminated  # "done" where the horizon is finite
+    estimator = loss.make_estimator()
+    last = estimator.tensor_keys.terminated  # "done" where the horizon is finite
     done, final = (batch["next", name].squeeze(-1) for name in ("done", last))
     ends = done.clone()
     ends[:, -1] = True
@@ -106,4 +107,4 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
         following[ends] = values(after.select(*inputs))
     batch.set(key, value)
     batch.set(("next", *key), following)
-    return loss.bare_estimator(batch)
+    return estimator(batch)

@@ -1,20 +1,22 @@
-"""The losses of the six algorithms: TorchRL's, each with only what our teams need to differ.
+"""The losses of the six algorithms: clipped, trust region and actor-critic, on one base for teams.
 
-All read a Collector batch [envs, T], or its flattened team steps once advantages are in it. They keep robots
-apart (one probability ratio per robot, over its whole action) and write loss_objective, loss_entropy,
-loss_critic (and loss_kl), plus what one likes to log. A robot that had collided decides nothing: its actions are
-left out of all that concerns the policy, its values are learned like any other.
+Each is a LossModule of TorchRL that reads a Collector batch [envs, T], or its flattened team steps once advantages are
+in it. They keep robots apart (one probability ratio per robot, over its whole action) and write terms that are named
+loss_*, to be added up, beside what one likes to log. A robot that had collided decides nothing: its actions are left
+out of all that concerns the policy, its values are learned like any other.
 
 A loss has two sides, the policy's and the critic's. Once there are advantages neither needs the other, unless the
 critic reads what the policy's encoder has just made: so each may be asked for by itself, in a thread of its own.
 """
 
+from dataclasses import dataclass, field
+
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.objectives import A2CLoss, PPOLoss, ValueEstimators
-from torchrl.objectives.multiagent import IPPOLoss, MAPPOLoss
+from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.value import GAE
 
 from maexp.agents.algorithms.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for, write_advantages
 from maexp.agents.networks.actor import ALIVE, PARAMS, SEEN
@@ -77,54 +79,123 @@ def standardise(values: Tensor, alive: Tensor, keep_robots: bool) -> Tensor:
     return (rest / spread.clamp_min(1e-6)).unsqueeze(-1)
 
 
-class LivingRobots:
-    """Leaves the actions of robots that had collided out of the objective, entropy, divergence and statistics.
+class TeamLoss(LossModule):
+    """What all losses share: the networks, the robots that count, advantages, and the critic's side.
+
+    A critic that writes the team's value gives every robot the team's advantage, another each robot its own.
 
     Args:
-        mask_collided: false counts them like the others
+        actor: the policy, from make_policy
+        critic: from make_critic
+        gamma, lmbda, finite_horizon: of the advantages (`settings/algorithms.py`)
+        entropy_coeff: weight of the entropy of a robot's whole action
+        critic_coeff: weight of the critic's error, a smooth L1
+        clip_value: bound on the change of a value; None: none
+        normalize_advantage: standardise advantages over the robots that count
+        mask_collided: false counts the actions of robots that had collided like the others
+        value_norm: running spread of the returns: the critic's error is measured in units of it
 
     Attributes:
         anchor_coeff: weight of the divergence from the policy of a warm start
     """
 
+    out_keys = ["loss_objective", "loss_entropy", "loss_critic", "entropy", "explained_variance"]
+    standardises_each_robot = True
     anchor_coeff = 0.0
 
-    def __init__(self, *args, mask_collided: bool = True, **settings):
-        super().__init__(*args, **settings)
-        self.mask_collided = mask_collided
-        self._has_critic = False  # for TorchRL's forward: `critic_terms` has what concerns the critic
+    @dataclass
+    class _AcceptedKeys:
+        """Where the batch has what, as TorchRL's losses name it."""
+
+        advantage: NestedKey = ADVANTAGE
+        value_target: NestedKey = TARGET
+        value: NestedKey = VALUE
+        reward: NestedKey = REWARD
+        action: list = field(default_factory=list)
+        sample_log_prob: list = field(default_factory=list)
+
+    def __init__(
+        self, actor, critic, *, gamma: float, lmbda: float, finite_horizon: bool, entropy_coeff: float,
+        critic_coeff: float, normalize_advantage: bool, mask_collided: bool, clip_value: float | None = None,
+        value_norm=None,
+    ):  # fmt: skip
+        super().__init__()
+        self.convert_to_functional(actor, "actor_network", create_target_params=False)
+        self.convert_to_functional(critic, "critic_network", create_target_params=False)
+        self.register_coeff_buffer("entropy_coeff", entropy_coeff)
+        self.register_coeff_buffer("critic_coeff", critic_coeff)
+        self.register_coeff_buffer("clip_value", clip_value)
+        self.normalize_advantage, self.mask_collided, self.value_norm = normalize_advantage, mask_collided, value_norm
+        self.gamma, self.lmbda, self.finite_horizon = gamma, lmbda, finite_horizon
+        self.team_value = TEAM_VALUE in critic.out_keys
+        self.set_keys(action=list(actor.dist_sample_keys), sample_log_prob=list(actor.log_prob_keys))
+        if self.team_value:
+            self.set_keys(value=TEAM_VALUE, value_target=TEAM_TARGET)
+        self.make_value_estimator(self.make_estimator(self.critic_network))
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What a batch without advantages must hold."""
+        ends = [("next", *REWARD), ("next", "done"), ("next", "terminated")]
+        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys}
+        following = [("next", *key) for key in self.critic_network.in_keys]
+        return [*self.tensor_keys.action, *self.tensor_keys.sample_log_prob, *ends, *seen, *following]
 
     @property
     def is_shared(self) -> bool:
         """Whether the critic reads what the policy's encoder made."""
         return SEEN in self.critic_network.in_keys
 
+    def make_estimator(self, critic=None) -> GAE:
+        """The estimator of advantages that calls `critic`; None: it reads the values from the batch."""
+        return estimator_for(self, self.gamma, self.lmbda, self.finite_horizon, critic)
+
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
         """All terms; advantages are estimated where there are none."""
         if self.tensor_keys.advantage not in batch.keys(True):
             batch = self.estimate(batch.copy())
-        terms = self.policy_terms(batch)
+        dist, made = self.act(batch)
+        terms = self.policy_terms(batch, dist)
         if self.is_shared:  # with its graph
-            batch = batch.copy().set(SEEN, self.__dict__.pop("_seen"))
+            batch = batch.copy().set(SEEN, made.get(SEEN))
         return terms.update(self.critic_terms(batch))
 
     def estimate(self, batch: TensorDictBase) -> TensorDictBase:
         """Write advantages into the batch, of shape [envs, T] where the critic reads what the policy's encoder made."""
         if self.is_shared:  # TorchRL's estimator would not find that
             return write_advantages(self, batch)
-        networks = dict(params=self.critic_network_params.detach(), target_params=self.target_critic_network_params)
-        return self.value_estimator(batch, **networks)
+        params = self.critic_network_params.detach()
+        return self.value_estimator(batch, params=params, target_params=params)
 
-    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
-        """What the policy learns from, and statistics; `batch` has advantages."""
-        return super().forward(batch)
+    def act(self, batch: TensorDictBase) -> tuple[Heads, TensorDictBase]:
+        """The policy's distribution in the states of `batch`, and all that its network wrote, with their graphs."""
+        made = batch.select(*self.actor_network.in_keys)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            return self.actor_network.get_dist(made), made
+
+    def policy_terms(self, batch: TensorDictBase, dist: Heads | None = None) -> TensorDict:
+        """What the policy learns from, and statistics; `batch` has advantages, and `dist` is what the policy would do
+        in it, if that is known."""
+        raise NotImplementedError
 
     def critic_terms(self, batch: TensorDictBase) -> TensorDict:
         """What the critic learns from, and how much of the returns it explains; `batch` has their targets."""
-        loss, clipped, explained = self.loss_critic(batch.copy())
-        weight = self.critic_coeff or 0.0  # TorchRL makes None of 0
-        terms = {"loss_critic": (weight * loss).mean(), "value_clip_fraction": clipped, "explained_variance": explained}
-        return TensorDict({name: value for name, value in terms.items() if value is not None})
+        target, old = batch.get(self.tensor_keys.value_target), None
+        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+            value = self.critic_network(batch.select(*self.critic_network.in_keys)).get(self.tensor_keys.value)
+        if self.clip_value is not None:
+            old = batch.get(self.tensor_keys.value)
+        if self.value_norm is not None:
+            self.value_norm.update(target)
+            target, value = self.value_norm.normalize(target), self.value_norm.normalize(value)
+            old = None if old is None else self.value_norm.normalize(old)
+        error = distance_loss(target, value, loss_function="smooth_l1")
+        if old is not None:
+            clipped = old + (value - old).clamp(-self.clip_value, self.clip_value)
+            error = torch.maximum(error, distance_loss(target, clipped, loss_function="smooth_l1"))
+        left = (target - value.detach()).var(dim=0, correction=0)
+        spread = target.var(dim=0, correction=0) + torch.finfo(target.dtype).eps
+        return TensorDict({"loss_critic": (self.critic_coeff * error).mean(), "explained_variance": 1 - left / spread})
 
     def find_living(self, batch: TensorDictBase) -> Tensor:
         """Whose actions count, bool [*, robots]."""
@@ -133,26 +204,22 @@ class LivingRobots:
             alive = torch.ones(batch.get(self.tensor_keys.advantage).shape[:-1], dtype=torch.bool, device=batch.device)
         return alive
 
-    def _maybe_normalize_advantage(self, advantage: Tensor, tensordict, *, update_norm: bool = False) -> Tensor:
-        self.__dict__["_alive"] = alive = self.find_living(tensordict)
+    def advantage(self, batch: TensorDictBase, alive: Tensor) -> Tensor:
+        """Of the robots that count, [n, 1]."""
+        advantage = batch.get(self.tensor_keys.advantage)
         if self.normalize_advantage:
-            advantage = standardise(advantage, alive, bool(self.normalize_advantage_exclude_dims))
+            advantage = standardise(advantage, alive, self.standardises_each_robot)
         return select_living(advantage, alive)
 
-    def _log_weight(self, tensordict, adv_shape):
-        alive = self._alive  # the shape given is that of the advantages selected
-        acted = tensordict.copy()
-        log_weight, dist, kl, behaviour = super()._log_weight(acted, alive.shape)
-        self.keep_seen(acted)
-        return select_living(log_weight, alive), dist, select_living(kl, alive), behaviour
+    def log_prob(self, batch: TensorDictBase, dist: Heads) -> TensorDictBase:
+        """Of each head of the actions in the batch."""
+        return dist.log_prob(batch.select(*self.tensor_keys.action))
 
-    def keep_seen(self, acted: TensorDictBase) -> None:
-        """Keep what the policy's encoder has just made, with its graph, for a critic that reads it."""
-        if self.is_shared:
-            self.__dict__["_seen"] = acted.get(SEEN)
-
-    def _get_entropy(self, dist: Heads, adv_shape=None) -> Tensor:
-        return select_living(dist.entropy().unsqueeze(-1), self._alive)
+    def log_ratio(self, batch: TensorDictBase, dist: Heads, alive: Tensor) -> Tensor:
+        """Of the probabilities of the whole action, now to then, of the robots that count, [n, 1]."""
+        now = self.log_prob(batch, dist)
+        log_ratio = sum(now[key] - batch[key] for key in self.tensor_keys.sample_log_prob)
+        return select_living(log_ratio.unsqueeze(-1), alive)
 
     def mean_divergence(self, batch: TensorDictBase, dist: Heads, key: tuple[str, ...] = PARAMS) -> Tensor:
         """Of `dist` from the policy that acted, over the living; arguments as in `policy_divergence`."""
@@ -165,50 +232,41 @@ class LivingRobots:
         return {"loss_anchor": self.anchor_coeff * self.mean_divergence(batch, dist, ANCHOR)}
 
 
-class RobotValues:
-    """A value per robot: keys and estimator of a loss with a local or a team critic."""
+class ClippedLoss(TeamLoss):
+    """PPO with a clipped ratio per robot (Schulman et al. 2017), and optionally loss_kl, a penalty on the divergence.
 
-    team_value = False
+    Args:
+        clip_epsilon: bound on each robot's probability ratio
+        kl_coeff: first weight of the penalty; 0 leaves it out
+        kl_target: divergence at which that weight stays
+    """
 
-    def setup(self, gamma: float, lmbda: float, finite_horizon: bool) -> None:
-        """Name the keys and build the estimators; the bare one is told the values instead of the network."""
-        heads = list(self.actor_network.dist_sample_keys)  # lists, of one head too: TorchRL then selects by key
-        self.set_keys(
-            action=heads,
-            sample_log_prob=list(self.actor_network.log_prob_keys),
-            advantage=ADVANTAGE,
-            value_target=TEAM_TARGET if self.team_value else TARGET,
-            value=TEAM_VALUE if self.team_value else VALUE,
-            reward=REWARD,
-        )
-        self.make_value_estimator(estimator_for(self, gamma, lmbda, finite_horizon, self.critic_network))
-        self.__dict__["bare_estimator"] = estimator_for(self, gamma, lmbda, finite_horizon, None)
-
-
-class TeamValues(RobotValues):
-    """One value for the team, from a mixed critic; every robot gets the team's advantage."""
-
-    team_value = True
-
-
-class KLPenalty(LivingRobots):
-    """Adds `loss_kl` = kl_coeff * KL(acting policy || policy) to a PPO loss; kl_coeff 0 leaves it out."""
-
-    def __init__(self, *args, kl_coeff: float = 0.0, kl_target: float = 0.01, **settings):
+    def __init__(self, *args, clip_epsilon: float, kl_coeff: float = 0.0, kl_target: float = 0.01, **settings):
         super().__init__(*args, **settings)
+        self.register_buffer("clip_epsilon", torch.tensor(clip_epsilon))
         self.register_buffer("kl_coeff", torch.tensor(float(kl_coeff)))
         self.kl_target = kl_target
 
-    def _log_weight(self, tensordict, adv_shape):
-        terms = super()._log_weight(tensordict, adv_shape)
-        check_finite("loss_objective", terms[0])  # here, for TorchRL would draw from the broken policy next
-        self.__dict__["_extra"] = extra = self.pull(tensordict, terms[1])
+    def policy_terms(self, batch: TensorDictBase, dist: Heads | None = None) -> TensorDict:
+        dist = self.act(batch)[0] if dist is None else dist
+        alive = self.find_living(batch)
+        advantage, log_ratio = self.advantage(batch, alive), self.log_ratio(batch, dist, alive)
+        near = self.pull(batch, dist)
         if self.kl_coeff > 0:
-            extra["loss_kl"] = self.kl_coeff * self.mean_divergence(tensordict, terms[1])
-        return terms
-
-    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
-        return super().policy_terms(batch).update(self._extra)
+            near["loss_kl"] = self.kl_coeff * self.mean_divergence(batch, dist)
+        clipped = log_ratio.clamp((-self.clip_epsilon).log1p(), self.clip_epsilon.log1p())
+        gain = torch.stack([log_ratio.exp() * advantage, clipped.exp() * advantage], -1).min(dim=-1).values
+        entropy = select_living(dist.entropy().unsqueeze(-1), alive)
+        then = log_ratio.detach().squeeze(-1)
+        sample_size = (2 * then.logsumexp(0) - (2 * then).logsumexp(0)).exp() / len(then)
+        return TensorDict({
+            "loss_objective": (-gain).mean(),
+            "clip_fraction": (clipped != log_ratio).to(log_ratio.dtype).mean(),
+            "kl": (-log_ratio).detach().mean(),
+            "entropy": entropy.detach().mean(),
+            "loss_entropy": (-self.entropy_coeff * entropy).mean(),
+            "ESS": sample_size,
+        } | near)  # fmt: skip
 
     def adapt_penalty(self, divergence: float) -> None:
         """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""
@@ -218,101 +276,43 @@ class KLPenalty(LivingRobots):
             self.kl_coeff.mul_(0.5)
 
 
-class IPPO(RobotValues, KLPenalty, IPPOLoss):
-    """TorchRL's IPPO with the optional KL penalty."""
+class TrustRegionLoss(TeamLoss):
+    """Unclipped surrogate with its divergence from the acting policy, for a trust-region step."""
 
-
-class MAPPO(RobotValues, KLPenalty, MAPPOLoss):
-    """TorchRL's MAPPO with the optional KL penalty."""
-
-
-class VDPPO(TeamValues, KLPenalty, MAPPOLoss):
-    """Clipped policy steps on the advantage of the mixed team value (Ma et al. 2022)."""
-
-
-class NormalisedValues:
-    """Critic error in units of the returns' running spread, as TorchRL's MAPPO has it."""
-
-    def __init__(self, *args, value_norm=None, **settings):
-        super().__init__(*args, **settings)
-        self.value_norm = value_norm
-
-    def _critic_loss_inputs(self, target: Tensor, value: Tensor, old: Tensor | None):
-        norm = self.value_norm
-        if norm is None:
-            return target, value, old
-        norm.update(target)
-        return norm.normalize(target), norm.normalize(value), None if old is None else norm.normalize(old)
-
-
-class TRPOLoss(RobotValues, NormalisedValues, LivingRobots, PPOLoss):
-    """Unclipped surrogate with its divergence from the acting policy, for a trust-region step.
-
-    `surrogate` gives the two terms a trust-region step needs and leaves its parts in `terms`, to be logged.
-    """
-
-    default_value_estimator = ValueEstimators.MAGAE
-
-    def __init__(self, *args, normalize_advantage_exclude_dims: tuple[int, ...] = (-2,), **settings):
-        exclude = normalize_advantage_exclude_dims  # each robot by itself, as in TorchRL's MAPPO
-        super().__init__(*args, normalize_advantage_exclude_dims=exclude, **settings)
-
-    def surrogate(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Mean loss to lower (objective and entropy bonus) and mean divergence, each a scalar with its graph."""
-        advantage = batch.get(self.tensor_keys.advantage)
-        advantage = self._maybe_normalize_advantage(advantage, batch, update_norm=False)
-        log_weight, dist, _, _ = self._log_weight(batch, adv_shape=advantage.shape[:-1])
-        objective, entropy = -(log_weight.exp() * advantage).mean(), self._get_entropy(dist).mean()
+    def policy_terms(self, batch: TensorDictBase, dist: Heads | None = None) -> TensorDict:
+        dist = self.act(batch)[0] if dist is None else dist
+        alive = self.find_living(batch)
+        advantage, log_ratio = self.advantage(batch, alive), self.log_ratio(batch, dist, alive)
+        objective = -(log_ratio.exp() * advantage).mean()
+        entropy = select_living(dist.entropy().unsqueeze(-1), alive).mean()
         terms = {"loss_objective": objective} | self.pull(batch, dist)
-        self.__dict__["terms"] = {name: value.item() for name, value in terms.items()} | {"entropy": entropy.item()}
-        return sum(terms.values()) - self.entropy_coeff * entropy, self.mean_divergence(batch, dist)
+        return TensorDict(terms | {"loss_entropy": -self.entropy_coeff * entropy, "entropy": entropy.detach()})
+
+    def surrogate(self, batch: TensorDictBase) -> tuple[Tensor, Tensor, TensorDict]:
+        """Mean loss to lower and mean divergence, each a scalar with its graph, and the terms of the loss."""
+        dist, _ = self.act(batch)
+        terms = self.policy_terms(batch, dist)
+        loss = sum(value for name, value in terms.items() if name.startswith("loss_"))
+        return loss, self.mean_divergence(batch, dist), terms.detach()
 
     def divergence(self, batch: TensorDictBase) -> Tensor:
         """Mean divergence from the acting policy, a scalar with its graph."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        return self.mean_divergence(batch, dist)
+        return self.mean_divergence(batch, self.act(batch)[0])
 
 
-class VDA2C(TeamValues, NormalisedValues, LivingRobots, A2CLoss):
-    """Advantage actor-critic on the mixed team value (Su et al. 2021), for actions of several heads."""
+class ActorCriticLoss(TeamLoss):
+    """Advantage actor-critic (Su et al. 2021), for actions of several heads."""
 
-    normalize_advantage_exclude_dims = ()  # all robots have the same advantage
+    standardises_each_robot = False  # all robots of a team have the same advantage
 
-    def __init__(self, *args, normalize_advantage: bool = True, **settings):
-        super().__init__(*args, **settings)
-        self.normalize_advantage = normalize_advantage
-
-    @property
-    def in_keys(self) -> list:
-        """A2CLoss expects one action key; here each head has its own."""
-        ends = [("next", *self.tensor_keys.reward), ("next", "done"), ("next", "terminated")]
-        seen = {*self.actor_network.in_keys, *self.critic_network.in_keys}
-        following = [("next", *key) for key in self.critic_network.in_keys]
-        return [*self.tensor_keys.action, *ends, *seen, *following]
-
-    def _log_probs(self, tensordict: TensorDictBase):
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(acted := tensordict.select(*self.actor_network.in_keys))
-        self.keep_seen(acted)
-        log_probs = dist.log_prob(tensordict.select(*self.tensor_keys.action))
-        return sum(log_probs.values(True, True)).unsqueeze(-1), dist
-
-    def loss_critic(self, tensordict: TensorDictBase):
-        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
-            value = self.critic_network(tensordict.select(*self.critic_network.in_keys))
-        target = tensordict.get(self.tensor_keys.value_target)
-        value = value.get(self.tensor_keys.value)
-        explained = 1 - (target - value.detach()).var() / target.var().clamp_min(1e-8)
-        target, value, _ = self._critic_loss_inputs(target, value, None)
-        return distance_loss(target, value, loss_function=self.loss_critic_type), None, explained
-
-    def policy_terms(self, batch: TensorDictBase) -> TensorDict:
-        advantage = self._maybe_normalize_advantage(batch.get(self.tensor_keys.advantage), batch)
-        log_prob, dist = self._log_probs(batch)
-        entropy = self._get_entropy(dist).mean()
+    def policy_terms(self, batch: TensorDictBase, dist: Heads | None = None) -> TensorDict:
+        dist = self.act(batch)[0] if dist is None else dist
+        alive = self.find_living(batch)
+        advantage = self.advantage(batch, alive)
+        log_prob = sum(self.log_prob(batch, dist).values(True, True)).unsqueeze(-1)
+        entropy = select_living(dist.entropy().unsqueeze(-1), alive).mean()
         terms = {
-            "loss_objective": -(select_living(log_prob, self._alive) * advantage).mean(),
+            "loss_objective": -(select_living(log_prob, alive) * advantage).mean(),
             "loss_entropy": -self.entropy_coeff * entropy,
             "entropy": entropy.detach(),
             "kl": self.mean_divergence(batch, dist).detach(),

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 from torchrl.modules import PopArtValueNorm
 
-from maexp.agents.algorithms import losses
+from maexp.agents.algorithms.losses import ActorCriticLoss, ClippedLoss, TrustRegionLoss
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.networks.critics import build_critic
 from maexp.agents.settings.algorithms import TUNINGS, Settings, Tunings
@@ -59,7 +59,6 @@ class Algorithm:
         settings = settings or self.settings
         norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
         loss = self.loss(policy, critic, value_norm=norm, **settings.loss_arguments())
-        loss.setup(settings.gamma, settings.lmbda, settings.finite_horizon)
         return loss.to(next(policy.parameters()).device)
 
     def make_updater(self, loss, settings: Settings | None = None) -> Updater:
@@ -70,12 +69,12 @@ class Algorithm:
 ALGORITHMS = {
     row.name: row
     for row in (
-        Algorithm("ippo", "local", losses.IPPO, GradientUpdater, TUNINGS["ippo"]),
-        Algorithm("mappo", "team", losses.MAPPO, GradientUpdater, TUNINGS["mappo"]),
-        Algorithm("itrpo", "local", losses.TRPOLoss, TrustRegionUpdater, TUNINGS["itrpo"]),
-        Algorithm("matrpo", "team", losses.TRPOLoss, TrustRegionUpdater, TUNINGS["matrpo"]),
-        Algorithm("vdppo", "mixed", losses.VDPPO, GradientUpdater, TUNINGS["vdppo"]),
-        Algorithm("vda2c", "mixed", losses.VDA2C, GradientUpdater, TUNINGS["vda2c"]),
+        Algorithm("ippo", "local", ClippedLoss, GradientUpdater, TUNINGS["ippo"]),
+        Algorithm("mappo", "team", ClippedLoss, GradientUpdater, TUNINGS["mappo"]),
+        Algorithm("itrpo", "local", TrustRegionLoss, TrustRegionUpdater, TUNINGS["itrpo"]),
+        Algorithm("matrpo", "team", TrustRegionLoss, TrustRegionUpdater, TUNINGS["matrpo"]),
+        Algorithm("vdppo", "mixed", ClippedLoss, GradientUpdater, TUNINGS["vdppo"]),
+        Algorithm("vda2c", "mixed", ActorCriticLoss, GradientUpdater, TUNINGS["vda2c"]),
     )
 }
 

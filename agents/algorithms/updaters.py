@@ -19,11 +19,9 @@ from maexp.agents.algorithms.trust_region import TRPO
 from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
 from maexp.agents.networks.encoder import compact, pools_pictures
 
-LOG_NAMES = {"loss_objective": "loss_objective", "kl_approx": "kl"}  # what every algorithm logs alike
 CALIBRATION_ROUNDS = 5
 CHUNK = 256  # team steps at a time where memory matters more than speed
 Terms = Callable[[TensorDictBase], TensorDict]
-QUIET = ("composite_entropy", "max_ratio", "mean_ratio", "value_clip_fraction")
 
 
 class Meter:
@@ -243,7 +241,8 @@ class TrustRegionUpdater(Updater):
         for number, parts in enumerate(self.minibatches(steps, self.settings.policy_minibatch_size)):
             if number:
                 self._act_again(parts)
-            meter.add(self.policy_optimizer.step(*self._closures(parts)) | self.loss.terms)
+            *closures, terms = self._closures(parts)
+            meter.add(self.policy_optimizer.step(*closures) | terms)
         for _ in range(self.settings.critic_epochs):
             self.learn_values(steps, meter)
 
@@ -256,13 +255,16 @@ class TrustRegionUpdater(Updater):
                 part.update(actor.get_dist_params(part.select(*actor.in_keys)).select(PARAMS))
 
     def _closures(self, parts: list[TensorDictBase]):
-        """Loss and divergence on all of `parts`; divergence alone on the few states of the Fisher matrix."""
+        """Loss and divergence on all of `parts`; divergence alone on the few states of the Fisher matrix; and the
+        terms of the loss when it was last asked for, of the last part."""
         total = sum(part.shape[0] for part in parts)
         share = min(1.0, self.settings.fisher_size / total)
         few = [part[: max(1, round(share * part.shape[0]))] for part in parts]
+        last: dict[str, float] = {}
 
         def closure() -> tuple[Tensor, Tensor]:
-            losses, divergences = zip(*(self.loss.surrogate(part) for part in parts), strict=True)
+            losses, divergences, terms = zip(*(self.loss.surrogate(part) for part in parts), strict=True)
+            last.update({name: value.item() for name, value in terms[-1].items() if name != "loss_entropy"})
             loss = sum(losses) / len(parts)
             if torch.is_grad_enabled():
                 check_finite("loss_objective", loss)
@@ -271,13 +273,11 @@ class TrustRegionUpdater(Updater):
         def fisher_closure() -> Tensor:
             return sum(self.loss.divergence(part) for part in few) / len(few)
 
-        return closure, fisher_closure
+        return closure, fisher_closure, last
 
 
 def summary(outputs: list[TensorDict]) -> dict[str, float]:
-    """What a loss reports, averaged over the batches, under the names all algorithms share."""
-    names = [name for name in outputs[0].keys() if name not in QUIET]
+    """What a loss reports, averaged over the batches."""
     return {
-        LOG_NAMES.get(name, name): sum(out[name].float().mean().item() for out in outputs) / len(outputs)
-        for name in names
+        name: sum(out[name].float().mean().item() for out in outputs) / len(outputs) for name in outputs[0].keys()
     }

@@ -11,26 +11,35 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.benchmark.plan import Cell, cell_config, cell_folder, lock, training_cell
+from maexp.agents.benchmark.plan import (
+    Cell,
+    cell_config,
+    cell_folder,
+    find_cell_player,
+    lock,
+    training_cell,
+    word_names,
+)
 from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.comparison import CHOOSING
 from maexp.agents.evaluation.evaluate import evaluate
-from maexp.agents.evaluation.results import describe_run
+from maexp.agents.evaluation.results import FORMAT, describe_run
 from maexp.agents.files import short, write_file, write_json
-from maexp.agents.policies.classical import CLASSICAL, POLICIES
+from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
+from maexp.agents.training.named import Player, suit_observation
 from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 PLAYED = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "num_envs", "num_robots", "seed",
-    "num_threads",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "num_envs",
+    "num_robots", "seed", "num_threads",
 )  # fmt: skip
 """Settings that matter to who only plays."""
 CURVE = ("curve_seconds", "curve_coverage")
@@ -49,14 +58,14 @@ class CellResult:
         seconds: times of the coverage curve [s], shape [records]
         coverage: [episodes, records] in [0, 1]
         run: what was run
-        maps: the map of each episode, names [episodes]; None: an earlier version did not note it
+        maps: the map of each episode, names [episodes]
     """
 
     episodes: dict[str, np.ndarray]
     seconds: np.ndarray
     coverage: np.ndarray
     run: dict
-    maps: np.ndarray | None = None
+    maps: np.ndarray
 
 
 class EnvShelf:
@@ -132,11 +141,15 @@ def play_suite(
     """
     with blame_input():
         maps = getattr(load_maps(settings.scenario, train=suite == "trained"), _ATTRIBUTE[suite])
-        key = f"{cell.scenario} {cell.seed} {cell.map} {suite}"
+        player = find_cell_player(cfg, cell) if team is None else None
+        if player is not None:
+            show_what_it_looks_at(settings, player, maps)
+        key = f"{cell.scenario} {cell.seed} {cell.map} {suite} {settings.observation}"
         episodes = min(CHOOSING, cfg.episodes) if suite == VALIDATION else cfg.episodes
         size = min(cfg.num_envs, episodes)
-        env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size))
-        policy = POLICIES[cell.policy](env) if team is None else restore_policy(env, model_settings(settings), team)
+        starts = {"starts": "together"} if suite == "held_out_together" else {}
+        env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size, **starts))
+        policy = restore_policy(env, model_settings(settings), team) if player is None else player.make(env)
         if suite != VALIDATION and not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
             write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
     begin = time.perf_counter()
@@ -149,10 +162,19 @@ def play_suite(
     described = describe_run(settings, maps, time.perf_counter() - begin)
     described |= {} if team is None else {"training_seconds": team["training_seconds"]}
     described |= {"algorithm": cell.policy} if cell.trains else {}
+    described |= {} if player is None or not player.source else {"policy": player.source}
     described |= {"episodes": episodes, "maps_are": suite}
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
+
+
+def show_what_it_looks_at(settings: TrainSettings, player: Player, maps: list) -> None:
+    """Let the env of a cell show what its policy looks at; say which maps of its training have changed."""
+    if player.targets is not None:  # the cell has an env of its own
+        settings.observation.targets = 0
+    suit_observation(settings, [player])
+    player.check_maps(maps)
 
 
 def played_settings(settings: TrainSettings, maps: list) -> dict:
@@ -164,10 +186,11 @@ def played_settings(settings: TrainSettings, maps: list) -> dict:
 def who_played(cfg: BenchmarkSettings, cell: Cell, episodes: int) -> dict:
     """The policy of a cell, and where it was trained."""
     trained = {"checkpoint": f"cells/{training_cell(cfg, cell).name}"} if cell.trains else {}
-    return {"policy": cell.policy, "episodes": episodes} | trained
+    word = next((word for word, name in word_names(cfg).items() if name == cell.policy), cell.policy)
+    return {"policy": word, "episodes": episodes} | trained
 
 
-_ATTRIBUTE = {"held_out": "held_out", "trained": "train", VALIDATION: "validation"}
+_ATTRIBUTE = {"held_out": "held_out", "trained": "train", "held_out_together": "held_out", VALIDATION: "validation"}
 
 
 def write_result(folder: Path, suite: str, arrays: dict[str, np.ndarray], summary: dict) -> None:
@@ -185,11 +208,13 @@ def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
     folder = cell_folder(where, cell)
     try:
         summary = json.loads((folder / f"{suite}.json").read_text())
+        if summary["run"]["format"] != FORMAT:
+            raise ValueError(summary["run"]["format"])
         with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         seconds, coverage = (arrays.pop(name) for name in CURVE)
         run = {name: summary["run"][name] for name in RUN} | summary["run"]
-        maps = arrays.pop("maps", None)
+        maps = arrays.pop("maps")
         episodes = {name: arrays[name] for name in summary[cell.policy]} | arrays
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(

@@ -6,11 +6,11 @@ from maexp.agents.benchmark.cell import CellResult
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.benchmark.table import weigh
 from maexp.agents.evaluation.comparison import DECIDES
-from maexp.envs.metrics import summarise
+from maexp.envs.metrics import in_reach, summarise
 
 Played = list[tuple[Cell, CellResult]]
 SHOWN = (("coverage_auc", "AUC, points", 100, 1), ("coverage_step_95_censored", "to 95, steps", 1, 0),
-         ("collisions", "robots lost", 1, 2))  # fmt: skip
+         ("coverage_step_99_censored", "to 99, steps", 1, 0), ("collisions", "robots lost", 1, 2))  # fmt: skip
 """Metric, title, scale and digits of what is shown of a difference."""
 
 
@@ -22,10 +22,9 @@ def subtract(policy: str, one: Played, other: Played) -> dict[str, dict]:
         return {}
     maps, counts = [mine.maps for _, mine, _ in pairs], [len(mine.coverage) for _, mine, _ in pairs]
     weights = weigh(policy, [seed for seed, _, _ in pairs], counts, maps)
-    shared = [name for name in pairs[0][1].episodes if all(name in x.episodes for _, *both in pairs for x in both)]
     return {
         name: summarise(np.concatenate([mine.episodes[name] - his.episodes[name] for _, mine, his in pairs]), weights)
-        for name in shared
+        for name in pairs[0][1].episodes
     }
 
 
@@ -43,9 +42,10 @@ def find_best(played: dict[str, Played]) -> str | None:
     return max(scores, key=scores.get, default=None)
 
 
-def difference_cells(found: dict[str, dict]) -> list[str]:
-    """+1.2 [0.3, 2.1] of each metric in `SHOWN`."""
-    return [_cell(found[metric], scale, digits) for metric, _, scale, digits in SHOWN]
+def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:
+    """{title: +1.2 [0.3, 2.1]} of the metrics in `SHOWN` that episodes reach which end at the coverage `goal`."""
+    shown = [row for row in SHOWN if in_reach(row[0], goal)]
+    return {title: _cell(found[metric], scale, digits) for metric, title, scale, digits in shown}
 
 
 def _cell(one: dict, scale: float, digits: int) -> str:
@@ -53,23 +53,26 @@ def _cell(one: dict, scale: float, digits: int) -> str:
     return f"{scale * one['mean']:+.{digits}f} [{low}, {high}]"
 
 
-def differences_markdown(rival: str, rows: dict[str, dict]) -> str:
+def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) -> str:
     """A table of trained policies less the best classical planner.
 
     Args:
         rival: that planner
         rows: policy -> its difference
+        goal: coverage that ended an episode
     """
+    cells = {name: difference_cells(found, goal) for name, found in rows.items()}
+    titles = next(iter(cells.values()))
     lines = [f"Less {rival}, the best classical planner on the validation maps, episode by episode:", ""]
-    lines += ["| | " + " | ".join(title for _, title, _, _ in SHOWN) + " |", "| --- |" + " --- |" * len(SHOWN)]
-    lines += [f"| {name} | {' | '.join(difference_cells(found))} |" for name, found in rows.items()]
+    lines += ["| | " + " | ".join(titles) + " |", "| --- |" + " --- |" * len(titles)]
+    lines += [f"| {name} | {' | '.join(found.values())} |" for name, found in cells.items()]
     return "\n".join(lines)
 
 
-def differences_text(scenario: str, rival: str, rows: dict[str, dict]) -> list[str]:
+def differences_text(scenario: str, rival: str, rows: dict[str, dict], goal: float = 0.95) -> list[str]:
     """The same as lines for the terminal."""
     lines = [f"{scenario}: less {rival}, the best classical planner on the validation maps, episode by episode"]
     for name, found in rows.items():
-        parts = [f"{title} {text}" for (_, title, _, _), text in zip(SHOWN, difference_cells(found), strict=True)]
+        parts = [f"{title} {text}" for title, text in difference_cells(found, goal).items()]
         lines.append(f"  {name}: {'; '.join(parts)}")
     return lines

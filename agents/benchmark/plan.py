@@ -17,22 +17,26 @@ from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.settings.checks import check_distinct, check_goals, check_seed
+from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
+from maexp.agents.training.named import Player, check_planner, find_player, name_players
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
-PLAN = "benchmark.json"
+PLAN, FORMAT = "benchmark.json", "maexp-benchmark-1"
 OPEN = "left_open"
+SOURCES = "sources"
 TOGETHER = "together"
 """In place of a scenario's name: all of them at once."""
-SUITES = {"held_out": "held-out maps", "trained": "training maps"}
+SUITES = {
+    "held_out": "held-out maps", "trained": "training maps", "held_out_together": "held-out maps, starts together"
+}  # fmt: skip
 SECTIONS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "model", "collector", "algorithm",
-    "action", "tuning", "num_envs", "num_robots", "device", "total_frames", "checkpoint_every", "checkpoint_keep",
-    "num_threads",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "model",
+    "collector", "algorithm", "action", "tuning", "num_envs", "num_robots", "device", "total_frames",
+    "checkpoint_every", "checkpoint_keep", "num_threads",
 )  # fmt: skip
 """Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
 OWN = ("scenario.name", "algorithm.name")  # each cell has its own
@@ -68,6 +72,11 @@ class Cell:
         return self.policy in ALGORITHMS
 
 
+def is_learned(policy: str) -> bool:
+    """Whether a policy, by its name in the tables, competes with the planners that come with the package."""
+    return policy not in POLICIES
+
+
 def training_cell(cfg: BenchmarkSettings, cell: Cell) -> Cell:
     """The cell whose folder holds the training: one for all scenarios where they are trained on together."""
     return replace(cell, scenario=TOGETHER) if cfg.together and cell.trains else cell
@@ -76,7 +85,7 @@ def training_cell(cfg: BenchmarkSettings, cell: Cell) -> Cell:
 def list_cells(cfg: BenchmarkSettings) -> list[Cell]:
     """All cells in the order they are run: seed by seed, scenario by scenario, classical policies first."""
     names = policy_names(cfg)
-    ordered = [one for one in names if one in POLICIES] + [one for one in names if one in ALGORITHMS]
+    ordered = [one for one in names if one not in ALGORITHMS] + [one for one in names if one in ALGORITHMS]
     return [
         Cell(scenario, policy, seed, index)
         for seed in as_list(cfg.seeds)
@@ -101,20 +110,42 @@ def as_list(value: Any) -> list:
 
 
 def policy_names(cfg: BenchmarkSettings) -> list[str]:
-    """Algorithms and classical policies, each once."""
-    return list(dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies)))
+    """Algorithms and policies by their names in the tables, each once."""
+    words = list(dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies)))
+    named = word_names(cfg)
+    return [named.get(word, word) for word in words]
+
+
+def word_names(cfg: BenchmarkSettings) -> dict[str, str]:
+    """The words that name policies, and what the tables call these."""
+    words = [str(word) for word in dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies))]
+    return name_players([word for word in words if word not in ALGORITHMS], "policies", ALGORITHMS)
+
+
+def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> Player:
+    """The policy of a cell that is not trained.
+
+    Raises:
+        UserError: it is damaged, or gone.
+    """
+    word = next(word for word, name in word_names(cfg).items() if name == cell.policy)
+    return find_player(word, "policies", cell.policy)
+
+
+def policy_sources(cfg: BenchmarkSettings) -> dict[str, str]:
+    """By its name, what changes with a policy that does not come with the package."""
+    players = [find_player(word, "policies", name) for word, name in word_names(cfg).items()]
+    return {one.name: one.source for one in players if one.source}
 
 
 def check_lists(cfg: DictConfig) -> None:
     """Raise UserError unless scenarios, policies, seeds and maps are lists of what there is."""
-    known = {
-        "scenarios": list(SCENARIOS), "algorithms": list(ALGORITHMS), "policies": list(POLICIES), "maps": list(SUITES)
-    }  # fmt: skip
+    known = {"scenarios": [*SCENARIOS], "algorithms": [*ALGORITHMS, *POLICIES], "maps": [*SUITES]}
     for name, choices in known.items():
         for value in as_list(cfg[name]):
-            both = [*ALGORITHMS, *POLICIES] if name in ("algorithms", "policies") else choices
-            if value not in both:
-                raise UserError(f"{name}={value} is unknown: choose of {', '.join(choices)}.")
+            if value not in choices:
+                listed = [one for one in choices if one not in POLICIES]
+                raise UserError(f"{name}={value} is unknown: choose of {', '.join(listed)}.")
     for name in ("scenarios", "maps", "seeds"):
         if not as_list(cfg[name]):
             raise UserError(f"{name}=[] leaves nothing to do: give at least one.")
@@ -124,7 +155,8 @@ def check_lists(cfg: DictConfig) -> None:
         check_distinct(name, as_list(cfg[name]))
     for seed in as_list(cfg.seeds):
         check_seed(seed, "seeds")
-    check_goals(as_list(cfg.policies), cfg.planner.name)
+    players = [find_player(word, "policies", name) for word, name in word_names(cfg).items()]
+    check_planner(cfg.planner.name, players)
     _check_policy_per_map(cfg)
     _check_together(cfg)
 
@@ -244,18 +276,21 @@ def cell_folder(where: Path, cell: Cell) -> Path:
 
 
 def write_plan(where: Path, cfg: DictConfig, overrides: list[str]) -> None:
-    """benchmark.json: the words of the command line, the settings that all cells share, and the names of those that
-    each cell has from its scenario or algorithm (its own config.yaml holds them)."""
+    """benchmark.json: the words of the command line, the settings that all cells share, the names of those that each
+    cell has from its scenario or algorithm (its own config.yaml holds them), and what tells that a policy changed."""
     shared = shared_settings(cfg)
     fixed = {name: value for name, value in shared.items() if value is not None}
-    write_json(where / PLAN, {"overrides": overrides, "settings": fixed, OPEN: [n for n in shared if n not in fixed]})
+    left_open = [name for name in shared if name not in fixed]
+    before = read_plan(where)[SOURCES] if (where / PLAN).is_file() else {}
+    content = {"format": FORMAT, "overrides": overrides, "settings": fixed, OPEN: left_open}
+    write_json(where / PLAN, content | {SOURCES: before | policy_sources(cfg)})
 
 
 def read_plan(place: str | Path) -> dict:
     """The content of a benchmark's benchmark.json.
 
     Raises:
-        UserError: the folder holds no benchmark.
+        UserError: the folder holds no benchmark, or one of another version.
     """
     path = Path(place) / PLAN
     if not path.is_file():
@@ -263,10 +298,12 @@ def read_plan(place: str | Path) -> dict:
         raise UserError(f"{place} {found}: give the folder of a maexp benchmark that was started before.")
     try:
         content = json.loads(path.read_text())
-        left_open = dict.fromkeys(content.get(OPEN, []))
-        return {"overrides": list(content["overrides"]), "settings": content["settings"] | left_open}
+        if content["format"] != FORMAT:
+            raise ValueError(content["format"])
+        settings = content["settings"] | dict.fromkeys(content[OPEN])
+        return {"overrides": list(content["overrides"]), "settings": settings, SOURCES: dict(content[SOURCES])}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} is damaged: start the benchmark anew in another folder.") from error
+        raise UserError(f"{path} is damaged, or not of the kind {FORMAT}: start anew in another folder.") from error
 
 
 def shared_settings(cfg: DictConfig) -> dict[str, Any]:
@@ -284,7 +321,14 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
     """Raise UserError if a setting differs from that of the cells already there."""
     if not (where / PLAN).is_file() or not any((where / "cells").glob("*/*/*")):
         return
-    before, now = read_plan(where)["settings"], json.loads(json.dumps(shared_settings(cfg)))
+    plan = read_plan(where)
+    for name, source in policy_sources(cfg).items():
+        if plan[SOURCES].get(name, source) != source and any((where / "cells").glob(f"*/{name}/*/*.json")):
+            raise UserError(
+                f"policies: {name} has changed since its cells in {where} were played: take it as it was, remove "
+                f"cells/*/{name} to play them again, or start a benchmark of its own."
+            )
+    before, now = plan["settings"], json.loads(json.dumps(shared_settings(cfg)))
     names = [name for name in now if name in before and before[name] != now[name]]  # others came or went with the code
     if names:
         told = [["left open" if one[name] is None else one[name] for one in (before, now)] for name in names[:4]]
@@ -298,10 +342,11 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
 
 
 @contextmanager
-def lock(where: Path, wait: bool = False) -> Iterator[None]:
+def lock(where: Path, who: str = "maexp benchmark", wait: bool = False) -> Iterator[None]:
     """Hold the folder; the lock ends with this process, however it ends.
 
     Args:
+        who: holds it, for the message
         wait: until a process that is at it has ended
 
     Raises:
@@ -312,6 +357,6 @@ def lock(where: Path, wait: bool = False) -> Iterator[None]:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield
     except BlockingIOError as error:
-        raise UserError(f"Another maexp benchmark is running in {where}: wait for it or stop it.") from error
+        raise UserError(f"Another {who} is running in {where}: wait for it or stop it.") from error
     finally:
         os.close(handle)

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.benchmark.cell import VALIDATION, CellResult, finished, read_result
 from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.agents.benchmark.plan import SUITES, Cell, as_list, training_cell
+from maexp.agents.benchmark.plan import SUITES, Cell, as_list, is_learned, training_cell
 from maexp.agents.benchmark.table import (
     Column,
     pool_column,
@@ -71,11 +70,12 @@ class Report:
             print("No cell is done yet, so there is no table.")
             return
         written = ["table.csv", "table.md", "table.tex", "summary.json", *self.draw(tables)]
-        print_tables(tables)
+        goal = self.cfg.scenario.success_coverage
+        print_tables(tables, goal=goal)
         for scenario, columns in tables.items():
             rival = self._rival(scenario)
             if rows := against(self.differences(scenario, columns), rival):
-                print("\n".join(differences_text(scenario, rival, rows)))
+                print("\n".join(differences_text(scenario, rival, rows, goal)))
         if self.cfg.preset == "smoke":
             print(SMOKE)
         print(f"Written to {short(self.where)}: {', '.join(written)}")
@@ -115,15 +115,16 @@ class Report:
         """table.csv, table.md, table.tex and summary.json; returns the columns of each scenario."""
         tables = self.tables()
         if tables:
+            goal = self.cfg.scenario.success_coverage
             write_text(self.where / "table.csv", table_csv(tables))
             rivals = {scenario: self._rival(scenario) for scenario in tables}
             apart = {scenario: self.differences(scenario, columns) for scenario, columns in tables.items()}
             below = {
-                scenario: differences_markdown(rivals[scenario], rows)
+                scenario: differences_markdown(rivals[scenario], rows, goal)
                 for scenario in tables if (rows := against(apart[scenario], rivals[scenario]))
             }  # fmt: skip
-            write_text(self.where / "table.md", table_markdown(tables, self.heading(), below))
-            write_text(self.where / "table.tex", table_latex(tables, self.heading()))
+            write_text(self.where / "table.md", table_markdown(tables, self.heading(), below, goal))
+            write_text(self.where / "table.tex", table_latex(tables, self.heading(), goal))
             content = {}
             for scenario, columns in tables.items():
                 named = {one.name: one.summary for one in columns}
@@ -141,9 +142,10 @@ class Report:
         return find_best({name: self.results(scenario, name, VALIDATION) for name in planners})
 
     def differences(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
-        """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b, for every trained a and all others on the same maps."""
+        """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b on the same maps, for every a that is learned or one's own
+        and all others."""
         found: dict[str, dict] = {}
-        for one in (one for one in columns if one.policy in ALGORITHMS):
+        for one in (one for one in columns if is_learned(one.policy)):
             for other in (other for other in columns if other is not one and other.suite == one.suite):
                 mine, theirs = (self.results(scenario, column.policy, one.suite) for column in (one, other))
                 if apart := subtract(one.policy, mine, theirs):
@@ -175,6 +177,7 @@ class Report:
             "maps_are": self.suites,
             "seeds": sorted({cell.seed for cell in known}),
             "episodes": self.cfg.episodes,
+            "success_coverage": self.cfg.scenario.success_coverage,
             "num_robots": self.cfg.num_robots,
             "planner": self.cfg.planner.name,
             "cells": {"done": len(known), "all": sum(one.scenario in scenarios for one in self.cells)},
@@ -218,7 +221,7 @@ class Report:
             pairs = compare_all(values)
             paths.append(self.where / f"improvement{mark}.csv")
             write_text(paths[-1], pairs_csv(pairs))
-            trained = [name for name in values if name in ALGORITHMS]
+            trained = [name for name in values if is_learned(name)]
             listed = trained if len(trained) > 1 else list(values)[:6]
             paths.append(draw_improvement(pairs, listed, self.where / f"improvement{mark}.png"))
         return [path.name for path in paths]
@@ -238,8 +241,8 @@ class Report:
         curves = {}
         for one in columns:
             curves[one.policy] = pool_curves([result for _, result in self.results(scenario, one.policy, one.suite)])
-        trained = {name: curve for name, curve in curves.items() if name in ALGORITHMS}
-        classical = {name: curve for name, curve in curves.items() if name not in ALGORITHMS}
+        trained = {name: curve for name, curve in curves.items() if is_learned(name)}
+        classical = {name: curve for name, curve in curves.items() if not is_learned(name)}
         if trained and "random" in classical:
             trained["random"] = classical["random"]
         return {"trained": trained, "classical": classical}
@@ -265,7 +268,7 @@ def _points(scenario: str, columns: list[Column]) -> list[tuple]:
     """What `draw_overview` shows of a scenario."""
     points = []
     for one in columns:
-        kind = "trained" if one.policy in ALGORITHMS else "classical"
+        kind = "trained" if is_learned(one.policy) else "classical"
         found, published = one.summary["exploration_ratio"], paper_value(scenario, one.policy, "exploration_ratio")
         points.append((one.policy, kind, found["mean"], found["ci95"], published and published[0] / 100))
     return points

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.envs.metrics import resample_weights, summarise
+from maexp.envs.metrics import in_reach, resample_weights, summarise
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,21 @@ ROWS = (
     Row("coverage_step_85", "CS85", "steps", -1, 1, 0),
     Row("coverage_step_95", "CS95", "steps", -1, 1, 0),
     Row("coverage_step_95_censored", "to 95", "steps", -1, 1, 0),
+    Row("coverage_step_99", "CS99", "steps", -1, 1, 0),
+    Row("coverage_step_99_censored", "to 99", "steps", -1, 1, 0),
     Row("mutual_overlap_85", "MO85", "%", -1, 100, 1),
     Row("mutual_overlap_95", "MO95", "%", -1, 100, 1),
     Row("reward_variance", "RV", "", -1, 1, 0),
 )
-SHOWN = [row for row in ROWS if row.metric not in ("mutual_overlap_95", "reward_variance")]  # there is room for six
+SHOWN = ("ER", "AUC", "CS85", "CS95", "to 95", "MO85")  # on the terminal, where there is room for six
+SHOWN_TO_THE_END = ("ER", "AUC", "CS95", "to 95", "CS99", "to 99")
 ORACLE = "oracle"
 SHORT = {"held_out": "", "trained": " (training maps)"}
 NOTES = (
     "ER: exploration ratio; AUC: mean coverage over all local steps of a full episode; more is better. CS85, CS95: "
-    "local steps until 85, 95 % coverage; to 95: the same with the limit for episodes that did not get there; MO85, "
-    "MO95: share of the seen points that two or more robots saw, at that moment; RV: spread of the reward over robots; "
-    "less is better.",
+    "local steps until 85, 95 % coverage; to 95: the same with the limit for episodes that did not get there (CS99, to "
+    "99: of 99 %, where episodes go on until then); MO85, MO95: share of the seen points that two or more robots saw, "
+    "at that moment; RV: spread of the reward over robots; less is better.",
     "Mean ± standard deviation over episodes, [bootstrap 95 % interval of the mean; maps, the episodes on each and the "
     "seeds of training are resampled]. CS and MO: over the episodes that got there, (how many/of all); a policy that "
     "seldom gets there shows its luckiest episodes.",
@@ -60,6 +63,18 @@ NOTES = (
     "Bold: the best mean of a row as printed; several where they tie. paper: Table II, trained and tested on the same "
     "map; its indoor and outdoor maps are scans, ours are generated.",
 )
+
+
+def rows_for(goal: float) -> list[Row]:
+    """The rows of a table of episodes that end at the coverage `goal`."""
+    return [row for row in ROWS if in_reach(row.metric, goal)]
+
+
+def shown_for(goal: float) -> list[Row]:
+    """Those that the terminal has room for."""
+    rows = rows_for(goal)
+    labels = SHOWN_TO_THE_END if any(row.label == "CS99" for row in rows) else SHOWN
+    return [row for row in rows if row.label in labels]
 
 
 @dataclass
@@ -87,15 +102,11 @@ def pool_column(
     policy: str,
     suite: str,
     cells: list[tuple[int, dict[str, np.ndarray]]],
-    maps: list[np.ndarray | None] | None = None,
+    maps: list[np.ndarray],
 ) -> Column:
-    """The column of a policy from the (seed, episodes) of its cells, and each episode's map where that is known."""
+    """The column of a policy from the (seed, episodes) of its cells, and the map of each episode."""
     counts = [len(episodes["exploration_ratio"]) for _, episodes in cells]
-    cells = [  # an earlier version knew fewer metrics
-        (seed, {row.metric: np.full(count, np.nan) for row in ROWS} | episodes)
-        for count, (seed, episodes) in zip(counts, cells, strict=True)
-    ]
-    metrics = [name for name in cells[0][1] if all(name in episodes for _, episodes in cells)]
+    metrics = list(cells[0][1])
     pooled = {name: np.concatenate([episodes[name] for _, episodes in cells]) for name in metrics}
     seeds: dict[int, dict[str, float]] = {}
     for seed in dict.fromkeys(seed for seed, _ in cells):
@@ -106,16 +117,14 @@ def pool_column(
     return Column(policy, suite, summary, len(pooled["exploration_ratio"]), seeds)
 
 
-def weigh(policy: str, seeds: list[int], counts: list[int], maps: list | None) -> np.ndarray | None:
+def weigh(policy: str, seeds: list[int], counts: list[int], maps: list[np.ndarray]) -> np.ndarray:
     """Resamples of maps, of the episodes on each and, where a policy was trained, of the seeds of its trainings.
 
     Args:
         policy: whose
         seeds, counts: of each cell, and its episodes
-        maps: the map of each episode, for each cell; None: not known, there are no such resamples
+        maps: the map of each episode, for each cell
     """
-    if maps is None or any(one is None for one in maps):
-        return None
     return resample_weights(np.concatenate(maps), *([np.repeat(seeds, counts)] if policy in ALGORITHMS else []))
 
 
@@ -171,32 +180,36 @@ def paper_text(scenario: str, column: Column, row: Row, digits: int | None = Non
 # Terminal
 
 
-def print_tables(tables: dict[str, list[Column]], console: Console | None = None) -> None:
-    """A table per scenario, policies as rows, and one of the coverage in all of them; fits 100 columns."""
+def print_tables(tables: dict[str, list[Column]], console: Console | None = None, goal: float = 0.95) -> None:
+    """A table per scenario, policies as rows, and one of the coverage in all of them; fits 100 columns.
+
+    Args:
+        goal: coverage that ended an episode
+    """
     console = console or Console()
     console = Console(file=console.file, width=max(100, console.width), force_terminal=console.is_terminal)
     for scenario, columns in tables.items():
-        console.print(draw_table(scenario, columns))
+        console.print(draw_table(scenario, columns, shown_for(goal)))
     if len(tables) > 1:
         console.print(draw_overview(tables))
     console.print(Group(*(Text(one, style="dim") for one in NOTES)))
 
 
-def draw_table(scenario: str, columns: list[Column]) -> Table:
+def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
     """The table of one scenario."""
     table = Table(title=f"{scenario}: {columns[0].total} episodes a policy", title_justify="left", box=box.SIMPLE_HEAD,
                   pad_edge=False, collapse_padding=True, padding=(0, 1))  # fmt: skip
     table.add_column("policy", no_wrap=True)
-    for row in SHOWN:
+    for row in rows:
         table.add_column(row.title.replace(" steps", ""), justify="right", no_wrap=True)
-    bold = {row.metric: best_columns(columns, row) for row in SHOWN}
+    bold = {row.metric: best_columns(columns, row) for row in rows}
     for column in columns:
         cells = []
-        for row in SHOWN:
+        for row in rows:
             cell = Text(value_text(column, row), style="bold" if column.name in bold[row.metric] else "")
             cells.append(cell.append(f"\n{_narrow(column, row)}", style="not bold dim"))
         table.add_row(column.name.replace(" (", "\n("), *cells)
-        published = [paper_text(scenario, column, row, row.digits) for row in SHOWN]
+        published = [paper_text(scenario, column, row, row.digits) for row in rows]
         if any(published):
             table.add_row(Text("  paper", style="dim"), *(Text(one or "-", style="dim") for one in published))
     return table
@@ -259,18 +272,21 @@ def _csv_number(value) -> str:
     return value if value == "" else f"{value:.6g}"
 
 
-def table_markdown(tables: dict[str, list[Column]], heading: str = "", below: dict[str, str] | None = None) -> str:
+def table_markdown(
+    tables: dict[str, list[Column]], heading: str = "", below: dict[str, str] | None = None, goal: float = 0.95
+) -> str:
     """A table per scenario as in the paper: metrics as rows, policies as columns.
 
     Args:
         heading: what was run
         below: scenario -> what stands below its table
+        goal: coverage that ended an episode
     """
     parts = [heading] if heading else []
     for scenario, columns in tables.items():
         lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
         lines += ["| | " + " | ".join(one.name for one in columns) + " |", "| --- |" + " --- |" * len(columns)]
-        for row in ROWS:
+        for row in rows_for(goal):
             bold = best_columns(columns, row)
             cells = [_markdown_cell(scenario, one, row, bold) for one in columns]
             lines.append(f"| {row.title} | {' | '.join(cells)} |")
@@ -287,9 +303,10 @@ def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> s
     return "<br>".join([text, interval_text(column, row), *([f"paper {published}"] if published else [])])
 
 
-def table_latex(tables: dict[str, list[Column]], heading: str = "") -> str:
+def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float = 0.95) -> str:
     """One tabular for \\input: scenarios and metrics as rows, policies as columns; needs booktabs and multirow."""
     names = list(dict.fromkeys(one.name for columns in tables.values() for one in columns))
+    rows = rows_for(goal)
     lines = [f"% {heading}", r"% \usepackage{booktabs,multirow}"]
     lines += [rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
     lines += [" & & " + " & ".join(_escape(one) for one in names) + r" \\"]
@@ -297,8 +314,8 @@ def table_latex(tables: dict[str, list[Column]], heading: str = "") -> str:
         lines.append(r"\midrule")
         have = {one.name: one for one in columns}
         published = any(paper_text(scenario, one, ROWS[0]) for one in columns)
-        height = len(ROWS) * (3 if published else 2)
-        for k, row in enumerate(ROWS):
+        height = len(rows) * (3 if published else 2)
+        for k, row in enumerate(rows):
             head = rf"\multirow{{{height}}}{{*}}{{{_escape(scenario)}}}" if k == 0 else ""
             bold = best_columns(columns, row)
             label = _escape(row.title).replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")

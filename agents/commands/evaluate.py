@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModuleBase
-from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
@@ -25,21 +23,18 @@ from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
 from maexp.agents.files import short, write_json
-from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.load import check_policies, load_policy_folder, policy_name, show_targets
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts, check_goals, team_sizes
+from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
-from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
-from maexp.agents.training.checksums import warn_of_changed_maps
-from maexp.agents.training.train import check_action, write_config
+from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
+from maexp.agents.training.named import Player, check_planner, find_players, suit_observation
+from maexp.agents.training.train import write_config
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 PICTURES = 4
-Player = str | TensorDictModuleBase  # a classical policy by its name, or a trained one
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -61,16 +56,15 @@ def check(cfg: EvaluateSettings) -> None:
     """Raise UserError for counts out of range and unknown policies."""
     check_counts(cfg, "num_envs", "episodes")
     team_sizes(cfg.num_robots)
-    check_policies(policy_names(cfg))
-    check_goals(policy_names(cfg), cfg.planner.name)
+    check_planner(cfg.planner.name, find_players(words_of(cfg.policy)))
     check_render(cfg)
 
 
-def policy_names(cfg: EvaluateSettings) -> list[str]:
-    """The policies asked for by name or folder."""
-    if cfg.policy is None:
+def words_of(value: Any) -> list[str]:
+    """The words of a setting that names one policy or several."""
+    if value is None:
         return []
-    return [cfg.policy] if isinstance(cfg.policy, str) else [str(one) for one in cfg.policy]
+    return [value] if isinstance(value, str) else [str(one) for one in value]
 
 
 def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
@@ -81,29 +75,32 @@ def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
-        show_targets(cfg, policy_names(cfg))
-        if cfg.checkpoint is None and cfg.observation.pictures is None:  # neither planners nor these look at pictures
-            cfg.observation.pictures = False
+        players = find_players(words_of(cfg.policy))
+        if cfg.checkpoint is not None:
+            players.insert(0, find_trained(cfg))
+        suit_observation(cfg, players)
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
-        policies = {} if cfg.checkpoint is None else {"trained": load_policy(cfg, envs[0][0], maps)}
-        policies |= {policy_name(word): open_player(word, envs[0][0]) for word in policy_names(cfg)}
+        for player in players:
+            player.check_maps(maps)
+            player.make(envs[0][0])
         steps = [env.local_steps * env.macro_steps for env in envs[0]]
+        names = [one.name for one in players]
         if baseline is not None:
             run_here = describe_run(cfg, maps, 0.0) | {"steps": steps}
-            baseline.check(run_here, [(name, size) for name in policies for size in team_sizes(cfg.num_robots)])
+            baseline.check(run_here, [(name, size) for name in names for size in team_sizes(cfg.num_robots)])
         best = {}
-        if not all(isinstance(one, str) for one in policies.values()):  # somebody has learned
-            best = {size: choose_best(cfg, suite, policy_names(cfg), size) for size in team_sizes(cfg.num_robots)}
+        if any(one.learned for one in players):
+            best = {size: choose_best(cfg, suite, names, size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
-    results = [one for team in envs for one in evaluate_places(cfg, team, policies)]
+    results = [one for team in envs for one in evaluate_places(cfg, team, players)]
     report(cfg, results, suite, best, where / "results.json", steps=steps)
     write_episodes(where / EPISODES_FILE, results)
-    draw_ends(cfg, maps, *next(iter(policies.items())), where / "picture.png")
+    draw_ends(cfg, maps, players[0], where / "picture.png")
     written = ["results.json", EPISODES_FILE, *draw_results(results, where), "picture.png", "config.yaml"]
     if baseline is not None:
         written += [compare_with(baseline, results, where)]
     if cfg.render:
-        films = [film for team in envs for film in film_all(cfg, team[0], maps, policies, where)]
+        films = [film for team in envs for film in film_all(cfg, team[0], maps, players, where)]
         written += [film.name for film in films] + [f"{EPISODES}/"]
     print(f"Written to {short(where)}: {', '.join(written)}")
     if cfg.render:
@@ -111,40 +108,30 @@ def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def load_policy(
-    cfg: EvaluateSettings | ViewSettings | ExportSettings, env: ExplorationEnv, maps: list[PointCloudMap]
-) -> ProbabilisticActor:
-    """The policy of a checkpoint, for any team size; says which of the `maps` it will play on have changed since."""
+def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> Player:
+    """The policy of `checkpoint`, for the settings that go with it and any team size."""
     saved = find_checkpoint(cfg.checkpoint)[1]
     check_action(saved, cfg)
-    warn_of_changed_maps(saved, maps)
-    return restore_policy(env, model_settings(cfg), saved)
+    model, direct = model_settings(cfg), cfg.planner.name == "direct"
+    looks = model.action == "regions"
+    kind = {"kind": "checkpoint", "pictures": looks, "direct": direct, "saved": saved}
+    return Player("trained", lambda env: restore_policy(env, model, saved), **kind)
 
 
-def open_player(word: str, env: ExplorationEnv) -> Player:
-    """What `bind` takes: the name of a classical policy, or a trained one."""
-    return word if word in POLICIES else load_policy_folder(word, env)
-
-
-def bind(policy: Player, env: ExplorationEnv) -> TensorDictModuleBase:
-    """A policy to call: the classical ones are made for an env, the trained one fits every env."""
-    return POLICIES[policy](env) if isinstance(policy, str) else policy
-
-
-def evaluate_all(cfg: EpisodeSettings, env: ExplorationEnv, policies: dict[str, Player]) -> list[EvaluationResult]:
+def evaluate_all(cfg: EpisodeSettings, env: ExplorationEnv, players: list[Player]) -> list[EvaluationResult]:
     """Each policy on the same episodes."""
     results = []
-    for name, policy in policies.items():
-        with Progress(f"{name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
-            settings = {"name": name, "seed": cfg.seed, "advance": progress.advance}
-            played = evaluate_recorded(bind(policy, env), env, cfg.episodes, **settings)
-            results.append(replace(played, learned=not isinstance(policy, str)))
+    for player in players:
+        with Progress(f"{player.name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
+            settings = {"name": player.name, "seed": cfg.seed, "advance": progress.advance}
+            played = evaluate_recorded(player.make(env), env, cfg.episodes, **settings)
+            results.append(replace(played, learned=player.learned))
     return results
 
 
-def evaluate_places(cfg: EvaluateSettings, envs: list, policies: dict[str, Player]) -> list[EvaluationResult]:
+def evaluate_places(cfg: EvaluateSettings, envs: list, players: list[Player]) -> list[EvaluationResult]:
     """Each policy on the same episodes in each of several places, and in all of them together."""
-    parts = [evaluate_all(cfg, env, policies) for env in envs]
+    parts = [evaluate_all(cfg, env, players) for env in envs]
     if len(envs) == 1:
         return parts[0]
     results = [pool(list(those)) for those in zip(*parts, strict=True)]
@@ -154,15 +141,15 @@ def evaluate_places(cfg: EvaluateSettings, envs: list, policies: dict[str, Playe
 
 
 def film_all(
-    cfg: EvaluateSettings, env: ExplorationEnv, maps: list[PointCloudMap], policies: dict[str, Player], where: Path
+    cfg: EvaluateSettings, env: ExplorationEnv, maps: list[PointCloudMap], players: list[Player], where: Path
 ) -> list[Path]:
     """A film of each policy in the first `render_envs` of the episodes, and the episodes as files."""
     films = []
     env = make_env(cfg, maps, env.num_robots, min(cfg.render_envs, cfg.episodes))
-    for name, policy in policies.items():
-        name = name if len(team_sizes(cfg.num_robots)) == 1 else f"{name}_N{env.num_robots}"
+    for player in players:
+        name = player.name if len(team_sizes(cfg.num_robots)) == 1 else f"{player.name}_N{env.num_robots}"
         print(f"filming {name}", file=sys.stderr, flush=True)
-        episodes = play_teams(env, bind(policy, env), name, seed=cfg.seed)
+        episodes = play_teams(env, player.make(env), name, seed=cfg.seed)
         films.append(write_film(episodes, where, name, cfg.render_format)[0])
     return films
 
@@ -219,7 +206,7 @@ def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSui
     return words + ", for each team size" * (len({one.num_robots for one in results}) > 1)
 
 
-def draw_ends(cfg: EvaluateSettings, maps: list, name: str, policy: Player, path: Path) -> None:
+def draw_ends(cfg: EvaluateSettings, maps: list, player: Player, path: Path) -> None:
     """The last moment of the first few episodes of a policy, side by side."""
     from maexp.envs.render import draw_teams
     from maexp.envs.viewing.show import write_picture
@@ -228,5 +215,5 @@ def draw_ends(cfg: EvaluateSettings, maps: list, name: str, policy: Player, path
     env = make_env(cfg, maps, team_sizes(cfg.num_robots)[0], count)
     with torch.random.fork_rng([]):
         torch.manual_seed(cfg.seed)
-        play(bind(policy, env), env, torch.arange(count, device=env.device))
-    write_picture(draw_teams([env.snapshot(index) | {"policy": name} for index in range(count)]), path)
+        play(player.make(env), env, torch.arange(count, device=env.device))
+    write_picture(draw_teams([env.snapshot(index) | {"policy": player.name} for index in range(count)]), path)

@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.build import load_maps, make_env
-from maexp.agents.commands.evaluate import load_policy
+from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import check_writable, remove_if_empty
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import short
 from maexp.agents.policies.card import RESULTS, find_results, write_card
 from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.settings.checks import team_sizes
-from maexp.agents.settings.compose import settings_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import ExportSettings
@@ -47,7 +46,7 @@ def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
     path, saved = find_checkpoint(cfg.checkpoint)
     with blame_input():
         env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out[:1], sizes[0], 1)
-        policy = load_policy(cfg, env, [])  # it is not played: no map of its training need still be there
+        policy = find_trained(cfg).make(env)
         find_chooser(policy)
         name, trained = cfg.name or out.absolute().name, describe_training(cfg, saved)
         card = write_card(name, trained, result_files(cfg, path), cfg.note)
@@ -60,14 +59,13 @@ def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
 
 def describe_training(cfg: ExportSettings, saved: dict) -> dict[str, Any]:
     """How the policy of a checkpoint was trained."""
-    settings = settings_of(saved)
     return {
         "scenarios": [cfg.scenario.name, *(cfg.scenario.also or [])],
         "num_robots": team_sizes(cfg.num_robots),
         "algorithm": cfg.algorithm.name,
         "seed": cfg.seed,
         "iteration": saved["iteration"],
-        "frames": settings["total_frames"],
+        "frames": saved["settings"]["total_frames"],
         "commit": saved.get("commit"),
     }
 

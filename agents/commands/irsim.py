@@ -9,11 +9,10 @@ import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
-from maexp.agents.policies.load import open_policy
-from maexp.agents.runtime import CHOICES
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.schema import IrsimSettings, given
+from maexp.agents.training.named import find_player
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.film import write_gif
 from maexp.envs.scenarios import default_macro_steps, find_scenario
@@ -36,8 +35,9 @@ def check(cfg: IrsimSettings) -> None:
     check_counts(cfg, "episode", "people", "seed", least=0)
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
-    if cfg.policy not in CHOICES:
-        open_policy(cfg.policy, others=CHOICES)
+    from maexp.agents.irsim.players import check_player
+
+    check_player(cfg.policy, find_player(cfg.policy))
     if importlib.util.find_spec("irsim") is None:
         raise UserError('maexp irsim needs the simulator ir-sim: pip install "maexp[irsim]".')
 
@@ -46,22 +46,24 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
     from maexp.agents.irsim import ours
     from maexp.agents.irsim.pictures import draw_curves, draw_moment
+    from maexp.agents.irsim.players import make_planner
     from maexp.agents.irsim.trial import run_trial
 
     with blame_input():
         world = import_map(cfg.floor, num_robots=cfg.num_robots, **given(cfg.importing))
         config = make_config(cfg, world)
-        targets = 0 if cfg.policy in CHOICES else open_policy(cfg.policy)[1].candidates
-        env = ours.make_team(world, cfg.num_robots, config, targets)
+        player = find_player(cfg.policy)
+        env = ours.make_team(world, cfg.num_robots, config, player.targets or 0)
         starts = ours.draw_starts(env, cfg.episode)
         frames: list[np.ndarray] = []
+        planner = make_planner(cfg.policy, player, config, env, where)
         trial = run_trial(
-            world, cfg.policy, starts, config, lambda moment: frames.append(draw_moment(moment, config.body_radius))
+            world, planner, starts, config, lambda moment: frames.append(draw_moment(moment, config.body_radius))
         )
     curves = {"ir-sim": trial.coverage}
     rows = {"ir-sim": measure(trial.coverage, config.seconds) | {"collisions": int(trial.collided.sum())}}
     if cfg.ours:
-        curve, collided = ours.run_ours(env, cfg.policy, cfg.episode)
+        curve, collided = ours.run_ours(env, player.make(env), cfg.episode)
         curves["ours"] = curve
         rows["ours"] = measure(curve, config.seconds) | {"collisions": int(collided.sum())}
     rows["ir-sim"] |= {
@@ -73,7 +75,7 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     run_info = {"floor": cfg.floor, "policy": cfg.policy, "num_robots": cfg.num_robots, "episode": cfg.episode}
     content = {"run": run_info | asdict(config), "results": rows, "coverage": curves, "notes": trial.notes}
     write_json(where / "results.json", content)
-    title = f"{world.name}: {cfg.num_robots} robots, {cfg.policy}"
+    title = f"{world.name}: {cfg.num_robots} robots, {player.name}"
     written = [where / "results.json", draw_curves(curves, title, where / "coverage.png")]
     written.append(write_gif(frames, where / "film.gif", FILM_SPEED))
     print(f"Written: {', '.join(str(one) for one in written)}")
@@ -85,7 +87,8 @@ def make_config(cfg: IrsimSettings, world: PointCloudMap):
     from maexp.agents.irsim.config import DT, TOLERANCE, TrialConfig
 
     scenario = find_scenario(world.scenario)
-    steps = scenario.macro_steps or default_macro_steps([world], scenario)
+    team = [(scenario.max_speed, cfg.radar_range or scenario.radar_range)] * cfg.num_robots
+    steps = scenario.macro_steps or default_macro_steps([world], scenario, team)
     # Our simulator measures from the points of walls, the middles of cells that are solid here.
     clearance = scenario.collision_threshold - 0.5 * world.resolution if cfg.clearance is None else cfg.clearance
     return TrialConfig(

@@ -1,22 +1,23 @@
 """`maexp train`: settings, a new or a resumed run, then the evaluation and the pictures."""
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
-from maexp.agents.build import choose_device, make_env
-from maexp.agents.commands.evaluate import bind, draw_results, evaluate_all, report
+from maexp.agents.build import choose_device, make_env, model_settings
+from maexp.agents.commands.evaluate import draw_results, evaluate_all, report, words_of
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import choose_best
 from maexp.agents.files import short
-from maexp.agents.policies.classical import POLICIES
-from maexp.agents.settings.checks import check_counts, check_distinct, team_sizes
+from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger
+from maexp.agents.training.named import Player, find_players, suit_observation
 from maexp.agents.training.train import TrainingRun, check_collector, describe_workers, train, write_config
 
 STOPPED = 130
@@ -63,17 +64,14 @@ def check(cfg: TrainSettings) -> None:
     check_logger(cfg.logger)
     if not cfg.resume:
         check_warm_start(cfg)
-    for name in classical_names(cfg):
-        if name not in POLICIES:
-            raise UserError(f"classical={name} is unknown: choose of {', '.join(POLICIES)}.")
-    check_distinct("classical", classical_names(cfg))
+    suit_observation(copy.deepcopy(cfg), find_others(cfg))
 
 
-def classical_names(cfg: TrainSettings) -> list[str]:
-    """The classical policies played at the end."""
-    if cfg.classical is None:
-        return []
-    return [cfg.classical] if isinstance(cfg.classical, str) else [str(one) for one in cfg.classical]
+def find_others(cfg: TrainSettings) -> list[Player]:
+    """The policies played at the end beside the trained one."""
+    words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
+    others = find_players(words, "classical")
+    return [one for one in others if one.direct] if cfg.planner.name == "direct" else others  # the rest pick goals
 
 
 def run(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
@@ -115,17 +113,25 @@ def finish(done: TrainingRun) -> None:
     best: dict[int, str | None] = {}
     if cfg.episodes:
         device = choose_device(cfg, "train_device")
-        others = [] if cfg.planner.name == "direct" else ["random", *classical_names(cfg)]  # these pick goals
-        best = {size: choose_best(cfg, done.suite, others, size, device=device) for size in done.sizes}
-        policies = {"trained": done.learner.policy} | {name: name for name in others}
-        envs = (make_env(cfg, done.suite.held_out, size, device=device) for size in done.sizes)
-        results = [one for env in envs for one in evaluate_all(cfg, env, policies)]
+        others = find_others(cfg)
+        names = [one.name for one in others]
+        best = {size: choose_best(cfg, done.suite, names, size, device=device) for size in done.sizes}
+        shown = copy.deepcopy(cfg)
+        suit_observation(shown, [trained_player(done), *others])
+        envs = (make_env(shown, done.suite.held_out, size, device=device) for size in done.sizes)
+        results = [one for env in envs for one in evaluate_all(cfg, env, [trained_player(done), *others])]
         report(cfg, results, done.suite, best, where / "summary.json", training_seconds=round(done.seconds, 2))
         written += ["summary.json", *draw_results(results, where)]
     draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
     written.append("rollout.gif")
     print(f"Written to {short(where)}: {', '.join(written)}")
     print(f"Next: maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8, or maexp view {short(where)}")
+
+
+def trained_player(done: TrainingRun) -> Player:
+    """The team that was trained."""
+    looks, direct = model_settings(done.cfg).action == "regions", done.cfg.planner.name == "direct"
+    return Player("trained", lambda env: done.learner.policy, "checkpoint", pictures=looks, direct=direct)
 
 
 def draw_curves(where: Path) -> None:
@@ -141,6 +147,6 @@ def draw_rollout(cfg: TrainSettings, done: TrainingRun, best: str | None, path: 
     from maexp.envs.film import write_gif
 
     env = make_env(cfg, done.suite.held_out[:1], done.sizes[0], 1, device=choose_device(cfg, "train_device"))
-    teams = {"trained": done.learner.policy} | ({} if best is None else {best: best})
-    episodes = [play_teams(env, bind(policy, env), name, seed=cfg.seed)[0] for name, policy in teams.items()]
+    teams = [trained_player(done), *([] if best is None else find_players([best]))]
+    episodes = [play_teams(env, one.make(env), one.name, seed=cfg.seed)[0] for one in teams]
     write_gif(draw_film(episodes), path)

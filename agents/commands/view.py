@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from maexp.agents.build import import_files, load_maps, make_env
-from maexp.agents.commands.evaluate import bind, load_policy, open_player
+from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.films import EPISODES, MOST_TEAMS, play_teams
 from maexp.agents.files import short
-from maexp.agents.policies.load import check_policies, policy_name, show_targets
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import ViewSettings, given
-from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.checkpoint import find_checkpoint, is_run
+from maexp.agents.training.named import check_planner, find_player, suit_observation
 from maexp.envs import PointCloudMap, import_map, make_map
 from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS
@@ -46,11 +46,6 @@ def prepare(overrides: list[str]) -> Recipe:
     return continue_run(*find_checkpoint(run), without(overrides, "place"), "view", "num_envs")
 
 
-def is_run(place: Path) -> bool:
-    """Whether this is a checkpoint or the folder of a run of `maexp train`."""
-    return place.suffix == ".pt" or (place / "checkpoints").is_dir() or any(place.glob("iteration_*.pt"))
-
-
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     """Every view has a new folder of its own, for what it writes."""
     return claim()
@@ -68,7 +63,7 @@ def check(cfg: ViewSettings) -> None:
     if cfg.seconds is not None and not 0 <= cfg.seconds < math.inf:
         raise UserError(f"seconds={cfg.seconds:g} must be a time after the start of the episode, 0 s or more.")
     if cfg.policy is not None and not holds_episodes(cfg.place):  # there it only picks some of what was recorded
-        check_policies([cfg.policy])
+        check_planner(cfg.planner.name, [find_player(cfg.policy)])
     if cfg.policy is not None and cfg.checkpoint is not None:
         raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
     if cfg.renderer not in show.RENDERERS:
@@ -138,15 +133,11 @@ def find_subject(cfg: ViewSettings, where: Path) -> tuple[list[Episode], PointCl
     if cfg.checkpoint is None and cfg.policy is None:
         return [], find_map(cfg, place)
     maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
-    if cfg.checkpoint is None:
-        show_targets(cfg, [cfg.policy])
-    env = make_env(cfg, maps, cfg.num_robots)
-    if cfg.checkpoint is None:
-        policy, name = open_player(cfg.policy, env), policy_name(cfg.policy)
-    else:
-        policy, name = load_policy(cfg, env, maps), "trained"
-    first = cfg.episode or 0
-    episodes = play_teams(env, bind(policy, env), name, first=first, seed=cfg.seed)
+    player = find_trained(cfg) if cfg.checkpoint is not None else find_player(cfg.policy)
+    suit_observation(cfg, [player])
+    player.check_maps(maps)
+    env, first, name = make_env(cfg, maps, cfg.num_robots), cfg.episode or 0, player.name
+    episodes = play_teams(env, player.make(env), name, first=first, seed=cfg.seed)
     (where / EPISODES).mkdir()
     for number, episode in enumerate(episodes, first):
         episode.save(where / EPISODES / f"{name}_{number}.npz")

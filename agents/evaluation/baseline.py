@@ -12,7 +12,7 @@ import numpy as np
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import DECIDES
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.results import result_names
+from maexp.agents.evaluation.results import FORMAT, result_names
 from maexp.agents.files import short, write_text
 
 EPISODES_FILE, CHANGES_FILE = "episodes.csv", "changes.json"
@@ -93,6 +93,8 @@ def load_baseline(path: str) -> Baseline:
     folder = Path(path).expanduser().absolute()
     try:
         run = json.loads((folder / "results.json").read_text())["run"]
+        if run["format"] != FORMAT:
+            raise ValueError(run["format"])
         with open(folder / EPISODES_FILE, newline="") as file:
             rows = list(csv.DictReader(file))
         metrics = [name for name in rows[0] if name not in KEY]
@@ -100,7 +102,7 @@ def load_baseline(path: str) -> Baseline:
         results = {team: _read_result(*team, rows, metrics) for team in teams}
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise UserError(
-            f"baseline={path} is no folder of maexp evaluate with results.json and {EPISODES_FILE} "
+            f"baseline={path} is no folder of maexp evaluate with {EPISODES_FILE} and results.json of kind {FORMAT} "
             f"({type(error).__name__}): give one, or evaluate again what it was."
         ) from error
     return Baseline(folder, run, results)

@@ -9,6 +9,7 @@ from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.schema import EpisodeSettings
+from maexp.envs.metrics import in_reach
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"
@@ -44,18 +45,23 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
     whole = [one for one in results if not one.place]
     rivals = {one.num_robots: one for one in whole if one.policy == best.get(one.num_robots)}
     return [
-        _describe(name, rivals[one.num_robots].policy, one.minus(rivals[one.num_robots]))
+        _describe(name, rivals[one.num_robots].policy, one.minus(rivals[one.num_robots]), one.success_coverage)
         for name, one in zip(result_names(whole), whole, strict=True)
         if one.learned and one.num_robots in rivals
     ]
 
 
-def _describe(name: str, rival: str, found: dict[str, dict]) -> str:
-    auc, steps = found[DECIDES], found["coverage_step_95_censored"]
+def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
+    auc = found[DECIDES]
     low, high = (100 * end for end in auc["ci95"])
     points = f"{100 * auc['mean']:+.1f} points of coverage over time [{low:+.1f}, {high:+.1f}]"
     where = "is ahead of" if low > 0 else "is behind" if high < 0 else "cannot be told from"
-    low, high = steps["ci95"]
-    later = f"{steps['mean']:+.0f} steps to 95 % [{low:+.0f}, {high:+.0f}]"
+    later = ", ".join(_later(found, mark) for mark in (95, 99) if mark == 95 or in_reach(f"_{mark}", goal))
     name = name.replace("trained", "The trained team", 1)
     return f"{name} {where} {rival}, the best classical planner on the validation maps: {points}, {later}."
+
+
+def _later(found: dict[str, dict], mark: int) -> str:
+    steps = found[f"coverage_step_{mark}_censored"]
+    low, high = steps["ci95"]
+    return f"{steps['mean']:+.0f} steps to {mark} % [{low:+.0f}, {high:+.0f}]"

@@ -30,6 +30,7 @@ class EvaluationResult:
         place: the map, where several were played one by one; "": all of them
         times, coverage: coverage over time, [records] [s] and [episodes, records] in [0, 1]; None: not recorded
         shares: of each robot in what its team discovered, [episodes, robots]; None: not recorded
+        success_coverage: share at which an episode was over: later marks tell nothing (`metrics.in_reach`)
     """
 
     policy: str
@@ -42,6 +43,7 @@ class EvaluationResult:
     times: np.ndarray | None = None
     coverage: np.ndarray | None = None
     shares: np.ndarray | None = None
+    success_coverage: float = 0.95
 
     @property
     def weights(self) -> np.ndarray:
@@ -75,6 +77,7 @@ def pool(parts: list[EvaluationResult]) -> EvaluationResult:
         times=times,
         coverage=np.stack(lines),
         shares=np.concatenate([one.shares for one in parts]),
+        success_coverage=parts[0].success_coverage,
     )
 
 
@@ -113,18 +116,26 @@ def evaluate(
             maps += [env.maps[index].name for index in env.simulation.tensors["map_id"][:count].tolist()]
             advance(count)
     metrics = episode_metrics(torch.cat(finals), env.local_steps * env.macro_steps, env.success_coverage)
-    return EvaluationResult(name, env.num_robots, metrics, time.perf_counter() - begin, np.array(maps))
+    seconds, goal = time.perf_counter() - begin, env.success_coverage
+    return EvaluationResult(name, env.num_robots, metrics, seconds, np.array(maps), success_coverage=goal)
 
 
 @torch.no_grad()
 def play(policy: Callable, env, numbers: torch.Tensor) -> TensorDict:
-    """One episode in each env, to the end: env i plays number `numbers[i]`. Returns the last step's info [envs]."""
+    """One episode in each env, to the end: env i plays number `numbers[i]`. Returns the last step's info [envs].
+
+    A policy that cannot go on with a team says so under ``lost``, bool [E, 1]: the episode ends there, as it was
+    before that decision.
+    """
     env.set_episodes(numbers)
     state = env.reset()
     final = state["info"].clone()
     running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     while bool(running.any()):
-        state = env.step(policy(state))
+        state = policy(state)
+        if "lost" in state.keys():
+            running = running & ~state["lost"].squeeze(-1)
+        state = env.step(state)
         after = state["next"]
         final = torch.where(running, after["info"], final)
         running = running & ~after["done"].squeeze(-1)

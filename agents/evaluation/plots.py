@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
-from maexp.envs.metrics import resample_weights, resampled_means
+from maexp.envs.metrics import in_reach, resample_weights, resampled_means
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
@@ -46,10 +46,13 @@ METRICS = (
     ("coverage_step_85", "Time to 85 % coverage", "local steps of 0.1 s", 1),
     ("coverage_step_95", "Time to 95 % coverage", "local steps of 0.1 s", 1),
     ("coverage_step_95_censored", "Time to 95 % or the limit", "local steps of 0.1 s", 1),
+    ("coverage_step_99", "Time to 99 % coverage", "local steps of 0.1 s", 1),
+    ("coverage_step_99_censored", "Time to 99 % or the limit", "local steps of 0.1 s", 1),
     ("mutual_overlap_85", "Overlap at 85 % coverage", "%", 100),
     ("mutual_overlap_95", "Overlap at 95 % coverage", "%", 100),
     ("collisions", "Collisions", "robots per episode", 1),
     ("path_length", "Path of a robot", "m per episode", 1),
+    ("longest_path", "Longest path in a team", "m per episode", 1),
     ("reward_variance", "Spread of reward over robots", "reward, unscaled", 1),
 )
 
@@ -273,7 +276,9 @@ def draw_summary(summary, path) -> Path:
         summary = json.loads(Path(summary).read_text())
     known = {metric for metric, *_ in METRICS}
     policies = {name: one for name, one in summary.items() if isinstance(one, dict) and known & one.keys()}
+    goal = summary.get("run", {}).get("success_coverage", 1.0)
     shown = [row for row in METRICS if any(_mean(one, row[0]) is not None for one in policies.values())]
+    shown = [row for row in shown if in_reach(row[0], goal)]
     if not shown:
         raise ValueError(
             f"the summary has no metric that can be drawn; found {', '.join(map(str, summary)) or 'nothing'}"

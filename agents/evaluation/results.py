@@ -10,16 +10,21 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.headroom import headroom_shares
 from maexp.agents.files import write_json
 from maexp.agents.settings.schema import EpisodeSettings
 from maexp.agents.versions import PACKAGES, find_commit
+from maexp.envs.metrics import in_reach
 
+FORMAT = "maexp-results-1"
 COLUMNS = {
     "exploration_ratio": "coverage",
     "coverage_auc": "over time",
     "coverage_step_85": "85 % at step",
     "coverage_step_95": "95 % at step",
     "coverage_step_95_censored": "95 % censored",
+    "coverage_step_99": "99 % at step",
+    "coverage_step_99_censored": "99 % censored",
     "mutual_overlap_85": "overlap",
     "success_rate": "success",
     "collisions": "collisions",
@@ -28,12 +33,14 @@ COLUMNS = {
 
 
 def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
-    """What was run: scenario, maps, seed, episodes, commit, versions, seconds."""
+    """What was run: scenario, maps, seed, episodes, the coverage that ends one, commit, versions, seconds."""
     return {
+        "format": FORMAT,
         "scenario": cfg.scenario.name,
         "maps": [one.name for one in maps],
         "seed": cfg.seed,
         "episodes": cfg.episodes,
+        "success_coverage": cfg.scenario.success_coverage,
         "commit": find_commit(),
         "versions": {name: metadata.version(name) for name in PACKAGES},
         "seconds": round(seconds, 2),
@@ -62,9 +69,11 @@ def paired_differences(results: list[EvaluationResult]) -> dict[str, dict]:
 
 def write_results(path: Path, results: list[EvaluationResult], run: dict) -> None:
     """{policy: {metric: {mean, std, ci95, n}}}; `difference`: the same of the learned ones less each other; `run`: what
-    was run."""
+    was run; `headroom_share`: leads by that of `clairvoyant` (`headroom`)."""
     named = {name: one.summary() for name, one in zip(result_names(results), results, strict=True)}
+    shares = headroom_shares(results, result_names(results))
     named |= {"difference": found} if (found := paired_differences(results)) else {}
+    named |= {"headroom_share": shares} if shares else {}
     named["run"] = run | {"num_robots": sorted({one.num_robots for one in results})}
     write_json(path, named)
 
@@ -73,12 +82,13 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
     """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("policy", no_wrap=True)
-    for column in COLUMNS.values():
-        table.add_column(escape(column), justify="right", no_wrap=True)  # [m] is no style of rich's
+    columns = [name for name in COLUMNS if in_reach(name, results[0].success_coverage)]
+    for name in columns:
+        table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)  # [m] is no style of rich's
     for name, result in zip(result_names(results), results, strict=True):
         summary = result.summary()
         total = summary["exploration_ratio"]["n"]
-        table.add_row(name, *(_cell(metric, summary[metric], total) for metric in COLUMNS))
+        table.add_row(name, *(_cell(metric, summary[metric], total) for metric in columns))
     natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
     Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.load import load_policy_folder
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
 
 from .config import DT, TrialConfig
@@ -35,10 +34,10 @@ def draw_starts(env: ExplorationEnv, episode: int) -> np.ndarray:
     return np.concatenate([now["center"], now["pose"][:, 3:4]], axis=1).astype(float)
 
 
-def run_ours(env: ExplorationEnv, policy: str, episode: int) -> tuple[list[float], np.ndarray]:
-    """An evaluation episode: coverage every DT, the first at the start, and who has collided."""
+def run_ours(env: ExplorationEnv, choose: Callable, episode: int) -> tuple[list[float], np.ndarray]:
+    """An evaluation episode of a policy made for `env`: coverage every DT, the first at the start, and who has
+    collided."""
     curve: list[float] = []
-    choose = POLICIES[policy](env) if policy in POLICIES else load_policy_folder(policy, env)
     env.set_step_hook(lambda env: curve.append(env.snapshot()["coverage"]))
     now = _begin(env, episode)
     while not bool(now["done"]):

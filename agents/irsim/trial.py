@@ -61,7 +61,7 @@ class Moment:
 
 def run_trial(
     world: PointCloudMap,
-    policy: str,
+    policy: str | TeamPlanner,
     starts: np.ndarray,
     config: TrialConfig,
     watch: Callable[[Moment], None] | None = None,
@@ -70,14 +70,14 @@ def run_trial(
 
     Args:
         world: a floor.
-        policy: a name or folder that `TeamPlanner` knows.
+        policy: a name or folder that `TeamPlanner` knows, or who plans as one does.
         starts: x, y [m] and heading [rad].
         config: the team and what disturbs it.
         watch: called at every decision.
     """
     floor = make_floor(world)
     simulator = Simulator(floor, starts, config)
-    planner = TeamPlanner(
+    planner = policy if not isinstance(policy, str) else TeamPlanner(
         policy, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed,
         max_speed=config.max_speed, max_accel=config.max_accel, seconds=config.decide,
     )  # fmt: skip

@@ -24,6 +24,7 @@ TARGETS_MASK = ("agents", "observation", "targets_mask")
 COVERAGE = ("info", "coverage")
 PARAMS = ("agents", "params")
 SEEN = ("agents", "seen")  # each robot as one vector: what the policy made of its observation, for critics
+PREFERENCE = (*ACTION, "preference")  # the logits of targets: where a robot goes whose target another one has taken
 CELLS = ("agents", "cells")  # what `compact` made of the pictures: who learns from them need not pool them again
 REGION_HEADS = {"region": distributions.Categorical, "offset": IndependentNormal}
 TARGET_HEADS = {"target": distributions.Categorical}
@@ -72,7 +73,7 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
     return ObservationShape(
         channels=spec[MAP].shape[-3] if MAP in spec.keys(True, True) else 0,
         side=spec[GRID].shape[-1],
-        regions=(*ACTION, "region") in actions,
+        regions=(*ACTION, "control") not in actions,
     )
 
 
@@ -83,6 +84,8 @@ class ActionParams(nn.Module):
 
     Attributes:
         pools: the network looks at pooled pictures, which are then returned as well
+        shares: it returns every robot as one vector as well, for critics
+        ranks: its logits are those of targets, and go into the action as well
     """
 
     def __init__(self, network: nn.Module, heads: dict[str, type]):
@@ -91,10 +94,11 @@ class ActionParams(nn.Module):
         self.names = [(head, name) for head, kind in heads.items() for name in PARAM_NAMES[kind]]
         self.pools = pools_pictures(network)
         self.shares = getattr(network, "shares", False)
+        self.ranks = heads is TARGET_HEADS
 
     @property
     def out_keys(self) -> list[tuple[str, ...]]:
-        return [PARAMS, *([CELLS] if self.pools else []), *([SEEN] if self.shares else [])]
+        return [PARAMS] + [PREFERENCE] * self.ranks + [CELLS] * self.pools + [SEEN] * self.shares
 
     def forward(self, *observation: Tensor) -> TensorDict | tuple[TensorDict, Tensor]:
         if self.pools and not observation[0].is_floating_point():
@@ -105,7 +109,8 @@ class ActionParams(nn.Module):
             values, seen = self.network(*observation), None
         lead = observation[0].shape[: values[0].ndim - 2]
         params = TensorDict(dict(zip(self.names, values, strict=True)), batch_size=lead)
-        others = [observation[0]] * self.pools + [seen] * self.shares
+        ranks = [values[0].detach()] if self.ranks else []
+        others = ranks + [observation[0]] * self.pools + [seen] * self.shares
         return (params, *others) if others else params
 
 

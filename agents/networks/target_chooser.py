@@ -13,9 +13,10 @@ from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
-from maexp.envs.target_view import FEATURES
+from maexp.envs.target_view import FEATURES, first_if_none
 
 SCORE = FEATURES.index("score")
+NEARNESS = FEATURES.index("nearness")  # above 0 for every target
 OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
 NEVER = -1e9  # logit of what cannot be chosen
 PART = 96  # teams that are learned from together
@@ -117,7 +118,7 @@ class TargetChooser(nn.Module):
         some = first_if_none(mask)
         targets, robots = self.encoder(features, some, comm)
         logits = self.score_weight * features[..., SCORE] + OUTPUT_GAIN * self.head(targets).squeeze(-1)
-        seen = torch.cat((add_up(targets, mask), robots), dim=-1) if self.shares else robots
+        seen = torch.cat((add_up(targets, real_ones(features, mask)), robots), dim=-1) if self.shares else robots
         return logits.masked_fill(~some, NEVER), seen
 
 
@@ -150,7 +151,7 @@ class TargetReader(nn.Module):
     def _look(self, features: Tensor, mask: Tensor, comm: Tensor) -> Tensor:
         """Candidates and robots of teams [batch] as one vector a robot."""
         targets, robots = self.encoder(features, first_if_none(mask), comm)
-        return torch.cat((add_up(targets, mask), robots), dim=-1)
+        return torch.cat((add_up(targets, real_ones(features, mask)), robots), dim=-1)
 
 
 class SeenReader(nn.Module):
@@ -202,7 +203,6 @@ def add_up(targets: Tensor, mask: Tensor) -> Tensor:
     return (mask.unsqueeze(-2).to(targets.dtype) @ targets).squeeze(-2) / COUNT
 
 
-def first_if_none(mask: Tensor) -> Tensor:
-    """`mask` [*, M], with the first entry where there is none: it stands for driving anywhere."""
-    first = torch.arange(mask.shape[-1], device=mask.device) == 0
-    return mask | (first & ~mask.any(-1, keepdim=True))
+def real_ones(features: Tensor, mask: Tensor) -> Tensor:
+    """`mask` [*, M] without the first entry where it stands for driving anywhere: no features [*, M, F] tell of it."""
+    return mask & (features[..., NEARNESS] > 0)

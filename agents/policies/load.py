@@ -1,5 +1,6 @@
 """Policies by name or folder: classical planners, and trained ones that ship or were exported, rebuilt in torch."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,9 +13,7 @@ from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.export import find_chooser
 from maexp.agents.runtime.folder import AGAIN, WEIGHTS, Contract, read_checked, read_contract
 from maexp.agents.runtime.shipped import CONTRACT, find_policy, shipped_names
-from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import CommonSettings
 from maexp.envs import ExplorationEnv
 
 
@@ -37,35 +36,7 @@ def open_policy(
 
 def is_exported(word: str) -> bool:
     """Whether this is the name of a policy that ships, or a folder that `maexp export` wrote."""
-    return word in shipped_names() or (Path(word) / CONTRACT).is_file()
-
-
-def policy_name(word: str) -> str:
-    """What tables and files call a policy: its own name, or that of its folder."""
-    return word if word in POLICIES else Path(word).absolute().name
-
-
-def check_policies(words: list[str], setting: str = "policy") -> None:
-    """Raise UserError for a policy that is unknown or damaged, or two of one name."""
-    for word in words:
-        if word not in POLICIES:
-            open_policy(word, setting)
-    check_distinct(setting, [policy_name(word) for word in words])
-
-
-def show_targets(cfg: CommonSettings, words: Iterable[str], setting: str = "policy") -> None:
-    """Let the env of the settings show as many targets as the trained policies among `words` look at.
-
-    Raises:
-        UserError: they look at different numbers, or the settings show another one.
-    """
-    counts = {word: open_policy(word, setting)[1].candidates for word in words if word not in POLICIES}
-    if counts:
-        counts |= {"observation.targets": cfg.observation.targets} if cfg.observation.targets else {}
-        if len(set(counts.values())) > 1:
-            told = ", ".join(f"{word} {count}" for word, count in counts.items())
-            raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
-        cfg.observation.targets = next(iter(counts.values()))
+    return word in shipped_names() or os.path.isfile(Path(word) / CONTRACT)
 
 
 def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") -> ProbabilisticActor:

@@ -1,39 +1,28 @@
 """`python -m maexp.agents.runtime`: how long a plan takes on this computer, for every planner and shipped policy.
 
+`python -m maexp.agents.runtime simulate` lets a team explore a floor in closed loop, and counts what goes wrong.
 Policies need onnxruntime and are left out where it is not installed.
 """
 
 import argparse
 import importlib.util
+import logging
+import sys
 import time
 
 import numpy as np
 
 from maexp.agents.runtime import CHOICES, TeamPlanner, shipped_names
+from maexp.agents.runtime.floors import make_floor, place_team, read_floor
+from maexp.agents.runtime.simulate import MARKS, Course, Floor, explore
+
+ROOM = 8.0  # side of a room of our own floors [m]
 
 
-def make_floor(cells: int, room: int = 80, door: int = 10) -> np.ndarray:
-    """A square floor of rooms with doors, of which the right third is not known yet: [cells, cells] as ROS has it."""
-    grid = np.zeros((cells, cells), np.int8)
-    walls = np.append(np.arange(0, cells - 1, room), cells - 1)
-    grid[walls], grid[:, walls] = 100, 100
-    for middle in range(room // 2, cells, room):
-        for wall in walls[1:-1]:
-            grid[middle : middle + door, wall] = 0
-            grid[wall, middle : middle + door] = 0
-    grid[:, 2 * cells // 3 :] = -1
-    return grid
-
-
-def main() -> None:
+def measure(given: argparse.Namespace) -> None:
     """Print milliseconds a plan, the middle and the longest of several, in processor time of one core."""
-    parser = argparse.ArgumentParser(prog="python -m maexp.agents.runtime", description=__doc__)
-    parser.add_argument("--metres", type=float, default=50.0, help="side of the floor [m]")
-    parser.add_argument("--resolution", type=float, default=0.1, help="edge of a cell [m]")
-    parser.add_argument("--robots", type=int, default=3)
-    parser.add_argument("--calls", type=int, default=10, help="plans for each planner")
-    given = parser.parse_args()
     grid = make_floor(round(given.metres / given.resolution))
+    grid[:, 2 * len(grid) // 3 :] = -1  # not known yet
     poses = [(1.5 + 1.2 * (k % 5), 1.5 + 1.2 * (k // 5), 0.0) for k in range(given.robots)]
     print(f"{given.robots} robots, {grid.shape[1]} x {grid.shape[0]} cells of {given.resolution:g} m")
     trained = shipped_names() if importlib.util.find_spec("onnxruntime") else []
@@ -44,6 +33,105 @@ def main() -> None:
             plan = planner.plan(grid, given.resolution, (0.0, 0.0), poses, now=0.1 * now)
             spent.append(1e3 * (time.process_time() - begin))
         print(f"{name:<18}{np.median(spent):7.0f} ms, at most {max(spent):.0f} ms, {len(plan.targets)} targets")
+
+
+def simulate(given: argparse.Namespace) -> None:
+    """Print how a team explores a floor: one line for each policy and run."""
+    logging.getLogger("maexp.runtime").setLevel(logging.INFO if given.notes else logging.ERROR)
+    if given.floor is None:
+        cell = given.resolution
+        grid = make_floor(round(given.metres / cell), round(ROOM / cell), max(round(1.0 / cell), 1))
+    else:
+        grid, cell = read_floor(given.floor, given.resolution)
+    size = f"{grid.shape[1] * cell:.0f} x {grid.shape[0] * cell:.0f} m, {(grid == 0).sum() * cell**2:.0f} m2 free"
+    print(f"{given.floor or 'rooms'}: {size}; {given.robots} robots of {given.radius:g} m start together")
+    for policy in given.policy.split(","):
+        for seed in range(given.seed, given.seed + given.runs):
+            first = np.random.default_rng(seed) if given.start is None else np.array(given.start)
+            places = place_team(grid, cell, given.radius, given.robots, first)
+            floor = Floor(grid, cell, places, given.radius, given.range, given.speed)
+            planner = TeamPlanner(
+                policy, radar_range=given.range, robot_radius=given.radius, max_speed=given.speed, seconds=1.0,
+                bounded=True, distinct=given.distinct, spare=given.spare, seed=seed,
+            )  # fmt: skip
+            course = explore(floor, planner, given.seconds)
+            print(describe(policy, seed, course), flush=True)
+            if given.notes:
+                print("".join(f"    {one}\n" for one in course.notes), end="")
+            if given.picture:
+                draw(given.picture, floor, course)
+
+
+def describe(policy: str, seed: int, course: Course) -> str:
+    """A course in a line."""
+    marks = ", ".join(f"{100 * mark:g} % " + (f"{when:.0f} s" if np.isfinite(when) else "never")
+                      for mark, when in zip(MARKS, course.reached, strict=True))  # fmt: skip
+    end = f"done after {course.seconds:.0f} s" if course.done else f"broken off after {course.seconds:.0f} s"
+    return (
+        f"{policy:<17} seed {seed}: {marks}; {end}, {100 * course.share:.1f} % seen; {course.driven:.0f} m driven; "
+        f"needless duplicates {course.needless}, close goals {course.close}, waits {course.waits}"
+    )
+
+
+def draw(path: str, floor: Floor, course: Course) -> None:
+    """The floor, what was seen, and the robots' ways, as a picture."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # late: robots need it not
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 9), dpi=100, layout="constrained")
+    axes, (height, width) = figure.add_subplot(), floor.grid.shape
+    shade = np.where(floor.grid != 0, 0.0, np.where(floor.seen, 1.0, 0.7))
+    extent = (0.0, width * floor.cell, 0.0, height * floor.cell)
+    axes.imshow(shade, cmap="gray", origin="lower", extent=extent, vmin=0.0, vmax=1.0)
+    for robot in range(course.tracks.shape[1]):
+        (line,) = axes.plot(*course.tracks[:, robot].T, linewidth=1.2)
+        axes.plot(*course.tracks[0, robot], "o", color=line.get_color())
+        axes.plot(*course.tracks[-1, robot], "s", color=line.get_color())
+    axes.set_title(f"{100 * course.share:.1f} % seen in {course.seconds:.0f} s; from dots to squares")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    FigureCanvasAgg(figure).print_png(path)
+
+
+def read_words(words: list[str]) -> argparse.Namespace:
+    """The command line."""
+    simulates = bool(words) and words[0] == "simulate"
+    parser = argparse.ArgumentParser(
+        prog="python -m maexp.agents.runtime" + " simulate" * simulates,
+        description=simulate.__doc__ if simulates else __doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--metres", type=float, default=24.0 if simulates else 50.0, help="side of the floor [m]")
+    parser.add_argument("--resolution", type=float, default=0.1, help="edge of a cell, at least [m]")
+    parser.add_argument("--robots", type=int, default=3)
+    if simulates:
+        parser.add_argument("floor", nargs="?", help="a map_server yaml; default: rooms of our own")
+        parser.add_argument("--policy", default="cost_utility", help="one or several: cost_utility,universal")
+        parser.add_argument("--start", type=float, nargs=2, help="x y [m] that the team begins at; default: drawn")
+        parser.add_argument("--radius", type=float, default=0.35, help="of a robot [m]")
+        parser.add_argument("--range", type=float, default=6.0, help="of its lidar [m]")
+        parser.add_argument("--speed", type=float, default=0.6, help="[m/s]")
+        parser.add_argument("--seconds", type=float, default=1800.0, help="broken off after so many")
+        parser.add_argument("--seed", type=int, default=0, help="of starts and of choices at random")
+        parser.add_argument("--runs", type=int, default=1, help="from so many places, one seed after the other")
+        parser.add_argument("--spare", default="wait", help="robots without a target: wait, or home")
+        parser.add_argument("--together", dest="distinct", action="store_false", help="robots may share a target")
+        parser.add_argument("--notes", action="store_true", help="print what the planner says")
+        parser.add_argument("--picture", help="file to draw the last run in (.png)")
+    else:
+        parser.add_argument("--calls", type=int, default=10, help="plans for each planner")
+    given = parser.parse_args(words[1:] if simulates else words)
+    given.run = simulate if simulates else measure
+    return given
+
+
+def main() -> None:
+    """Do what the command line says; what cannot be done is one sentence."""
+    given = read_words(sys.argv[1:])
+    try:
+        given.run(given)
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""Which target each robot takes: the classical planners of `maexp.agents.policies`, for one team in NumPy."""
+"""What robots think of targets: the classical planners of `maexp.agents.policies`, for one team in NumPy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -18,72 +17,68 @@ RRT_SAMPLES = 512
 RRT_HYSTERESIS = 1.5  # rrt_frontiers: gain of targets within a radar range counts this much more
 DECAY = 1.0  # potential_field: a target pulls with its frontier cells over its way to this power
 REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pulls of a target there
-FAR = 1e12  # stands for no way where numbers must be finite
+UNREACHABLE = 1e12  # stands for no way where numbers must be finite [m]
+FAR = 1e5  # longer than any way [m]: puts targets that a robot takes for want of better ones behind all others
 
 
-def prefer(scene: Scene) -> Scene:
-    """`scene` without the targets that offer little, for robots that can get to one that offers more."""
-    kept = np.where(scene.gain >= LEAST_GAIN, scene.travel, np.float32(np.inf))
-    return replace(scene, travel=np.where(np.isfinite(kept).any(-1, keepdims=True), kept, scene.travel))
-
-
-def choose_nearest(scene: Scene) -> np.ndarray:
+def rank_nearest(scene: Scene) -> np.ndarray:
     """Each robot its nearest target (Yamauchi 1997)."""
-    return prefer(scene).travel.argmin(-1)
+    return rank(scene, -scene.travel, _worthwhile(scene))
 
 
-def choose_by_utility(scene: Scene) -> np.ndarray:
+def rank_by_utility(scene: Scene) -> np.ndarray:
     """Unknown area around the target against the way there; a target taken lowers what others near it offer."""
     gain = np.broadcast_to(scene.gain, scene.travel.shape)
-    return _choose_in_turn(scene, gain, value_targets(gain, scene.travel, scene.radar_range))
+    return _rank_in_turn(scene, gain, np.isfinite(scene.travel))
 
 
-def _choose_in_turn(scene: Scene, gain: np.ndarray, value: np.ndarray) -> np.ndarray:
+def _rank_in_turn(scene: Scene, gain: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """The values of the targets `among` all when it is their robot's turn (`plan_in_turn`)."""
+    value = np.where(among, value_targets(gain, scene.travel, scene.radar_range), -np.inf)
     points = np.broadcast_to(scene.points / scene.radar_range, (*gain.shape, 2))
-    return plan_in_turn(gain, value, points)[1]
+    return rank(scene, plan_in_turn(gain, value, points)[0], among)
 
 
-def choose_by_area(scene: Scene) -> np.ndarray:
+def rank_by_area(scene: Scene) -> np.ndarray:
     """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
-    scene = prefer(scene)
-    own = scene.travel.argmin(0) == np.arange(len(scene.at))[:, None]
-    mine = np.where(own, scene.travel, np.inf)
-    return np.where(np.isfinite(mine).any(-1), mine.argmin(-1), scene.travel.argmin(-1))
+    worth = _worthwhile(scene)
+    travel = np.where(worth, scene.travel, np.inf)
+    mine = worth & (travel.argmin(0) == np.arange(len(scene.at))[:, None])
+    mine |= ~mine.any(-1, keepdims=True)
+    return rank(scene, np.where(mine, -travel, -FAR - travel), worth)
 
 
-def choose_by_assignment(scene: Scene) -> np.ndarray:
+def rank_by_assignment(scene: Scene) -> np.ndarray:
     """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
-    scene = prefer(scene)
-    chosen = scene.travel.argmin(-1)
-    robot, target = linear_sum_assignment(np.where(np.isfinite(scene.travel), scene.travel, FAR))
-    can = np.isfinite(scene.travel[robot, target])
-    chosen[robot[can]] = target[can]
-    return chosen
+    worth = _worthwhile(scene)
+    score = -scene.travel
+    robot, target = linear_sum_assignment(np.where(worth, scene.travel, UNREACHABLE))
+    score[robot, target] = FAR
+    return rank(scene, score, worth)
 
 
-def choose_by_force(scene: Scene) -> np.ndarray:
+def rank_by_force(scene: Scene) -> np.ndarray:
     """The target whose way starts off closest to the force: pulls along the ways, pushes between robots.
 
     As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
     """
-    scene = prefer(scene)
-    reached = np.isfinite(scene.travel)
+    worth = _worthwhile(scene)
     cells = np.tile(scene.targets.cell, (len(scene.at), 1))
     first = cells_ahead(scene.passable, scene.distance, cells, 3.0)
     ways = scene.grid.centers(np.maximum(first, 0)) - scene.at[:, None]
     ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-6)
     with np.errstate(invalid="ignore"):
-        pull = np.where(reached, scene.targets.size / np.maximum(scene.travel / scene.grid.cell, 1.0) ** DECAY, 0.0)
+        pull = np.where(worth, scene.targets.size / np.maximum(scene.travel / scene.grid.cell, 1.0) ** DECAY, 0.0)
     force = (pull[..., None] * ways).sum(1)
     apart = scene.at[:, None] - scene.at
     gap = np.maximum(np.linalg.norm(apart, axis=-1, keepdims=True), 1e-6)
     push = REPULSION * np.maximum(1.0 - gap / scene.radar_range, 0.0)
     force += pull.sum(-1, keepdims=True) * (push * apart / gap).sum(1)
     along = (ways * force[:, None]).sum(-1) / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-6)
-    return np.where(reached, pull * (1.0 + along), -np.inf).argmax(-1)
+    return rank(scene, pull * (1.0 + along), worth)
 
 
-def choose_by_tree(scene: Scene) -> np.ndarray:
+def rank_by_tree(scene: Scene) -> np.ndarray:
     """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
     ends = _grow_trees(scene)
     shift = scene.targets.block_of(ends % scene.grid.width, ends // scene.grid.width)
@@ -91,8 +86,7 @@ def choose_by_tree(scene: Scene) -> np.ndarray:
     found |= ~found.any(-1, keepdims=True)  # no tree of the team found any: all frontiers count
     near = np.linalg.norm(scene.points - scene.at[:, None], axis=-1) <= scene.radar_range
     gain = (scene.gain * np.where(near, RRT_HYSTERESIS, 1.0)).astype(np.float32)
-    value = value_targets(gain, scene.travel, scene.radar_range)
-    return _choose_in_turn(scene, gain, np.where(found, value, -np.inf))
+    return _rank_in_turn(scene, gain, found & np.isfinite(scene.travel))
 
 
 def _grow_trees(scene: Scene) -> np.ndarray:
@@ -129,7 +123,7 @@ def _grow_trees(scene: Scene) -> np.ndarray:
     return np.array(ends, np.int64)
 
 
-def choose_any(scene: Scene) -> np.ndarray:
+def rank_any(scene: Scene) -> np.ndarray:
     """Each robot any target that it can get to, and that one again as long as it is there."""
     start = scene.rng.bit_generator.seed_seq.entropy
     draw = [
@@ -137,16 +131,29 @@ def choose_any(scene: Scene) -> np.ndarray:
         for robot in scene.robots.tolist()
         for block in (scene.targets.block + STRIDE).tolist()
     ]
-    return np.where(np.isfinite(scene.travel), np.reshape(draw, scene.travel.shape), -1.0).argmax(-1)
+    return rank(scene, np.reshape(draw, scene.travel.shape), np.isfinite(scene.travel))
+
+
+def _worthwhile(scene: Scene) -> np.ndarray:
+    """Targets in reach, bool [n, K]; those that offer little only for robots that get to none that offers more."""
+    reached = np.isfinite(scene.travel)
+    worth = reached & (scene.gain >= LEAST_GAIN)
+    return np.where(worth.any(-1, keepdims=True), worth, reached)
+
+
+def rank(scene: Scene, score: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Targets by their `score` where they are `among` those that count, the others in reach behind, -inf the rest."""
+    reached = np.isfinite(scene.travel)
+    return np.where(among & reached, score, np.where(reached, -2.0 * FAR - scene.travel, -np.inf))
 
 
 CHOICES: dict[str, Callable[[Scene], np.ndarray]] = {
-    "random": choose_any,
-    "nearest_frontier": choose_nearest,
-    "cost_utility": choose_by_utility,
-    "potential_field": choose_by_force,
-    "rrt_frontiers": choose_by_tree,
-    "voronoi": choose_by_area,
-    "hungarian": choose_by_assignment,
+    "random": rank_any,
+    "nearest_frontier": rank_nearest,
+    "cost_utility": rank_by_utility,
+    "potential_field": rank_by_force,
+    "rrt_frontiers": rank_by_tree,
+    "voronoi": rank_by_area,
+    "hungarian": rank_by_assignment,
 }
-"""Name -> `Scene` to the target of each robot, int64 [N]; what is infinitely far does not count as chosen."""
+"""Name -> `Scene` to what each robot thinks of each target, float [n, K]; -inf: out of reach."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .choices import rank
 from .features import FEATURES, Candidates, Motion, list_candidates
 from .scene import Scene
 from .shipped import CONTRACT
@@ -46,7 +47,7 @@ class Contract:
 
 
 class LearnedChoice:
-    """Chooses among targets as a trained policy does, the likeliest each.
+    """Thinks of targets as a trained policy does, the likeliest first.
 
     Args:
         folder: where it lies.
@@ -87,11 +88,17 @@ class LearnedChoice:
         }
         return self.session.run(["logits"], inputs)[0][0]
 
-    def choose(self, scene: Scene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
-        """The target of every robot, int64 [n]; the arguments of `list_candidates`."""
+    def rank(self, scene: Scene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
+        """What every robot thinks of every target, float [n, K]; the arguments of `list_candidates`.
+
+        Targets that the policy was not shown come behind the others.
+        """
         candidates = list_candidates(scene, self.contract.candidates, heading, speed, last, time_left, motion)
-        best = np.where(candidates.mask, self.logits(candidates), -np.inf).argmax(-1)
-        return candidates.target[np.arange(len(best)), best]
+        logits, shown = np.zeros(scene.travel.shape), np.zeros(scene.travel.shape, bool)
+        robot, place = np.nonzero(candidates.mask)
+        target = candidates.target[robot, place]
+        logits[robot, target], shown[robot, target] = self.logits(candidates)[robot, place], True
+        return rank(scene, logits, shown)
 
 
 def read_contract(folder: Path) -> Contract:

@@ -8,19 +8,23 @@ import time
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from .choices import CHOICES
+from .coarse import coarsen
 from .features import Motion
 from .folder import Contract, LearnedChoice
 from .grid import FREE, MAX_CELLS, KnownGrid, read_grid
 from .scene import Scene, look_at
+from .sharing import Shares
 from .shipped import find_policy
 from .team import Team, read_team
 from .watch import Watch
-from .ways import trace
+from .ways import UNREACHED, snap, trace
 
+SPARE = ("wait", "home")
 LOG = logging.getLogger("maexp.runtime")
 DEFAULTS = Contract("", 1, radar_range=5.0, robot_radius=0.3, motion=Motion(1.0, 1.0, 1.0))
 
@@ -33,6 +37,7 @@ class Plan:
         names: keys of the poses, or 0 to N - 1.
         goals: float64 [N, 2]; where a robot stands if it has nowhere to go, NaN if its pose is not known.
         active: bool [N], robots that have somewhere to go: their goals lie on known free ground that they get to.
+        waits: bool [N], robots that are to stop where they are: others have the targets that are left.
         ways: float64 [k, 2] each, corners of the way from a robot to its goal; k = 0 for robots that stay.
         targets: float64 [K, 2], all places that were chosen from, for drawing.
         done: nothing is left that a robot could get to and see more from.
@@ -42,6 +47,7 @@ class Plan:
     names: tuple[Hashable, ...]
     goals: np.ndarray
     active: np.ndarray
+    waits: np.ndarray
     ways: list[np.ndarray]
     targets: np.ndarray
     done: bool
@@ -65,6 +71,9 @@ class TeamPlanner:
         pause: how long a target is given up for the first time; longer every time, the third for good [s].
         max_speed, max_accel, seconds: of the robots [m/s, m/s^2], and between two calls [s]; only trained policies look
             at them; None: as the policy was trained.
+        distinct: robots go to different targets, farther apart than their bodies; else each goes where it likes best.
+        spare: what robots do for which no target is left then: "wait" where they are, or drive "home" to where they
+            were first seen.
         seed: of choices at random.
     """
 
@@ -83,8 +92,13 @@ class TeamPlanner:
         max_speed: float | None = None,
         max_accel: float | None = None,
         seconds: float | None = None,
+        distinct: bool = True,
+        spare: Literal["wait", "home"] = "wait",
         seed: int = 0,
     ):
+        if spare not in SPARE:
+            raise ValueError(f"spare={spare!r} is unknown: choose {' or '.join(SPARE)}")
+        self.distinct, self.spare = distinct, spare
         known = isinstance(policy, str) and policy in CHOICES
         self.learned = None if known else LearnedChoice(find_policy(policy, CHOICES))
         self.policy, self.bounded, self.seed = policy, bounded, _whole("seed", seed)
@@ -108,6 +122,7 @@ class TeamPlanner:
         self.rng = np.random.default_rng(self.seed)
         self.anchor: KnownGrid | None = None  # blocks of targets are counted from its corner
         self.last: dict[Hashable, np.ndarray] = {}  # where each robot's latest target was in the map's frame
+        self.home: dict[Hashable, np.ndarray] = {}  # where each robot was first seen there
         self.said: frozenset[str] = frozenset()
 
     def plan(
@@ -145,16 +160,17 @@ class TeamPlanner:
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
         _check_reach(reach, known)
+        known = coarsen(known, team.radius.min(initial=math.inf))
         time_left = min(max(_finite("time_left", time_left), 0.0), 1.0)
         scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
             notes.append("the grid holds no free cell yet: robots stay where they are")
             return self._finish(_stay(team, notes))
         notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
-        chosen, events = self._choose(team, scene, time_left)
-        plan = _describe(team, scene, chosen, notes + events)
+        shares, events = self._choose(team, scene, time_left)
+        plan = _describe(team, scene, shares.taken, notes + events)
         self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
-        return self._finish(plan)
+        return self._finish(self._send_away(plan, team, scene, shares))
 
     def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> Scene:
         shift = self._shift(grid, notes)
@@ -172,37 +188,70 @@ class TeamPlanner:
         x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
         return int(x), int(y)
 
-    def _choose(self, team: Team, scene: Scene, time_left: float) -> tuple[np.ndarray, list[str]]:
-        """The target of each robot of the scene, int64 [n], -1 = none; and what happened."""
+    def _choose(self, team: Team, scene: Scene, time_left: float) -> tuple[Shares, list[str]]:
+        """The target of each robot of the scene, and what happened."""
         notes = []
         allowed = self.watch.allowed(team, scene.robots, scene.targets)
         if not np.isfinite(scene.travel[allowed]).any() and self.watch.try_again():
             notes.append("nothing else is left: what was given up is tried once more")
             allowed = self.watch.allowed(team, scene.robots, scene.targets)
         travel = np.where(allowed, scene.travel, np.inf).astype(np.float32)
-        chosen = np.full(len(scene.robots), -1)
-        if not travel.size:
-            return chosen, notes
-        parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots])
-        if not parked.all():
-            chosen[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left)
-        chosen[parked] = scene.travel[parked].argmin(-1)
+        parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots], bool)
+        preference = np.full(travel.shape, -np.inf)
+        if travel.size and not parked.all():
+            preference[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left)
         travel[parked] = scene.travel[parked]
-        chosen[~np.isfinite(travel[np.arange(len(chosen)), chosen])] = -1
-        chosen, events = self.watch.settle(
-            team, scene.robots, scene.targets, travel, chosen, scene.radar_range
-        )
-        return chosen, notes + events
+        preference[parked] = -travel[parked]
+        preference[~np.isfinite(travel)] = -np.inf
+        held = self.watch.held(team, scene.robots, scene.targets)
+        rows = np.flatnonzero(held >= 0)
+        rows = rows[np.isfinite(travel[rows, held[rows]])]
+        preference[rows, held[rows]] = np.inf
+        shares = Shares(preference, travel, scene.points, team.radius[scene.robots], self.distinct)
+        some = shares.reached.any(-1)
+        shares.settle_for(np.flatnonzero(some & ~parked))
+        for row in np.flatnonzero(some & parked):  # who stands still takes nothing away from the others
+            if (free := shares.free(row)).any():
+                shares.taken[row] = np.where(free, travel[row], np.inf).argmin()
+        notes += self.watch.settle(team, scene.robots, scene.targets, travel, shares, scene.radar_range)
+        return shares, notes
 
     def _ask(self, team: Team, scene: Scene, time_left: float) -> np.ndarray:
-        """What the policy chooses for each robot of the scene, int64 [n]."""
+        """What the policy thinks of each target for each robot of the scene, float [n, K]."""
         if self.learned is None:
             return CHOICES[self.policy](scene)
         robots = scene.robots
         last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
         heading = team.yaw[robots] - scene.grid.yaw
         last = scene.grid.from_map(last)
-        return self.learned.choose(scene, heading, team.speed[robots], last, time_left, self.motion)
+        return self.learned.rank(scene, heading, team.speed[robots], last, time_left, self.motion)
+
+    def _send_away(self, plan: Plan, team: Team, scene: Scene, shares: Shares) -> Plan:
+        """The plan with what robots do for which no target is left."""
+        for robot in np.flatnonzero(np.isfinite(team.at).all(-1)):
+            self.home.setdefault(team.names[robot], team.at[robot].copy())
+        notes = []
+        for row in np.flatnonzero(shares.reached.any(-1) & (shares.taken < 0)):
+            robot = scene.robots[row]
+            way = self._way_home(team, scene, row) if self.spare == "home" else None
+            plan.waits[robot] = way is None
+            if way is not None:
+                plan.ways[robot], plan.goals[robot], plan.active[robot] = way, way[-1], True
+            does = "waits" if way is None else "drives home"
+            notes.append(f"{team.title(robot)} {does}: the others have the targets that are left")
+        return replace(plan, notes=(*plan.notes, *notes))
+
+    def _way_home(self, team: Team, scene: Scene, row: int) -> np.ndarray | None:
+        """Corners of the way to where a robot was first seen, [k, 2]; None where it is there or gets nowhere near."""
+        robot = scene.robots[row]
+        home = self.home[team.names[robot]]
+        cell = int(scene.grid.cells(scene.grid.from_map(home)))
+        cell = -1 if cell < 0 else snap(scene.passable[row], cell)
+        near = np.linalg.norm(team.at[robot] - home) <= team.radius[robot]
+        if near or cell < 0 or scene.distance[row].flat[cell] >= UNREACHED:
+            return None
+        cells = trace(scene.passable[row], scene.distance[row], cell)
+        return np.concatenate([team.at[robot][None], scene.grid.to_map(scene.grid.centers(cells))])
 
     def _finish(self, plan: Plan) -> Plan:
         """Log what has not been said in the call before."""
@@ -232,6 +281,7 @@ def _stay(team: Team, notes: list[str]) -> Plan:
         names=team.names,
         goals=team.at.copy(),
         active=np.zeros(count, bool),
+        waits=np.zeros(count, bool),
         ways=[np.zeros((0, 2))] * count,
         targets=np.zeros((0, 2)),
         done=False,

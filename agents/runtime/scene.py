@@ -77,7 +77,7 @@ def look_at(
         rng: for choices at random.
         notes: robots that are left out are added, a sentence each.
     """
-    robots, passable, distance = _find_ways(grid, team, clearance_factor, notes)
+    robots, passable, distance = find_ways(grid, team, clearance_factor, notes)
     radius = team.radius[robots]
     search = math.ceil(np.float32(radius.max(initial=0.0)) / np.float32(grid.cell) + np.float32(MARGIN_CELLS)) + 1
     targets = list_targets(
@@ -111,7 +111,7 @@ def look_at(
     )
 
 
-def _find_ways(grid: KnownGrid, team: Team, clearance_factor: float, notes: list[str]):
+def find_ways(grid: KnownGrid, team: Team, clearance_factor: float, notes: list[str]):
     """The robots that have a place on the grid, and where each can get to."""
     gaps = gap_squares(grid.known)
     sizes, which = np.unique(team.radius, return_inverse=True)

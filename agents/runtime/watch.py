@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .frontiers import Targets
+from .sharing import Shares
 from .team import Team
 
 LOG = logging.getLogger("maexp.runtime")
@@ -164,27 +165,31 @@ class Watch:
             self.given[key] = (self.now, self.given[key][1])
         return bool(waiting)
 
-    def settle(self, team: Team, robots: np.ndarray, targets: Targets, travel: np.ndarray, chosen: np.ndarray, room):
-        """The targets that robots are to have, int64 [n], -1 = none, and what was changed, in sentences.
+    def held(self, team: Team, robots: np.ndarray, targets: Targets) -> np.ndarray:
+        """Targets that robots go on with after they were caught going back and forth, int64 [n]; -1 = none."""
+        number = {block: k for k, block in enumerate(targets.keys())}
+        return np.array([number.get(self.tracks[team.names[robot]].hold, -1) for robot in robots], np.int64)
+
+    def settle(
+        self, team: Team, robots: np.ndarray, targets: Targets, travel: np.ndarray, shares: Shares, room: float
+    ) -> list[str]:
+        """Write down the targets that robots get, and change those of robots that go back and forth; returns what was
+        changed, in sentences.
 
         Args:
             travel: [n, K], infinite where a target is not to be taken [m].
-            chosen: int64 [n], what the policy chose; -1 = none.
+            shares: who has which.
             room: a robot that changes its mind within so many metres goes back and forth.
         """
-        blocks, notes = targets.keys(), []
+        blocks, notes, chosen = targets.keys(), [], shares.taken
         number = {block: k for k, block in enumerate(blocks)}
-        chosen = chosen.copy()
         for row, robot in enumerate(robots):
             track = self.tracks[team.names[robot]]
-            held = number.get(track.hold, -1)
-            if held >= 0 and np.isfinite(travel[row, held]):
-                chosen[row] = held
-            else:
-                track.hold = None
             block = blocks[chosen[row]] if chosen[row] >= 0 else None
+            if block != track.hold:
+                track.hold = None
             if self._swings(track, block, team.at[robot], room, number):
-                chosen[row] = travel[row].argmin()
+                chosen[row] = np.where(shares.free(row), travel[row], np.inf).argmin()
                 track.hold = blocks[chosen[row]]
                 self._give_up(team.names[robot], track.block if track.hold == block else block)
                 block = track.hold
@@ -193,7 +198,7 @@ class Watch:
                 track.best, track.best_since = math.inf, self.now
                 track.past = [*track.past[2 - 2 * PERIODS[-1] :], (block, team.at[robot])] if block else track.past
             track.block = block
-        return chosen, notes
+        return notes
 
     @staticmethod
     def _swings(track: Track, block: Block | None, at: np.ndarray, room: float, present: Container[Block]) -> bool:

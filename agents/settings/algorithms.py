@@ -48,7 +48,8 @@ class Settings:
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings."""
-        names = ("entropy_coeff", "critic_coeff", "normalize_advantage", "mask_collided")
+        names = ("gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage")
+        names += ("mask_collided",)
         return {name: getattr(self, name) for name in names}
 
 

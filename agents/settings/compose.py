@@ -3,7 +3,6 @@
 import difflib
 import re
 from importlib import resources
-from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -13,9 +12,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_seed
-from maexp.agents.settings.legacy import old_defaults
-from maexp.agents.settings.overrides import rename, without
-from maexp.agents.settings.resolved import flatten, plain
 from maexp.agents.settings.runs import Recipe
 
 KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
@@ -58,14 +54,6 @@ def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
     return cfg
 
 
-def settings_of(saved: dict) -> dict[str, Any]:
-    """The values of a run of `maexp train` by their full names, however old its checkpoint is."""
-    if "settings" in saved:
-        return flatten(saved["settings"])
-    words = rename(without(saved["overrides"], "hydra"))
-    return flatten(plain(compose_config("train", [*old_defaults(words), *words])))
-
-
 def compose_config(verb: str, overrides: list[str]) -> DictConfig:
     """The composed settings of a verb, with Hydra's own under `hydra`.
 
@@ -74,7 +62,6 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
     """
     from maexp.agents.settings.schema import register_schema
 
-    overrides = rename(overrides)
     register_schema(verb)
     GlobalHydra.instance().clear()
     try:
@@ -85,7 +72,7 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
         raise UserError(explain(error, verb)) from error
     if missing:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
-    if "seed" in cfg:
+    if cfg.get("seed") is not None:
         check_seed(cfg.seed)
     return cfg
 

@@ -1,5 +1,6 @@
 """From the words of a command line to Hydra overrides: paths and lists are quoted, so that any file name works."""
 
+import os
 import re
 from pathlib import Path
 
@@ -11,13 +12,15 @@ from maexp.agents.settings.schema import schema
 from maexp.envs.config import STARTS
 
 PATHS = (
-    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results",
+    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results", "suite",
     "hydra.run.dir", "hydra.sweep.dir",
 )  # fmt: skip
-RENAMED = {"algorithm.preset": "tuning", "model.preset": "model", "planner.name": "planner"}
-"""Settings that are groups now: a choice brings all its values."""
+WORDS = (("suite", "policy"),)
+"""Commands of other programs, taken as they stand."""
+POLICIES = {"evaluate": "policy", "benchmark": "policies policy", "train": "classical"}
+"""Settings that name several policies, by the verb: names, folders, module:function."""
 LISTS = {
-    "train": ("num_robots",),
+    "train": ("num_robots", "classical"),
     "export": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
     "bench": ("num_robots", "axes"),
@@ -68,7 +71,7 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
 
 
 def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
-    if name in PATHS and value not in ("", "null") and not _is_quoted(value):
+    if (name in PATHS or (verb, name) in WORDS) and value not in ("", "null") and not _is_quoted(value):
         if multirun and "," in value and not Path(value).exists():
             return f"{name}={value}"
         if name == "scenario.starts" and value not in STARTS:  # kept with the run, as the next
@@ -76,6 +79,8 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
             value = ",".join(str(Path(one).expanduser().absolute()) for one in split_paths(value))
         return f"{name}={quote(value)}"
+    if not multirun and name in POLICIES.get(verb, "").split() and not OPERATOR.match(value):
+        return f"{name}={quote_policies(value, verb == 'benchmark')}"
     if not multirun and name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
     for word in (f"{name}={value}", f"{name}={quote(value)}"):
@@ -85,6 +90,26 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         except (OverrideParseException, HydraException):
             continue
     raise UserError(f"{name}={value} cannot be read as a setting: write name=value (see maexp {verb} --help).")
+
+
+OPERATOR = re.compile(r"\[?\s*['\"$]|(null|\[\s*\])?$")
+"""Values that Hydra reads by itself: quoted ones, references, nothing."""
+
+
+def quote_policies(value: str, absolute: bool) -> str:
+    """One policy or several, `a,b` or `[a,b]`, each quoted, so that any folder's name works.
+
+    Args:
+        absolute: write folders as such from the root: they are kept, and gone on with from elsewhere.
+    """
+    single = os.path.exists(value)
+    listed = not single and ("," in value or value.startswith("["))
+    words = value.removeprefix("[").removesuffix("]").split(",") if listed else [value]
+    words = [word.strip() for word in words]
+    if absolute:  # a name of ours is one even where a folder is called the same
+        words = [str(Path(word).absolute()) if os.sep in word and os.path.exists(word) else word for word in words]
+    quoted = [quote(word) if not re.fullmatch(r"[\w.]+", word) else word for word in words]
+    return f"[{','.join(quoted)}]" if listed else quoted[0]
 
 
 def split_paths(text: str) -> list[str]:
@@ -97,12 +122,6 @@ def split_paths(text: str) -> list[str]:
     parts = [one.strip() for one in text.split(",") if one.strip()]
     single = Path(text).expanduser().exists() or not all(Path(one).suffix for one in parts)
     return [text] if single else parts
-
-
-def rename(overrides: list[str]) -> list[str]:
-    """`overrides` with the groups that took the place of single settings."""
-    parts = [word.partition("=") for word in overrides]
-    return [f"{RENAMED.get(name, name)}{sign}{value}" for name, sign, value in parts]
 
 
 def quote(text: str) -> str:

@@ -7,17 +7,20 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.settings.algorithms import Settings, find_tunings
+from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, describe, given, schema
 from maexp.envs.config import (
     CommConfig,
+    LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
     RobotConfig,
+    TargetsConfig,
     complete_planner,
     complete_radar,
     complete_robot,
@@ -56,14 +59,21 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
     elif "scenario" in settings:
         row = find_scenario(maps[0].scenario if maps else cfg.scenario.name)
         known = maps is not None or row.build is not None
-        settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
         if known:
             settings["robot"] |= _resolve_robot(cfg, row)
             settings["radar"] = asdict(complete_radar(RadarConfig(**given(cfg.radar)), row))
+        settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
+        if maps and not settings["scenario"]["macro_steps"]:
+            settings["scenario"]["macro_steps"] = default_macro_steps(
+                maps, row, _paces(settings), settings["scenario"]["local_steps"]
+            )
+        if known:
             settings["planner"] = _resolve_planner(cfg, row)
         settings["reward"] = asdict(RewardConfig(**given(cfg.reward)))
         settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
         settings["comm"] = asdict(CommConfig(**given(cfg.comm)))
+        settings["targets"] = asdict(TargetsConfig(**given(cfg.targets)))
+        settings["lookahead"] = asdict(LookaheadConfig(**given(cfg.lookahead)))
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -76,13 +86,20 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
 
 def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | None) -> dict[str, Any]:
     settings = {"local_steps": scenario.local_steps or row.local_steps}
-    fallback = default_macro_steps(maps, row) if maps and not row.macro_steps else row.macro_steps
-    settings["macro_steps"] = scenario.macro_steps or fallback
+    settings["macro_steps"] = scenario.macro_steps or row.macro_steps
     if find_scenario(scenario.name).build is None:
         return settings | {"importing": asdict(ImportOptions(**given(scenario.importing)))}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
     settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
     return settings | {"importing": None}
+
+
+def _paces(settings: dict[str, Any]) -> list[tuple[float, float]]:
+    """Speed [m/s] and radar range [m] of every robot of the smallest team."""
+    robot, radar = settings["robot"], settings["radar"]
+    team = robot["team"] or [robot | {"radar": radar}]
+    count = min(team_sizes(plain_value(settings.get("num_robots", 3))))
+    return [(one["max_speed"], one["radar"]["range"]) for one in (team[i % len(team)] for i in range(count))]
 
 
 def plain_value(value: Any) -> Any:

@@ -5,7 +5,6 @@
 - Values that the scenario had supplied follow a new scenario; those that the run's own words had set stay.
 """
 
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,14 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from maexp.agents.errors import UserError
-from maexp.agents.settings.legacy import old_defaults
-from maexp.agents.settings.overrides import find_override, rename, without
+from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import schema
 
-GROUPS = ("scenario", "robot", "radar", "planner", "reward", "observation", "comm", "algorithm", "model")
+GROUPS = (
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "algorithm",
+    "model",
+)  # fmt: skip
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
 CALLED = {"radar.range": "radar_range", "robot.length": "body_length", "robot.width": "body_width"}
 """What the scenario calls them, where that is another name."""
@@ -32,7 +33,7 @@ class Recipe:
 
     Attributes:
         words: overrides in the order of the command line, those of a run first
-        defaults: overrides in front of these: defaults as they were when the run was started
+        defaults: overrides in front of these, which are not the run's own words
         values: values of that run by their full names; they replace what the words come to
         source: the checkpoint they come from, for messages
     """
@@ -51,9 +52,8 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         new: overrides of the command line
         leave_out: settings of the run that do not matter here
     """
-    new, own = rename(new), rename(saved["overrides"])
     known = schema(verb).__dataclass_fields__
-    values = flatten(saved.get("settings", {}))
+    values = flatten(saved["settings"])
     for name in ("preset", "tuning"):
         if choice := find_override(new, name):
             raise UserError(
@@ -64,15 +64,10 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     leave_out += ("preset", "tuning") * (verb != "train")
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
     left_out += HELD_OUT if {*HELD_OUT} & {*_names(new)} else ()
-    kept = without(own, *left_out)
-    old = without(old_defaults([*own, *new]), *left_out)
-    if not values:
-        _warn_of_old_defaults(path, old)
-        return Recipe([*kept, *new], old)
-    unknown_then = [word for word in old if word.partition("=")[0] not in (*values, *GROUPS)]
-    followed = "planner.clearance_factor" in saved.get("followers", []) and values.get("planner.name") == "dwa"
+    kept, defaults = without(saved["overrides"], *left_out), []
+    followed = "planner.clearance_factor" in saved["followers"] and values["planner.name"] == "dwa"
     if followed and "planner" not in chosen:  # the paper's DWA: of a new scenario, too, that scenario's clearance
-        unknown_then.append("planner.clearance_factor=${scenario.clearance_factor}")
+        defaults.append("planner.clearance_factor=${scenario.clearance_factor}")
     gone = {*left_out, *_gone_with_the_scenario(saved, values, new, verb)}
     if verb != "train":
         gone |= {name for name in values if name.partition(".")[0] not in (*GROUPS, *SHARED)}
@@ -81,15 +76,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         for name, value in values.items()
         if not gone & {name, name.partition(".")[0]} and not _is_set(name, new)
     }
-    return Recipe([*kept, *new], unknown_then, held, str(path))
-
-
-def _warn_of_old_defaults(path: Path, old: list[str]) -> None:
-    warnings.warn(
-        f"{path} was written by an earlier version and holds only the words of its command line: what they leave open "
-        f"is taken as it was then ({', '.join(old)})",
-        stacklevel=2,
-    )
+    return Recipe([*kept, *new], defaults, held, str(path))
 
 
 def _names(words: list[str]) -> list[str]:
@@ -109,7 +96,7 @@ def _chosen_anew(values: dict[str, Any], new: list[str]) -> list[str]:
 
 def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str], verb: str) -> list[str]:
     """The run's values that followed what the new words change."""
-    followers, names = saved.get("followers", []), _names(new)
+    followers, names = saved["followers"], _names(new)
     place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers

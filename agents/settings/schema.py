@@ -19,9 +19,21 @@ from omegaconf import MISSING, DictConfig
 from maexp.agents.runtime.choices import CHOICES
 from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.model import ModelConfig
-from maexp.envs.config import CommConfig, ObservationConfig, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
+from maexp.envs.config import (
+    CommConfig,
+    LookaheadConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+    TargetsConfig,
+)
 from maexp.envs.importing.options import ImportOptions
 
+NAMES = (*CHOICES, "lookahead", "oracle", "clairvoyant")
+"""Of the policies that come with the package and are not trained."""
+OTHERS = "a trained one or its folder, a run, module:function"
 PRIMITIVES = (int, float, bool, str)
 
 
@@ -72,6 +84,8 @@ PlannerSettings = optional_settings(PlannerConfig)
 RewardSettings = optional_settings(RewardConfig)
 ObservationSettings = optional_settings(ObservationConfig)
 CommSettings = optional_settings(CommConfig)
+TargetsSettings = optional_settings(TargetsConfig)
+LookaheadSettings = optional_settings(LookaheadConfig)
 AlgorithmSettings = optional_settings(
     *{type(row.default): None for row in TUNINGS.values()}, name=str | None
 )
@@ -91,7 +105,7 @@ class ScenarioSettings:
     held_out_count: int | None = None  # instead: so many, from the first held-out one on, beyond the table's count too
     local_steps: int | None = None  # control steps in one decision
     macro_steps: int | None = None  # decisions in one episode
-    starts: str = "drawn"  # anew at every reset; fixed: once for each map; or a .csv or .npy file of x, y, heading
+    starts: str = "drawn"  # anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses
     radar_range: float | None = None
     max_speed: float | None = None
     max_accel: float | None = None
@@ -101,7 +115,7 @@ class ScenarioSettings:
     clearance_factor: float | None = None
     num_steering: int | None = None
     max_steer: float | None = None
-    success_coverage: float = 0.95
+    success_coverage: float = 0.95  # share of the free points that ends an episode, in (0, 1]
     collision: str = "centre"  # or footprint
     importing: ImportSettings = field(default_factory=ImportSettings)
 
@@ -146,6 +160,8 @@ class CommonSettings:
     reward: RewardSettings = field(default_factory=RewardSettings)
     observation: ObservationSettings = field(default_factory=ObservationSettings)
     comm: CommSettings = field(default_factory=CommSettings)
+    targets: TargetsSettings = field(default_factory=TargetsSettings)
+    lookahead: LookaheadSettings = field(default_factory=LookaheadSettings)
     num_envs: int = setting(32, "teams simulated at once")
     seed: int = setting(0, "of everything random: maps' starts, networks, policy")
     device: str = setting("auto", "cpu, cuda, cuda:1, ...; auto: cuda where there is one")
@@ -170,8 +186,8 @@ class TrainSettings(LearnerSettings):
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
-    classical: Any = setting(None, "planners played beside the trained team; default: three that are good and cheap")
-    warm_start: str | None = setting(None, "policy to imitate first: a name, or a folder: of a run, or exported")
+    classical: Any = setting(None, "policies played beside the trained team; default: three planners, good and cheap")
+    warm_start: str | None = setting(None, "policy to imitate first: a name, a folder, a run or module:function")
     warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
@@ -188,7 +204,7 @@ class EvaluateSettings(LearnerSettings):
     preset: str = MISSING
     action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
-    policy: Any = setting(None, f"random, {', '.join(CHOICES)}, oracle, or a trained one or its folder; several as a,b")
+    policy: Any = setting(None, f"{', '.join(NAMES)}, {OTHERS}; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     episodes: int = setting(256, "episodes of each policy and team size")
     baseline: str | None = setting(None, "an earlier evaluation of the same episodes, to compare with: its folder")
@@ -208,7 +224,7 @@ class ViewSettings(LearnerSettings):
     action: str = MISSING  # which file of conf/action
     place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
     index: int = setting(0, "which map of the scenario")
-    policy: str | None = setting(None, "a policy to watch, classical or trained, on the map given or a held-out one")
+    policy: str | None = setting(None, "a policy to watch, as of maexp evaluate, on the map given or a held-out one")
     checkpoint: str | None = None  # what `place` becomes where it is a run
     num_robots: int = setting(3, "robots in a team")
     num_envs: int = setting(1, "teams to watch, each in a held-out episode of its own")
@@ -264,7 +280,7 @@ class IrsimSettings:
     """`maexp irsim`."""
 
     floor: str | None = setting(None, "a floor's file, as for maexp maps import")
-    policy: str = setting("cost_utility", "a classical policy, or a trained one or its folder")
+    policy: str = setting("cost_utility", "a classical one, a trained one or its folder, a run, module:Class")
     num_robots: int = setting(3, "robots in the team")
     seconds: float | None = setting(None, "length of the trial [s]; default: an episode of our simulator on this floor")
     episode: int = setting(0, "the robots start where they do in this evaluation episode of our simulator")
@@ -280,6 +296,23 @@ class IrsimSettings:
     pose_drift: float = setting(0.0, "the same, of an error that walks at random with the way, after 1 m [m]")
     people: int = setting(0, "people who walk about")
     importing: ImportSettings = field(default_factory=ImportSettings)
+
+
+@dataclass
+class SuiteSettings:
+    """`maexp suite`."""
+
+    task: str = MISSING
+    place: str | None = setting(None, "the suite, or the .yaml file of one; verify: the folder of a run")
+    policy: str | None = setting(None, "run: a name, a folder, module:Class, or exec:COMMAND, as docs/arena.md says")
+    suite: str | None = setting(None, "verify: the .yaml file of a suite that does not come with the package")
+    seed: int | None = setting(None, "run: plays other maps and starts than the frozen ones, those of this seed")
+    resume: str | None = setting(None, "run: folder of a run to go on with")
+    num_envs: int = setting(16, "run: teams at once")
+    workers: int | None = setting(None, "run: teams at once of a policy in processes; default: as many as cores")
+    decision_limit: float | None = setting(None, "run: its processor time a decision [s]; default: the suite's")
+    patience: float = setting(120.0, "run: how long it may be silent [s]")
+    device: str = setting("cpu", "run: cpu, cuda, ...; bits are promised on one platform alone")
 
 
 @dataclass
@@ -306,13 +339,13 @@ class BenchmarkSettings(LearnerSettings):
     action: str = MISSING  # which file of conf/action
     scenarios: Any = setting(None, "where: scenarios=maze,indoor_small; default: what the preset says")
     algorithms: Any = setting(None, "trained and then evaluated; default: all six")
-    policies: Any = setting(None, "classical ones, only evaluated; default: all")
+    policies: Any = setting(None, "only evaluated: planners, trained ones, module:function; default: all planners")
     seeds: Any = setting(None, "of training, starts and maps; default: what the preset says")
     episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)")
     num_robots: int = setting(3, "robots in a team")
     total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for")
     iterations: int | None = setting(None, "instead: iterations of one episode of each of the num_envs teams")
-    maps: Any = setting("held_out", "evaluated on held_out or trained maps, or both as maps=held_out,trained")
+    maps: Any = setting("held_out", "evaluated on held_out, trained, held_out_together (so teams start), or several")
     train_maps: int | None = setting(None, "train on the first so many maps; default: all that may be trained on")
     test_maps: int | None = setting(None, "evaluate on so many held-out maps, new ones too; default: the last fifth")
     policy_per_map: Any = setting(None, "a policy for each of so many maps, as {maze: 4}; default: one for all")
@@ -335,6 +368,7 @@ SCHEMAS = {
     "policies": PoliciesSettings,
     "maps": MapsSettings,
     "irsim": IrsimSettings,
+    "suite": SuiteSettings,
     "bench": BenchSettings,
     "benchmark": BenchmarkSettings,
 }

@@ -1,4 +1,4 @@
-"""`maexp bench kernels`: every kernel alone and in place, beside what the machine can copy and compute.
+"""`maexp bench kernels`: every kernel alone and in place.
 
 In place: the launches of a macro step follow each other as in a run, each timed by itself. Alone: one launch
 again and again, its outputs put back in between, so that its data lie as near as they can. Both start from the same
@@ -9,7 +9,6 @@ those of the thread, without waits for other programs; caches that those emptied
 import importlib
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,6 @@ from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
 from maexp.agents.settings.schema import BenchSettings
-from maexp.agents.speed.census import count_moment
-from maexp.agents.speed.counts import kernel_cost
 from maexp.agents.speed.env import advance
 from maexp.agents.speed.shared import (
     LEAST_LAPS,
@@ -70,7 +67,7 @@ class Step:
 
 
 def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
-    """Times, bytes and operations of every kernel at every point; ``where/bench_kernels.json`` and tables."""
+    """Times of every kernel at every point; ``where/bench_kernels.json`` and tables."""
     points = sweep_points(cfg, overrides, TEAM_SIZES)
     before = load_baseline(cfg.baseline) if cfg.baseline else None
     device = pick_device(cfg.device)
@@ -86,8 +83,6 @@ def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
             progress.show(len(rows), f"{point.num_envs} envs of {point.num_robots} robots")
     torch.set_num_threads(threads)
     flat = [row for group in rows for row in group]
-    for row in flat:
-        add_shares(row, ceilings)
     if before is not None:
         compare(flat, before)
     print_ceilings(ceilings, loading, before)
@@ -140,9 +135,7 @@ def measure_kernels(env: ExplorationEnv, cfg: BenchSettings) -> list[dict]:
     steps = record_steps(env, shard)
     stream = current_stream(shard.device)
     run = Runner(env.device, stream)
-    active = env.simulation.tensors["active"].clone()
-    in_place, counts = run.in_place(steps, cfg.seconds / 2, lambda: count_moment(env, shard, active))
-    alone = run.alone(steps, cfg.seconds / 2)
+    in_place, alone = run.in_place(steps, cfg.seconds / 2), run.alone(steps, cfg.seconds / 2)
     robots = (shard.last - shard.first) * env.num_robots
     rows = []
     for stage, kernel in dict.fromkeys((step.stage, step.kernel) for step in steps):
@@ -151,11 +144,7 @@ def measure_kernels(env: ExplorationEnv, cfg: BenchSettings) -> list[dict]:
         for name, laps in (("in_place", in_place), ("alone", alone)):
             summed = [sum(together) for together in zip(*(laps[k] for k in mine), strict=False)]
             row[f"{name}_us"] = {one: 1e6 * seconds for one, seconds in spread(summed).items()}
-        cost = kernel_cost(kernel, counts)
-        row |= {"robots": robots, "bytes": None, "operations": None}
-        if cost is not None:
-            row |= {"bytes": cost.bytes * robots, "operations": cost.operations * robots}
-        rows.append(row)
+        rows.append(row | {"robots": robots})
     return rows
 
 
@@ -193,18 +182,16 @@ class Runner:
     def time(self, step: Step) -> float:
         return time_call(lambda: step.command.launch(self.stream), self.device)
 
-    def in_place(self, steps: list[Step], seconds: float, count: Callable) -> tuple[list[list[float]], Any]:
-        """Laps over all launches in their order, from the same state; also what `count` says after the local step."""
+    def in_place(self, steps: list[Step], seconds: float) -> list[list[float]]:
+        """Laps over all launches in their order, from the same state."""
         saved = save_outputs(steps)
         laps: list[list[float]] = [[] for _ in steps]
-        counts, end = None, time.perf_counter() + seconds
+        end = time.perf_counter() + seconds
         while time.perf_counter() < end or len(laps[0]) <= LEAST_LAPS:
             for k, step in enumerate(steps):
-                if counts is None and step.stage == STAGES[3]:
-                    counts = count()
                 laps[k].append(self.time(step))
             restore(saved)
-        return [lap[1:] for lap in laps], counts  # the first lap warms up
+        return [lap[1:] for lap in laps]  # the first lap warms up
 
     def alone(self, steps: list[Step], seconds: float) -> list[list[float]]:
         """Laps of every launch by itself, its outputs put back after each."""
@@ -232,14 +219,6 @@ def save_outputs(steps: list[Step]) -> list[tuple[wp.array, wp.array]]:
 def restore(saved: list[tuple[wp.array, wp.array]]) -> None:
     for array, copy in saved:
         wp.copy(array, copy)
-
-
-def add_shares(row: dict, ceilings: dict[str, float]) -> None:
-    """Shares of the ceilings that the counted bytes and operations reach in the time in place."""
-    seconds = 1e-6 * row["in_place_us"]["median"]
-    for name, what in (("copy_bytes_per_second", "bytes"), ("fma_operations_per_second", "operations")):
-        share = None if row[what] is None else row[what] / seconds / ceilings[name]
-        row[f"share_of_{name.partition('_')[0]}"] = share
 
 
 def load_baseline(path: str) -> dict:
@@ -303,7 +282,7 @@ def print_kernels(rows: list[dict], compared: bool) -> None:
         f"us per robot: scenario={one['scenario']}, {one['planner']}, {one['num_envs']} envs of {one['num_robots']} "
         f"robots, radar {one['radar_range']:g} m"
     )
-    columns = ["kernel", "in place", "p10..p90", "alone", "bytes", "operations", "of copy", "of FMA"]
+    columns = ["kernel", "in place", "p10..p90", "alone"]
     cells = []
     for stage in dict.fromkeys(row["stage"] for row in rows):
         mine = [row for row in rows if row["stage"] == stage]
@@ -324,8 +303,6 @@ def kernel_cells(row: dict, compared: bool) -> list[str]:
         f"{place['p10'] / robots:.3f}..{place['p90'] / robots:.3f}",
         f"{row['alone_us']['median'] / robots:.3f}",
     ]
-    cells += ["-" if row[what] is None else f"{row[what] / robots:,.0f}" for what in ("bytes", "operations")]
-    cells += ["-" if row[f"share_of_{k}"] is None else f"{100 * row[f'share_of_{k}']:.1f} %" for k in ("copy", "fma")]
     if compared:
         ratio = row["ratio"]
         cells.append("-" if ratio is None else f"{'! ' if row['changed'] else ''}{ratio:.2f}")

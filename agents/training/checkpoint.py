@@ -1,8 +1,10 @@
 """Checkpoints: written whole or not at all, the newest few and the best kept, loaded without unpickling."""
 
+import os
 import random
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,16 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.networks.weights import load_matching
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.settings.model import SIZES, ModelConfig
+from maexp.agents.settings.resolved import flatten
+from maexp.agents.settings.schema import LearnerSettings
 from maexp.envs import ExplorationEnv
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
-KINDS = {"overrides": list, "iteration": int, "policy": dict}  # what every reader of a checkpoint relies on
+FORMAT = "maexp-checkpoint-1"
+KINDS = {"overrides": list, "settings": dict, "followers": list, "maps": dict, "iteration": int, "policy": dict}
+"""What every reader of a checkpoint relies on."""
 
 
 def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: bool = False) -> Path:
@@ -31,7 +37,7 @@ def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: 
         best: write it as `best.pt` too
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"iteration_{iteration:06d}.pt"
+    path, state = folder / f"iteration_{iteration:06d}.pt", {"format": FORMAT} | state
     for target in [path] + [folder / BEST] * best:
         _write_atomically(target, state)
     for old in list_checkpoints(folder)[keep:]:
@@ -72,23 +78,20 @@ def load_checkpoint(path: Path) -> dict:
     except Exception as error:  # a damaged file fails anywhere inside zip and pickle
         raise UserError(f"{path} is not a whole checkpoint: it is damaged or something else.") from error
     if not _is_ours(state):
-        raise UserError(f"{path} is not a checkpoint of MAexp.")
+        raise UserError(f"{path} is no checkpoint of the kind {FORMAT}: train again, or use the version that wrote it.")
     return state
 
 
 def _is_ours(state: object) -> bool:
     """Whether a file holds the kinds of values that `maexp train` puts there."""
-    if not isinstance(state, dict) or any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
         return False
-    words, weights = [*state["overrides"], *state.get("followers", ())], state["policy"].values()
+    if any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
+        return False
+    words, weights = [*state["overrides"], *state["followers"]], state["policy"].values()
     if not all(isinstance(word, str) for word in words) or not all(torch.is_tensor(weight) for weight in weights):
         return False
-    return "settings" not in state or _has_names(state["settings"])
-
-
-def _has_names(settings: object) -> bool:
-    """Whether settings of a run tell its scenario and planner."""
-    groups = [settings.get(name) for name in ("scenario", "planner")] if isinstance(settings, dict) else [None]
+    groups = [state["settings"].get(name) for name in ("scenario", "planner")]
     return all(isinstance(group, dict) and isinstance(group.get("name"), str) for group in groups)
 
 
@@ -112,6 +115,37 @@ def find_checkpoint(place: str | Path) -> tuple[Path, dict]:
         except UserError as error:
             warnings.warn(f"{error} Falling back to the one before.", stacklevel=2)
     raise UserError(f"{place} holds no whole checkpoint: give the folder of a run of maexp train.")
+
+
+def is_run(place: Path) -> bool:
+    """Whether this is a checkpoint or the folder of a run of `maexp train`."""
+    if place.suffix == ".pt":
+        return True
+    return os.path.isdir(place) and (os.path.isdir(place / "checkpoints") or any(place.glob("iteration_*.pt")))
+
+
+def model_of(saved: dict) -> ModelConfig:
+    """The sizes of the networks in a checkpoint."""
+    values = {
+        name.removeprefix("model."): value
+        for name, value in flatten(saved["settings"]).items()
+        if name.startswith("model.") and value is not None
+    }
+    return replace(SIZES[values.pop("preset", "small")], **values)
+
+
+def check_action(saved: dict, cfg: LearnerSettings) -> None:
+    """Refuse weights trained for the other kind of action: goals and controls have tensors of the same shapes.
+
+    Raises:
+        UserError: one of the two planners is `direct`, the other not.
+    """
+    trained = saved["settings"]["planner"]["name"]
+    if (trained == "direct") != (cfg.planner.name == "direct"):
+        raise UserError(
+            f"The checkpoint was trained with planner={trained} and planner={cfg.planner.name} takes another action: "
+            f"leave planner={cfg.planner.name} out, or train a policy with it."
+        )
 
 
 def restore_policy(env: ExplorationEnv, model: str | ModelConfig, saved: dict) -> ProbabilisticActor:

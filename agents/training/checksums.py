@@ -21,7 +21,7 @@ def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
 
 def warn_of_changed_maps(saved: dict, maps: list[PointCloudMap]) -> None:
     """Say which of `maps` are not what they were when the checkpoint `saved` was written."""
-    before = saved.get("maps", {})
+    before = saved["maps"]
     changed = [name for name, one in checksums(maps).items() if before.get(name, one) != one]
     if changed:
         more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""

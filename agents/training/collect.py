@@ -48,12 +48,8 @@ class TeamCollector(Collector):
         """Go on where `state_dict` was called; ValueError if the simulator's state does not fit."""
         self.env.load_state_dict(state_dict["env"])
         self._frames, self._iter = state_dict["frames"], state_dict["iter"]
-        seen = {key: state_dict["seen"].get(_SEPARATOR.join(key)) for key in self._seen_keys()}
-        if any(value is None for value in seen.values()):  # saved before the observation had this key
-            now = self.env.observe()
-            seen = {key: now.get(key) if value is None else value for key, value in seen.items()}
-        for key, value in seen.items():
-            self._carrier.set(key, value.to(self.env.device))
+        for key in self._seen_keys():
+            self._carrier.set(key, state_dict["seen"][_SEPARATOR.join(key)].to(self.env.device))
 
     def _seen_keys(self) -> list[tuple[str, ...]]:
         """What a reset returns: observation and done flags."""

@@ -5,14 +5,12 @@ probability, and the critic what they earn. Each batch is looked at a few times 
 not grow. Afterwards the algorithm may keep the policy near what it has become (`algorithm.anchor_coeff`).
 """
 
+import copy
 import math
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.algorithms.losses import check_finite
@@ -21,72 +19,49 @@ from maexp.agents.build import Learner, choose_device, make_env
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.networks.actor import ALIVE
-from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.load import is_exported, load_policy_folder, show_targets
+from maexp.agents.networks.distributions import ACTION
 from maexp.agents.progress import Progress
-from maexp.agents.runtime.shipped import advise, shipped_names
-from maexp.agents.settings.checks import check_counts, check_goals
-from maexp.agents.settings.compose import settings_of
-from maexp.agents.settings.model import SIZES, ModelConfig
+from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.schema import TrainSettings
-from maexp.agents.training.checkpoint import find_checkpoint, restore_policy
 from maexp.agents.training.collect import batch_statistics, divide_teams
-from maexp.agents.training.train import TrainingRun, check_action
-from maexp.envs import ExplorationEnv
+from maexp.agents.training.named import Player, check_planner, find_player, suit_observation
+from maexp.agents.training.train import TrainingRun
 
 LEARNING_RATE = 2e-3
 PASSES = 4  # over each batch
 LOG = "warm_start.csv"
+HEADS = ("region", "offset", "target", "control")
 
 
 def check_warm_start(cfg: TrainSettings) -> None:
     """Raise UserError for a teacher or a count that cannot be used."""
     check_counts(cfg, "warm_start_frames")
-    if cfg.warm_start in POLICIES:
-        check_goals([cfg.warm_start], cfg.planner.name)
-        _check_kind(cfg, "regions")
-    elif cfg.warm_start is not None and is_exported(cfg.warm_start):
-        _check_kind(cfg, "targets")
-        show_targets(cfg, [cfg.warm_start], "warm_start")
-    elif cfg.warm_start is not None and not Path(cfg.warm_start).exists():
-        names = [*POLICIES, *shipped_names()]
-        raise UserError(
-            f"warm_start={cfg.warm_start} is neither a run's folder, a checkpoint, nor a policy: "
-            f"{advise(cfg.warm_start, names)}".rstrip("?") + "."
-        )
+    if cfg.warm_start is None:
+        return
+    teacher = find_player(cfg.warm_start, "warm_start")
+    check_planner(cfg.planner.name, [teacher])
+    suit_observation(copy.deepcopy(cfg), [teacher])
+    _check_kind(cfg, taught_by(teacher))
 
 
-def _check_kind(cfg: TrainSettings, taught: str) -> None:
+def taught_by(teacher: Player) -> str | None:
+    """What a policy chooses; None: it tells when it acts."""
+    if teacher.direct:
+        return "controls"
+    if teacher.kind == "own" and teacher.direct is None:
+        return None
+    return "targets" if teacher.targets is not None else "regions"
+
+
+def _check_kind(cfg: TrainSettings, taught: str | None) -> None:
     """Raise UserError where the teacher chooses something else than the policy that is to imitate it."""
-    chosen = model_settings(cfg).action
-    if chosen != taught:
+    chosen = "controls" if cfg.planner.name == "direct" else model_settings(cfg).action
+    if taught not in (None, chosen):
         raise UserError(
             f"warm_start={cfg.warm_start} chooses {taught}, which a policy with action={chosen} cannot imitate: "
             f"add action={taught}."
         )
-
-
-def load_teacher(cfg: TrainSettings, env: ExplorationEnv) -> TensorDictModuleBase:
-    """The policy to imitate in `env`."""
-    if cfg.warm_start in POLICIES:
-        return POLICIES[cfg.warm_start](env)
-    if is_exported(cfg.warm_start):
-        return load_policy_folder(cfg.warm_start, env, "warm_start")
-    _, saved = find_checkpoint(cfg.warm_start)
-    check_action(saved, cfg)
-    _check_kind(cfg, model_of(saved).action)
-    return restore_policy(env, model_of(saved), saved)
-
-
-def model_of(saved: dict) -> ModelConfig:
-    """The sizes of the networks in a checkpoint."""
-    values = {
-        name.removeprefix("model."): value
-        for name, value in settings_of(saved).items()
-        if name.startswith("model.") and value is not None
-    }
-    return replace(SIZES[values.pop("preset", "small")], **values)
 
 
 def warm_start(run: TrainingRun) -> None:
@@ -118,14 +93,27 @@ def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]
             make_env(cfg, run.suite.train, one.num_robots, one.num_envs, device=device)
             for one in divide_teams(cfg.num_envs, run.sizes)
         ]
-        teachers = [load_teacher(cfg, env) for env in envs]
+        teacher = find_player(cfg.warm_start, "warm_start")
+        teachers = [teacher.make(env) for env in envs]
     for _ in range(rounds):
         with torch.no_grad():
             batches = [
                 env.rollout(cfg.collector.steps, teacher, break_when_any_done=False)
                 for env, teacher in zip(envs, teachers, strict=True)
             ]
+        _check_heads(cfg, run.learner.policy, batches[0])
         yield batches
+
+
+def _check_heads(cfg: TrainSettings, policy: ProbabilisticActor, batch: TensorDictBase) -> None:
+    """Raise UserError where the teacher acted by other means than the policy that is to imitate it."""
+    wanted = [head for head in HEADS if (*ACTION, head) in policy.out_keys]
+    chosen = [head for head in HEADS if head in batch["agents", "action"].keys()]
+    if not {*wanted} <= {*chosen}:
+        raise UserError(
+            f"warm_start={cfg.warm_start} wrote {' and '.join(chosen)}, and the policy that is to imitate it "
+            f"chooses {' and '.join(wanted)}: let it write that, or set action."
+        )
 
 
 def imitate(learner: Learner, optimizer: torch.optim.Optimizer, steps: list[TensorDictBase], meter: Meter) -> None:

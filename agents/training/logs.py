@@ -29,7 +29,6 @@ class MetricsLog:
     def __init__(self, folder: Path, settings: LoggerSettings, kept: int, frames: int, config: dict):
         self.path = folder / "metrics.csv"
         self.columns = _keep_rows(self.path, kept)
-        self.goes_on = self.columns is not None
         self.file = open(self.path, "a", newline="")
         self.backends = [BACKENDS[name](folder, settings, config, frames) for name in settings.backends]
 
@@ -38,26 +37,13 @@ class MetricsLog:
         if self.columns is None:
             self.columns = list(row)
             self.file.write(_line(self.columns))
-        unknown = [name for name in row if name not in self.columns]
-        if unknown and self.goes_on:  # a version that knew fewer began this log
-            self._add_columns(unknown)
-        elif unknown:
+        if unknown := [name for name in row if name not in self.columns]:
             raise RuntimeError(f"{unknown[0]} was not among the first row's metrics {self.columns}")
         self.file.write(_line([row.get(name, "") for name in self.columns]))
-        self.goes_on = False
         self.file.flush()
         known = {name: value for name, value in row.items() if not math.isnan(value)}
         for backend in self.backends:
             backend.write(known)
-
-    def _add_columns(self, names: list[str]) -> None:
-        """Empty in the rows that are there."""
-        self.file.close()
-        with open(self.path, newline="") as file:
-            rows = list(csv.reader(file))[1:]
-        self.columns += names
-        write_text(self.path, "".join(_line(row) for row in [self.columns, *(row + [""] * len(names) for row in rows)]))
-        self.file = open(self.path, "a", newline="")
 
     def sync(self) -> None:
         """Make sure that what was written survives a power cut."""

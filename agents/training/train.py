@@ -31,10 +31,11 @@ from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
-from maexp.agents.settings.compose import compose_config, settings_of
+from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
-from maexp.agents.settings.schema import LearnerSettings, TrainSettings
+from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import (
+    check_action,
     random_state,
     save_checkpoint,
     seed_everything,
@@ -192,15 +193,15 @@ class TrainingRun:
 
     def restore_experience(self, saved: dict) -> None:
         """Go on with the episodes of `saved`, or with new ones where other workers ran them."""
-        before, now = saved.get("teams", ""), describe_teams(self.cfg)
-        if before and before != now:
+        before, now = saved["teams"], describe_teams(self.cfg)
+        if before != now:
             raise UserError(f"The checkpoint was trained with {before}, not {now}: leave these settings as they were.")
-        if saved.get("workers") == describe_workers(self.cfg):
+        if saved["workers"] == describe_workers(self.cfg):
             self.experience.load_state_dict(saved["collector"])
             return
         warnings.warn(
-            f"the checkpoint was written by {saved.get('workers', 'an earlier version')}, not by "
-            f"{describe_workers(self.cfg)}: new episodes begin, and the result differs from that of a run in one go",
+            f"the checkpoint was written by {saved['workers']}, not by {describe_workers(self.cfg)}: new episodes "
+            "begin, and the result differs from that of a run in one go",
             stacklevel=2,
         )
         self.experience.update_policy_weights_()
@@ -319,20 +320,6 @@ def describe_workers(cfg: TrainSettings) -> str:
         return "one process"
     one, several = {"processes": ("worker process", "worker processes"), "ray": ("Ray worker", "Ray workers")}[backend]
     return f"{workers} {one if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"
-
-
-def check_action(saved: dict, cfg: LearnerSettings) -> None:
-    """Refuse weights trained for the other kind of action: goals and controls have tensors of the same shapes.
-
-    Raises:
-        UserError: one of the two planners is `direct`, the other not.
-    """
-    trained = settings_of(saved)["planner.name"]
-    if (trained == "direct") != (cfg.planner.name == "direct"):
-        raise UserError(
-            f"The checkpoint was trained with planner={trained} and planner={cfg.planner.name} takes another action: "
-            f"leave planner={cfg.planner.name} out, or train a policy with it."
-        )
 
 
 @contextmanager

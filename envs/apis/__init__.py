@@ -1,4 +1,4 @@
-"""The env under other projects' interfaces: PettingZoo's ParallelEnv and Gymnasium's VectorEnv."""
+"""The env under other projects' interfaces: PettingZoo's ParallelEnv, Gymnasium's VectorEnv and Env."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .gymnasium import TeamVectorEnv
     from .pettingzoo import TeamParallelEnv
+    from .team import TeamEnv
 
-__all__ = ["parallel_env", "vector_env"]
+__all__ = ["parallel_env", "team_env", "vector_env"]
 
 
 def parallel_env(map, num_robots: int = 3, **settings) -> TeamParallelEnv:
@@ -44,3 +45,20 @@ def vector_env(maps, num_envs: int = 1, num_robots: int = 3, **settings) -> Team
     except ImportError as error:
         raise ImportError('vector_env needs Gymnasium: pip install "maexp[gymnasium]"') from error
     return TeamVectorEnv(maps, num_envs, num_robots, **settings)
+
+
+def team_env(map, num_robots: int = 3, **settings) -> TeamEnv:
+    """One team as a Gymnasium ``Env``; see `maexp.envs.apis.team.TeamEnv`.
+
+    Args:
+        map: a `PointCloudMap`, or several of which every reset chooses one.
+        num_robots: robots of the team, which acts as one agent.
+
+    Raises:
+        ImportError: Gymnasium is not installed.
+    """
+    try:
+        from .team import TeamEnv
+    except ImportError as error:
+        raise ImportError('team_env needs Gymnasium: pip install "maexp[gymnasium]"') from error
+    return TeamEnv(map, num_robots, **settings)

@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from maexp.envs.environment import ExplorationEnv
 from maexp.envs.specs import INFO_ENV
 
-from .spaces import action_space, check_kind, observation_space, to_action, to_numpy
+from .spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
 
 
 class TeamVectorEnv(VectorEnv):
@@ -29,7 +28,8 @@ class TeamVectorEnv(VectorEnv):
         num_envs: teams in the batch, E.
         num_robots: robots of a team, N.
         seed: key of all random numbers until ``reset(seed=...)`` gives another.
-        action: "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`.
+        action: "targets", "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`. With targets, observation
+            and info hold ``action_mask``, int8 [E, N, M]: which there are.
         autoreset_mode: when a team that is done starts anew: in the next step, in the same one, or not by itself.
         render_mode: "rgb_array" or None.
         settings: those of `ExplorationEnv` (radar, planner, macro_steps, ...).
@@ -44,12 +44,12 @@ class TeamVectorEnv(VectorEnv):
         num_robots: int = 3,
         *,
         seed: int = 0,
-        action: str = "region_offset",
+        action: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **settings,
     ):
-        check_kind(action)
+        self._kind, settings = settle(action, settings)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is unknown: choose rgb_array or None")
         self.autoreset_mode = _mode(autoreset_mode)
@@ -59,13 +59,14 @@ class TeamVectorEnv(VectorEnv):
             "autoreset_mode": self.autoreset_mode,
             "render_fps": 10 / self.env.local_steps,
         }
-        self._kind, self._direct = action, self.env.planner_config.name == "direct"
         spec = self.env.observation_spec
-        robots, team = (observation_space(spec[key], 1) for key in (("agents", "observation"), "team"))
-        self._robots, self._team = (batch_space(one, self.num_envs) for one in (robots, team))
-        self.single_observation_space = spaces.Dict({**robots, "team_map": team["map"]})
+        self._pictures, self._targets = (getattr(self.env.observation_config, name) for name in ("pictures", "targets"))
+        seen = named(spec["agents", "observation"], self._kind)
+        if self._pictures:
+            seen["team_map"] = spec["team", "map"]
+        self.single_observation_space = observation_space(seen, 1)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.single_action_space = action_space(action, self._direct, (self.env.num_robots,))
+        self.single_action_space = action_space(self._kind, self._targets, (self.env.num_robots,))
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._done: np.ndarray | None = None
         self._seen: TensorDictBase | None = None  # what the teams saw last
@@ -101,7 +102,8 @@ class TeamVectorEnv(VectorEnv):
             raise RuntimeError(
                 f"teams {np.flatnonzero(before).tolist()} are done: call reset(options={{'reset_mask': ...}})"
             )
-        action = to_action(actions, self._kind, self._direct, (self.num_envs, self.env.num_robots), self.env.device)
+        team = (self.num_envs, self.env.num_robots)
+        action = to_action(actions, self._kind, self._targets, team, self.env.device)
         now = self._seen = self.env.step(action)["next"]
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
             now = self._start_anew(now, before)
@@ -149,7 +151,7 @@ class TeamVectorEnv(VectorEnv):
         done = self._done
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
-            final[i] = _row(observation, i)
+            final[i] = row(observation, i)
         begun = self._restart(done)
         told = {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done}
         told |= self._told("robot_reward", info["robot_reward"])
@@ -157,8 +159,10 @@ class TeamVectorEnv(VectorEnv):
         return self._observation(begun), self._info(begun) | told
 
     def _observation(self, now: TensorDictBase) -> dict[str, np.ndarray]:
-        robots = to_numpy(now["agents", "observation"], self._robots)
-        return robots | {"team_map": to_numpy(now["team"], self._team)["map"]}
+        seen = named(now["agents", "observation"], self._kind)
+        if self._pictures:
+            seen["team_map"] = now["team", "map"]
+        return to_numpy(seen, self.observation_space)
 
     def _info(self, now: TensorDictBase) -> dict[str, np.ndarray]:
         """The env's ``info``: [E] of the team, [E, N] of its robots, and Gymnasium's masks of who has them."""
@@ -166,16 +170,18 @@ class TeamVectorEnv(VectorEnv):
         for name, value in now["info"].items():
             array = value.cpu().numpy()
             told |= self._told(name, array[:, 0] if name in INFO_ENV else array)
+        if self._kind == "targets":
+            told |= self._told(MASK, now["agents", "observation", "targets_mask"].cpu().numpy().astype(np.int8))
         return told
 
     def _told(self, name: str, value: np.ndarray) -> dict[str, np.ndarray]:
         return {name: value, f"_{name}": np.ones(self.num_envs, dtype=bool)}
 
 
-def _row(observation: dict, index: int) -> dict:
+def row(observation: dict, index: int) -> dict:
     """One team's part of an observation, copied."""
     return {
-        name: _row(value, index) if isinstance(value, dict) else value[index].copy()
+        name: row(value, index) if isinstance(value, dict) else value[index].copy()
         for name, value in observation.items()
     }
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from maexp.envs.environment import ExplorationEnv
 from maexp.envs.specs import INFO_ENV
 
-from .spaces import action_space, check_kind, observation_space, to_action, to_numpy
+from .spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
 
 COLLIDED = ("stay", "leave")
 
@@ -24,7 +24,8 @@ class TeamParallelEnv(ParallelEnv):
         map: a `PointCloudMap`, or several of which every reset chooses one.
         num_robots: robots of the team, the agents ``robot_0``, ``robot_1``, ...
         seed: key of all random numbers until ``reset(seed=...)`` gives another.
-        action: "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`.
+        action: "targets", "region_offset", "region" or "goal"; see `maexp.envs.apis.spaces`. With targets, every
+            robot's observation and info hold ``action_mask``, int8 [M]: which there are.
         collided: "stay" keeps a robot that collided among the agents until the team's episode ends: it cannot move,
             and goes on paying for time; "leave" terminates it at once.
         render_mode: "rgb_array" or None.
@@ -42,31 +43,32 @@ class TeamParallelEnv(ParallelEnv):
         num_robots: int = 3,
         *,
         seed: int = 0,
-        action: str = "region_offset",
+        action: str | None = None,
         collided: str = "stay",
         render_mode: str | None = None,
         **settings,
     ):
-        check_kind(action)
+        self._kind, settings = settle(action, settings)
         if collided not in COLLIDED:
             raise ValueError(f"collided={collided!r} is unknown: choose one of {', '.join(COLLIDED)}")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r} is unknown: choose rgb_array or None")
         self.env = ExplorationEnv(map, 1, num_robots, seed=seed, **settings)
-        if not self.env.observation_config.pictures:
-            raise ValueError("observation.pictures=False leaves out the state of a parallel env: leave it True")
         self.render_mode, self.collided = render_mode, collided
         self.metadata = self.metadata | {"render_fps": 10 / self.env.local_steps}
         self.possible_agents = [f"robot_{i}" for i in range(self.env.num_robots)]
         self.agents: list[str] = []
-        self._kind, self._direct = action, self.env.planner_config.name == "direct"
+        self._pictures, self._targets = (getattr(self.env.observation_config, name) for name in ("pictures", "targets"))
         spec = self.env.observation_spec
-        self.observation_spaces = {
-            name: observation_space(spec["agents", "observation"], 2) for name in self.possible_agents
-        }
-        self.action_spaces = {name: action_space(action, self._direct) for name in self.possible_agents}
-        self.state_space = observation_space(spec["team"], 1)["map"]
-        self._team_map: np.ndarray | None = None
+        seen = named(spec["agents", "observation"], self._kind)
+        self.observation_spaces = {name: observation_space(seen, 2) for name in self.possible_agents}
+        self.action_spaces = {name: action_space(self._kind, self._targets) for name in self.possible_agents}
+        if self._pictures:
+            self.state_space = observation_space(spec["team"], 1)["map"]
+        else:
+            numbers = sum(spaces.flatdim(one) for one in self.observation_spaces.values()) + 1
+            self.state_space = spaces.Box(-np.inf, np.inf, (numbers,), np.float32)
+        self._now: TensorDictBase | None = None  # what the team sees
 
     def observation_space(self, agent: str) -> spaces.Space:
         return self.observation_spaces[agent]
@@ -78,15 +80,14 @@ class TeamParallelEnv(ParallelEnv):
         """Start the seed's first episode, or without a seed the next one; there are no options."""
         if seed is not None:
             self.env._set_seed(seed)  # set_seed() would seed torch's own generator, too
-        now = self.env.reset()
+        self._now = self.env.reset()
         self.agents = list(self.possible_agents)
-        self._team_map = now["team", "map"][0].cpu().numpy()
-        return self._observations(now), self._infos(now)
+        return self._tell()
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
         """One decision of every agent that is left; what follows holds entries for just these."""
         self._check_agents(actions)
-        now = self.env.step(self._action(actions))["next"]
+        now = self._now = self.env.step(self._action(actions))["next"]
         robots = {name: i for i, name in enumerate(self.possible_agents) if name in self.agents}
         reward = now["agents", "reward"][0, :, 0].tolist()
         leaves = (now["info", "collided"][0] & (self.collided == "leave")).tolist()
@@ -94,23 +95,28 @@ class TeamParallelEnv(ParallelEnv):
         rewards = {name: reward[i] for name, i in robots.items()}
         terminations = {name: over or leaves[i] for name, i in robots.items()}
         truncations = {name: out_of_time and not terminations[name] for name in robots}
-        self._team_map = now["team", "map"][0].cpu().numpy()
-        observations, infos = self._observations(now), self._infos(now)
+        observations, infos = self._tell()
         self.agents = [name for name in robots if not (terminations[name] or truncations[name])]
         return observations, rewards, terminations, truncations, infos
 
     def state(self) -> np.ndarray:
-        """The team's map: explored, obstacle, number of robots that explored it; uint8 [3, 125, 125]."""
-        if self._team_map is None:
+        """The team's map: explored, obstacle, number of robots that explored it; uint8 [3, 125, 125].
+
+        Without pictures the numbers of all robots' observations, one after the other, and the coverage; float32 [K].
+        """
+        if self._now is None:
             raise RuntimeError("the env has no state yet: call reset() first")
-        return self._team_map
+        if self._pictures:
+            return self._now["team", "map"][0].cpu().numpy()
+        seen = [spaces.flatten(self.observation_spaces[name], self._seen_by(i)) for i, name in self._numbered()]
+        return np.concatenate([*seen, [self._now["info", "coverage"].item()]]).astype(np.float32)
 
     def render(self) -> np.ndarray | None:
         """The team from above, uint8 [height, width, 3]."""
         if self.render_mode is None:
             logger.warn('render() draws nothing without render_mode="rgb_array"')
             return None
-        if self._team_map is None:
+        if self._now is None:
             raise RuntimeError("there is nothing to draw yet: call reset() first")
         return self.env.render()
 
@@ -144,25 +150,26 @@ class TeamParallelEnv(ParallelEnv):
             together: Any = {key: _stacked(key, [one[key] for one in given.values()]) for key in space}
         else:
             together = _stacked("action", list(given.values()))
-        return to_action(together, self._kind, self._direct, (1, len(given)), self.env.device)
+        return to_action(together, self._kind, self._targets, (1, len(given)), self.env.device)
 
-    def _observations(self, now: TensorDictBase) -> dict[str, dict]:
-        values = now["agents", "observation"][0]
-        return {
-            name: to_numpy(values[i], self.observation_spaces[name])
-            for i, name in enumerate(self.possible_agents)
-            if name in self.agents
-        }
+    def _tell(self) -> tuple[dict[str, dict], dict[str, dict]]:
+        """What every agent that is left observes, and what its ``info`` holds of the team and of it, as numbers."""
+        team = {key: value[0].tolist() for key, value in self._now["info"].items()}
+        observations, infos = {}, {}
+        for i, name in self._numbered():
+            if name in self.agents:
+                observations[name] = self._seen_by(i)
+                infos[name] = {key: value[0] if key in INFO_ENV else value[i] for key, value in team.items()}
+                if self._kind == "targets":
+                    infos[name][MASK] = observations[name][MASK].copy()
+        return observations, infos
 
-    def _infos(self, now: TensorDictBase) -> dict[str, dict]:
-        """What the env's ``info`` holds of the team and of the robot, as plain numbers."""
-        team = now["info"][0].to_dict()
-        listed = {key: value.tolist() for key, value in team.items()}
-        return {
-            name: {key: value[0] if key in INFO_ENV else value[i] for key, value in listed.items()}
-            for i, name in enumerate(self.possible_agents)
-            if name in self.agents
-        }
+    def _seen_by(self, robot: int) -> dict[str, np.ndarray]:
+        seen = named(self._now["agents", "observation"][0, robot], self._kind)
+        return to_numpy(seen, self.observation_spaces[self.possible_agents[robot]])
+
+    def _numbered(self) -> list[tuple[int, str]]:
+        return list(enumerate(self.possible_agents))
 
 
 def _stacked(name: str, values: list) -> np.ndarray:

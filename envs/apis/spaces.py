@@ -1,15 +1,21 @@
 """Gymnasium's spaces for what enters and leaves the env, and the way between NumPy and tensordicts.
 
-Observations follow the env's specs, so that a key that joins them appears here, too. Actions come in three kinds:
+Observations follow the env's specs, so that a key that joins them appears here, too. Actions come in four kinds:
 
-``region_offset``: the env's own, a region of 64 and an offset in it, [-1, 1]^2.
+``targets``: one of the frontier targets that the robot is shown; ``action_mask`` tells which there are.
+``region_offset``: a region of 64 and an offset in it, [-1, 1]^2.
 ``region``: the region alone; the goal is its centre.
 ``goal``: a place of the map's extent, [-1, 1]^2, for libraries that know plain boxes only.
 
-With the planner ``direct`` the action is the control, [-1, 1]^2, whatever was chosen.
+With the planner ``direct`` the action is the control, [-1, 1]^2, whatever was chosen. Where nothing was chosen it is
+what the env itself takes: targets with ``ObservationConfig(targets=...)``, else ``region_offset``.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,12 +23,42 @@ from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
+from maexp.envs.config import ObservationConfig, PlannerConfig
 from maexp.kernels.types import REGIONS
 
-ACTIONS = ("region_offset", "region", "goal")
+ACTIONS = ("targets", "region_offset", "region", "goal")
+SHOWN = 24  # targets that ``action="targets"`` shows unless ``observation`` says how many
+MASK = "action_mask"  # what other projects call ``targets_mask``
 
 
-def observation_space(spec: Composite, lead: int) -> spaces.Dict:
+def settle(action: str | None, settings: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The kind of action, "control" with the planner ``direct``, and the settings of an env that takes it.
+
+    Raises:
+        ValueError: there is no such kind, or the planner cannot take it.
+    """
+    planner, observation = (settings.get(name) for name in ("planner", "observation"))
+    direct = isinstance(planner, PlannerConfig) and planner.name == "direct"
+    if action is None:
+        shows = isinstance(observation, ObservationConfig) and observation.targets
+        action = "targets" if shows else "region_offset"
+    elif action not in ACTIONS:
+        raise ValueError(f"action={action!r} is unknown: choose one of {', '.join(ACTIONS)}")
+    if action == "targets" and not direct:
+        observation = ObservationConfig(pictures=False) if observation is None else observation
+        if isinstance(observation, ObservationConfig):  # the env tells what else it is
+            settings = settings | {"observation": replace(observation, targets=observation.targets or SHOWN)}
+    elif action == "targets":
+        raise ValueError("planner=direct takes controls, action='targets' chooses goals: leave out one of the two")
+    return "control" if direct else action, settings
+
+
+def named(observation: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """What a robot sees, or its spec, under the names that other projects expect."""
+    return {MASK if kind == "targets" and name == "targets_mask" else name: one for name, one in observation.items()}
+
+
+def observation_space(spec: Mapping[str, TensorSpec], lead: int) -> spaces.Dict:
     """The space of one observation: ``spec`` without its first ``lead`` dimensions."""
     inner = {
         name: observation_space(one, lead) if isinstance(one, Composite) else _leaf(one, lead)
@@ -41,7 +77,7 @@ def _leaf(spec: TensorSpec, lead: int) -> spaces.Space:
     return spaces.Box(np.iinfo(kind).min, np.iinfo(kind).max, shape, kind.type)
 
 
-def to_numpy(values: TensorDictBase, space: spaces.Dict) -> dict:
+def to_numpy(values: Mapping[str, torch.Tensor] | TensorDictBase, space: spaces.Dict) -> dict:
     """``values`` in the shapes and types of ``space``."""
     return {
         name: to_numpy(values[name], one)
@@ -51,33 +87,31 @@ def to_numpy(values: TensorDictBase, space: spaces.Dict) -> dict:
     }
 
 
-def check_kind(action: str) -> None:
-    if action not in ACTIONS:
-        raise ValueError(f"action={action!r} is unknown: choose one of {', '.join(ACTIONS)}")
-
-
-def action_space(kind: str, direct: bool, robots: tuple[int, ...] = ()) -> spaces.Space:
-    """The action of one robot, or of ``robots`` = (N,) together."""
+def action_space(kind: str, targets: int, robots: tuple[int, ...] = ()) -> spaces.Space:
+    """The action of one robot, or of ``robots`` = (N,) together, where it is shown so many targets."""
     box = spaces.Box(-1.0, 1.0, (*robots, 2), np.float32)
-    if direct or kind == "goal":
+    if kind in ("control", "goal"):
         return box
-    count = REGIONS**2
-    region = spaces.MultiDiscrete(np.full(robots, count)) if robots else spaces.Discrete(count)
-    return region if kind == "region" else spaces.Dict(region=region, offset=box)
+    count = targets if kind == "targets" else REGIONS**2
+    choice = spaces.MultiDiscrete(np.full(robots, count)) if robots else spaces.Discrete(count)
+    return spaces.Dict(region=choice, offset=box) if kind == "region_offset" else choice
 
 
-def to_action(actions, kind: str, direct: bool, shape: tuple[int, int], device) -> TensorDict:
+def to_action(actions, kind: str, targets: int, shape: tuple[int, int], device) -> TensorDict:
     """The env's action, batch [E], from arrays of ``shape`` = (E, N), in the form that `action_space` describes."""
-    if direct:
+    if kind == "control":
         parts = {"control": _box("control", actions, (*shape, 2))}
+    elif kind == "targets":
+        parts = {"target": _choice("target", actions, shape, targets)}
     elif kind == "goal":
         parts = _region_of(_box("goal", actions, (*shape, 2)))
     elif kind == "region":
-        parts = {"region": _region(actions, shape), "offset": np.zeros((*shape, 2), np.float32)}
+        parts = {"region": _choice("region", actions, shape), "offset": np.zeros((*shape, 2), np.float32)}
     else:
         if not isinstance(actions, dict) or not {"region", "offset"} <= set(actions):
             raise ValueError(f"the action is {type(actions).__name__}: give a dict of region and offset")
-        parts = {"region": _region(actions["region"], shape), "offset": _box("offset", actions["offset"], (*shape, 2))}
+        region, offset = _choice("region", actions["region"], shape), actions["offset"]
+        parts = {"region": region, "offset": _box("offset", offset, (*shape, 2))}
     tensors = {name: torch.as_tensor(one, device=device) for name, one in parts.items()}
     inner = TensorDict(tensors, batch_size=shape, device=device)
     return TensorDict({"agents": {"action": inner}}, batch_size=shape[:1], device=device)
@@ -93,11 +127,11 @@ def _region_of(goal: np.ndarray) -> dict[str, np.ndarray]:
     return {"region": index[..., 0] * side + index[..., 1], "offset": offset}
 
 
-def _region(values, shape) -> np.ndarray:
-    region, last = _shaped("region", values, shape), REGIONS**2 - 1
-    if region.dtype.kind not in "iu" or (region < 0).any() or (region > last).any():
-        raise ValueError(f"region={region.tolist()} must hold whole numbers of 0 to {last}")
-    return region.astype(np.int64)
+def _choice(name: str, values, shape, count: int = REGIONS**2) -> np.ndarray:
+    chosen = _shaped(name, values, shape)
+    if chosen.dtype.kind not in "iu" or (chosen < 0).any() or (chosen >= count).any():
+        raise ValueError(f"{name}={chosen.tolist()} must hold whole numbers of 0 to {count - 1}")
+    return chosen.astype(np.int64)
 
 
 def _box(name: str, values, shape) -> np.ndarray:

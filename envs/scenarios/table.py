@@ -1,12 +1,10 @@
 """The table of scenarios: sizes, robots, radars and episode lengths that belong together."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from numbers import Integral
-
-import numpy as np
 
 from maexp.envs.map import PointCloudMap
 
@@ -17,7 +15,7 @@ from .random_obstacles import build_adaptive, build_random_obstacles
 
 LEAST_MACRO_STEPS = 10
 SWEEPS = 2.0
-"""A team of three that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
+"""A team that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +115,25 @@ def cut_last_fifth(indices: range) -> tuple[range, range]:
     return indices[:first], indices[first:]
 
 
-def default_macro_steps(maps: list[PointCloudMap], scenario: Scenario) -> int:
-    """Macro steps for a map without a fixed number, from its free area (largest of ``maps``)."""
+def default_macro_steps(
+    maps: list[PointCloudMap],
+    scenario: Scenario,
+    team: Sequence[tuple[float, float]] | None = None,
+    local_steps: int | None = None,
+) -> int:
+    """Macro steps for a map without a fixed number: the team can sweep its free area `SWEEPS` times over (the largest
+    of ``maps``), and its slowest robot drive across as many times.
+
+    Args:
+        team: speed [m/s] and radar range [m] of every robot; None: three as the scenario has them.
+        local_steps: of a macro step; None: the scenario's.
+    """
     from maexp.kernels.types import DT  # here: settings and help wait for no Warp
 
-    area = max(float((m.free_spacing.astype(np.float64) ** 2).sum()) for m in maps)
-    swept = 3 * scenario.max_speed * DT * scenario.local_steps * scenario.radar_range
-    return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * area / swept))
+    team = team or [(scenario.max_speed, scenario.radar_range)] * 3
+    seconds = DT * (local_steps or scenario.local_steps)
+    area = max(m.free_area for m in maps)
+    across = max(math.dist(*m.extent) for m in maps)
+    sweeping = area / sum(speed * reach for speed, reach in team)
+    crossing = across / min(speed for speed, _ in team)
+    return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * max(sweeping, crossing) / seconds - 1e-9))

@@ -102,8 +102,6 @@ class Episode:
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], path: str | os.PathLike) -> Episode:
         """The episode among the arrays that `path` held; raises MapError as `load` does."""
-        if "target" in arrays:  # what earlier versions called the waypoint
-            arrays = {"waypoint": arrays["target"]} | arrays
         missing = {"episode_format", "policy", *_KINDS} - arrays.keys()
         if missing:
             raise MapError(f"{path} is not an episode of MAexp (no {', '.join(sorted(missing))}); record it again")

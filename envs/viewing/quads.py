@@ -45,7 +45,7 @@ class Quads:
 def make_quads(scene: Scene) -> Quads:
     """All quadrilaterals of a scene."""
     unit = float(np.ptp(np.stack(scene.bounds), axis=0).max()) / 400  # width of a line
-    tile = 1.5 * float(scene.ground_size.max())
+    tile, across = 1.5 * float(scene.ground_size.max()), float(np.linalg.norm(np.ptp(np.stack(scene.bounds), axis=0)))
     pin = 6 * unit + 1.6 * (float(np.median(scene.wall_height)) if len(scene.walls) else 0.0)
     parts = [_ground(scene), _columns(scene)]
     for i in range(len(scene.robots)):
@@ -53,7 +53,8 @@ def make_quads(scene: Scene) -> Quads:
         trail = scene.trails[:, i]
         fade = np.linspace(0.35, 1.0, max(len(trail) - 1, 1))[: len(trail) - 1, None]
         parts.append(_ribbon(trail, 1.5 * unit, fade * colour + (1 - fade) * 235, lift, tile, layer=2))
-        parts.append(_ring(scene.robots[i], scene.radar_range[i], 0.6 * unit, colour, lift, tile))
+        if scene.radar_range[i] <= across:  # a wider one lies outside, and would be cut into millions of pieces
+            parts.append(_ring(scene.robots[i], scene.radar_range[i], 0.6 * unit, colour, lift, tile))
         if np.isfinite(scene.goals[i]).all():
             parts.append(_goal(scene.goals[i], unit, colour, pin, tile))
         parts.append(_robot(scene, i, tile))

@@ -71,8 +71,10 @@ class TeamNode(Node):
             return
         for note in plan.notes:
             self.get_logger().info(note, throttle_duration_sec=10.0)
-        for name, goal, way, active in zip(plan.names, plan.goals, plan.ways, plan.active, strict=True):
-            if active:
+        for name, goal, way, active, waits in zip(
+            plan.names, plan.goals, plan.ways, plan.active, plan.waits, strict=True
+        ):
+            if active or (waits and name in self.goals):  # who waits is to stop where it is
                 self._send(name, goal, way)
         self._draw(plan)
         if plan.done and not self.finished:

@@ -1,4 +1,4 @@
-"""Gallery of the scenarios, one PNG each: `python -m maexp.envs.scenarios.gallery docs/gallery`."""
+"""Gallery of the scenarios, one PNG each: `python -m tests.tools.gallery docs/gallery`."""
 
 import sys
 from pathlib import Path
@@ -8,8 +8,7 @@ from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import PointCloudMap
-
-from .table import SCENARIOS, make_map
+from maexp.envs.scenarios import SCENARIOS, make_map
 
 PANEL = 420  # pixels a side
 COLORS = {"ink": (30, 30, 30), "paper": (255, 255, 255), "wall": (25, 30, 45), "free": (222, 233, 242)}
@@ -92,7 +91,7 @@ def _ground_under(world: PointCloudMap) -> np.ndarray:
 def main() -> None:
     """Draw every scenario into the folder named on the command line."""
     if len(sys.argv) != 2:
-        raise SystemExit("usage: python -m maexp.envs.scenarios.gallery FOLDER")
+        raise SystemExit("usage: python -m tests.tools.gallery FOLDER")
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     for name, scenario in SCENARIOS.items():

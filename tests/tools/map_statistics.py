@@ -1,4 +1,4 @@
-"""What kind of place a map is, in figures: `python -m maexp.envs.scenarios.statistics [MAP FILES ...]`."""
+"""What kind of place a map is, in figures: `python -m tests.tools.map_statistics [MAP FILES ...]`."""
 
 import sys
 from dataclasses import dataclass
@@ -9,8 +9,7 @@ from skimage.measure import euler_number
 from skimage.morphology import remove_small_holes, skeletonize
 
 from maexp.envs.map import PointCloudMap
-
-from .table import SCENARIOS, find_scenario, make_map
+from maexp.envs.scenarios import SCENARIOS, find_scenario, make_map
 
 EIGHT = np.ones((3, 3), dtype=int)
 MAPS = 8  # of each scenario

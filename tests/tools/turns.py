@@ -1,9 +1,9 @@
 """Checkouts compared in turns, so that whatever else the machine does meets all alike (docs/performance.md).
 
-`python turns.py steps FOLDER ... -- scenario=maze planner=wavefront goals=cost_utility robots=3 threads=1` prints
-processor time of a robot-local-step and of a decision of a team, 64 teams. `python turns.py training FOLDER ... --
-num_envs=64` prints wall and processor seconds of an iteration of `maexp train` with these settings, for 480 macro
-steps of teams; OMP_NUM_THREADS=1 and num_threads=1 make it one thread. Medians of nine turns.
+`python tests/tools/turns.py steps FOLDER ... -- scenario=maze planner=wavefront goals=cost_utility robots=3 threads=1`
+prints processor time of a robot-local-step and of a decision of a team, 64 teams. `python tests/tools/turns.py training
+FOLDER ... -- num_envs=64` prints wall and processor seconds of an iteration of `maexp train` with these settings, for
+480 macro steps of teams; OMP_NUM_THREADS=1 and num_threads=1 make it one thread. Medians of nine turns.
 """
 
 import json
@@ -40,11 +40,8 @@ def make_stepper(scenario="maze", planner="wavefront", goals="random", robots="3
 
 
 def make_trainer(*overrides: str) -> Callable[[], dict]:
-    try:
-        from maexp.agents.speed.train import Trainee
-    except ImportError:  # before 21 November 2026
-        from maexp.agents.bench.train import Trainee
     from maexp.agents.settings.compose import compose_config
+    from maexp.agents.speed.train import Trainee
 
     one = Trainee.build(compose_config("train", list(overrides)))
     share = MACRO_STEPS / (one.env.num_envs * one.cfg.collector.steps)

@@ -1,0 +1,167 @@
+"""`maexp suite`: frozen worlds, one score, and results that others can check."""
+
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.files import short, write_text
+from maexp.agents.progress import Progress
+from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.overrides import find_override
+from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.schema import SuiteSettings
+from maexp.agents.suites.suite import Suite, load_suite, suite_names
+
+# What needs torch is imported where it is used: `list` and `show` answer at once.
+
+KEPT = ("place", "policy", "seed", "num_envs", "decision_limit")
+"""Settings of a run that `resume` keeps."""
+DIFFERENT, STOPPED = 1, 130
+
+
+def prepare(overrides: list[str]) -> Recipe:
+    """For resume=FOLDER: what that run played, then the new words."""
+    place = find_override(overrides, "resume")
+    if place is None:
+        return Recipe(overrides)
+    from maexp.agents.suites import folder as files
+
+    if changed := [name for name in (*KEPT, "hydra.run.dir") if find_override(overrides, name) is not None]:
+        raise UserError(f"resume={place} keeps what was played and where: leave {changed[0]} out.")
+    saved = files.read_json(Path(place).expanduser() / files.RUN)["settings"]
+    return Recipe(overrides, values={name: saved[name] for name in KEPT}, source=place)
+
+
+def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
+    """A run has a new folder, or that of the run that it goes on with; the other tasks write none."""
+    place = find_override(overrides, "resume")
+    if place is not None:
+        return Path(place).expanduser().absolute()
+    return claim() if find_override(overrides, "task") == "run" else None
+
+
+def check(cfg: SuiteSettings) -> None:
+    """Raise UserError for words that are missing or out of range."""
+    if cfg.task == "list":
+        if cfg.place:
+            raise UserError(f"maexp suite list lists all and takes no name: leave {cfg.place} out.")
+        return
+    if not cfg.place:
+        what = "the folder of a run" if cfg.task == "verify" else f"a name: {', '.join(suite_names())}"
+        raise UserError(f"maexp suite {cfg.task} needs {what} after it.")
+    if cfg.task != "verify":
+        load_suite(cfg.place)
+    if cfg.task == "run":
+        if not cfg.policy:
+            raise UserError("Nothing to run: give policy=NAME, as policy=universal.")
+        check_counts(cfg, "num_envs", *["workers"] * (cfg.workers is not None))
+        for name in ("patience", *["decision_limit"] * (cfg.decision_limit is not None)):
+            if not 0.0 < cfg[name] < math.inf:
+                raise UserError(f"{name}={cfg[name]} must be a number of seconds above 0.")
+
+
+def run(cfg: SuiteSettings, where: Path | None, overrides: list[str]) -> int:
+    """Do the task."""
+    return {"list": _list, "show": _show, "run": _run, "verify": _verify, "freeze": _freeze}[cfg.task](cfg, where)
+
+
+def _list(cfg: SuiteSettings, where: None) -> int:
+    for name in suite_names():
+        suite = load_suite(name)
+        first = suite.path.read_text().splitlines()[0].removeprefix("#").strip()
+        print(f"{name:<12}{first}; {len(suite.parts) * suite.episodes} episodes, checksum {suite.checksum[:16]}")
+    return 0
+
+
+def _show(cfg: SuiteSettings, where: None) -> int:
+    from maexp.agents.suites import report
+
+    print("\n".join(report.describe_suite(load_suite(cfg.place))))
+    return 0
+
+
+def _run(cfg: SuiteSettings, where: Path) -> int:
+    from maexp.agents.benchmark.plan import lock
+    from maexp.agents.build import pick_device
+    from maexp.agents.suites import folder as files
+    from maexp.agents.suites import report
+    from maexp.agents.suites.players import Player
+    from maexp.agents.suites.run import SuiteRun
+
+    suite = load_suite(cfg.place)
+    suite.check()
+    limit = suite.decision_limit if cfg.decision_limit is None else cfg.decision_limit
+    player = Player(cfg.policy, limit, cfg.patience)
+    with blame_input():
+        device = pick_device(cfg.device)
+    settings = {name: cfg[name] for name in KEPT} | {"decision_limit": limit}
+    if player.hosted and not cfg.resume:
+        settings["num_envs"] = min(cfg.num_envs, cfg.workers or os.cpu_count() or 1)
+    with lock(where, "maexp suite"):
+        if (where / files.RUN).exists():
+            _check_same_suite(where, suite)
+        else:
+            content = {"format": files.FORMAT, "suite": files.describe_suite(suite, cfg.seed), "settings": settings}
+            write_text(where / files.RUN, files.dump(content) + "\n")
+        try:
+            total = len(suite.parts) * suite.episodes
+            with Progress(f"{player.name} on {suite.name}", total) as progress:
+                playing = SuiteRun(
+                    suite, player, where, cfg.seed, settings["num_envs"], device, progress.advance
+                )
+                results = playing.play()
+        except KeyboardInterrupt:
+            print(f"maexp: stopped. Go on with: maexp suite run resume={short(where)}", file=sys.stderr)
+            return STOPPED
+        report.print_table(suite, results)
+        for sentence in report.describe_results(suite, results):
+            print(sentence)
+        report.draw_profiles(suite, results, where / "profile.png")
+    print(f"Written to {short(where)}: {files.RESULTS}, {files.ACTIONS}/, profile.png, {files.RUN}")
+    print(f"Next: maexp suite verify {short(where)}")
+    return 0
+
+
+def _check_same_suite(where: Path, suite: Suite) -> None:
+    from maexp.agents.suites import folder as files
+
+    before = files.read_json(where / files.RUN)["suite"]
+    if before["checksum"] != suite.checksum:
+        raise UserError(
+            f"{short(where)} was begun with version {before['version']} of {suite.name} (checksum "
+            f"{before['checksum'][:16]}, now {suite.checksum[:16]}): begin a new run."
+        )
+
+
+def _verify(cfg: SuiteSettings, where: None) -> int:
+    """Print the report as JSON, and what it says in a sentence on stderr; 0: all follows, 1: not."""
+    from maexp.agents.suites.verify import verify
+
+    place = Path(cfg.place).expanduser()
+    found = verify(place, cfg.suite)
+    print(json.dumps(found, indent=2))
+    if found["verified"]:
+        print(f"maexp: every number of {cfg.place} follows from its actions.", file=sys.stderr)
+        return 0
+    first = found["differences"][0]
+    print(f"maexp: {cfg.place} is not what it says: {first['file']}, {first['where']}; "
+          f"{found['number_of_differences']} differences.", file=sys.stderr)  # fmt: skip
+    return DIFFERENT
+
+
+def _freeze(cfg: SuiteSettings, where: None) -> int:
+    from maexp.agents.suites import folder as files
+    from maexp.agents.suites import report
+    from maexp.agents.suites.frozen import freeze
+
+    suite = load_suite(cfg.place)
+    made = files.describe_code() | {"machine": files.describe_machine(), "date": time.strftime("%Y-%m-%d")}
+    with Progress(f"random and {suite.reference} on {suite.name}", 2 * len(suite.parts) * suite.episodes) as progress:
+        frozen = freeze(suite, made, progress.advance)
+    print("\n".join(report.describe_suite(frozen)))
+    return 0

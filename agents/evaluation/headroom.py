@@ -1,0 +1,49 @@
+"""How much of what there is to win a policy wins: its share of the lead of a search that knows the true map."""
+
+import numpy as np
+
+from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.envs.metrics import resampled_means
+
+BASE, CEILING = "cost_utility", "clairvoyant"
+"""The planner that leads are measured from, and the reference whose lead is the headroom."""
+
+
+def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[str, dict]:
+    """The lead over `BASE` in coverage over time as a share of the lead of `CEILING`, on the same episodes.
+
+    Args:
+        results: of all policies.
+        names: what each is called.
+
+    Returns:
+        {name: {mean, ci95: [low, high], n}} of the others, where both were played in the same place with a team of the
+        same size and `CEILING` is ahead in all resamples of maps and episodes; else nothing of that place and size.
+    """
+    groups: dict[tuple, list[tuple[str, EvaluationResult]]] = {}
+    for name, one in zip(names, results, strict=True):
+        groups.setdefault((one.place, one.num_robots), []).append((name, one))
+    found = {}
+    for group in groups.values():
+        known = {one.policy: one for _, one in group}
+        if BASE in known and CEILING in known:
+            others = {name: one for name, one in group if one.policy not in (BASE, CEILING)}
+            found |= _shares(others, known[BASE], known[CEILING])
+    return found
+
+
+def _shares(others: dict[str, EvaluationResult], base: EvaluationResult, ceiling: EvaluationResult) -> dict[str, dict]:
+    headroom = _lead(ceiling, base)
+    drawn = resampled_means(headroom, base.weights)
+    if headroom.mean() <= 0.0 or drawn.min() <= 0.0:
+        return {}
+    found = {}
+    for name, one in others.items():
+        lead = _lead(one, base)
+        low, high = np.percentile(resampled_means(lead, base.weights) / drawn, [2.5, 97.5])
+        found[name] = {"mean": float(lead.mean() / headroom.mean()), "ci95": [float(low), float(high)], "n": len(lead)}
+    return found
+
+
+def _lead(one: EvaluationResult, base: EvaluationResult) -> np.ndarray:
+    return one.episodes["coverage_auc"] - base.episodes["coverage_auc"]

@@ -1,0 +1,113 @@
+"""Who chooses goals in a trial: planners, trained policies, and foreign ones, which give goals in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.errors import UserError
+from maexp.agents.policies.export import export_policy
+from maexp.agents.policies.foreign import ForeignCalls
+from maexp.agents.policies.own import is_foreign
+from maexp.agents.runtime import CHOICES, Plan, TeamPlanner
+from maexp.agents.runtime.grid import FREE, OBSTACLE, read_grid
+from maexp.agents.runtime.scene import find_ways
+from maexp.agents.runtime.team import read_team
+from maexp.agents.runtime.ways import UNREACHED, trace
+from maexp.agents.training.named import Player
+from maexp.envs import ExplorationEnv
+
+from .config import TrialConfig
+
+
+def check_player(word: str, player: Player) -> None:
+    """Raise UserError for a policy that plays in our simulator alone."""
+    if player.kind == "classical" and word not in CHOICES:
+        known = ", ".join(CHOICES)
+        raise UserError(f"policy={word} looks into our simulator and plays there alone: choose of {known}.")
+    if player.kind == "checkpoint" and player.targets is None:
+        raise UserError(f"policy={word} chooses regions of a whole map: maexp irsim plays those trained on targets.")
+    if player.kind == "own" and not is_foreign(player.found):
+        raise UserError(
+            f"policy={word} plays on tensordicts of our simulator's env: maexp irsim takes a class with act "
+            "(NumPy arrays in, goals in metres out)."
+        )
+
+
+def make_planner(word: str, player: Player, config: TrialConfig, env: ExplorationEnv, where: Path):
+    """What `run_trial` asks for plans.
+
+    Args:
+        env: the same team in our simulator.
+        where: folder of the trial; a run's policy is exported to it.
+    """
+    if player.kind == "own":
+        return ForeignTeam(player, config, env.num_robots)
+    if player.kind == "checkpoint":
+        trained = {"iteration": player.saved["iteration"]}
+        export_policy(player.make(env), env, where / "policy", player.name, f"# {player.name}\n", trained)
+        word = str(where / "policy")
+    return TeamPlanner(
+        word, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed,
+        max_speed=config.max_speed, max_accel=config.max_accel, seconds=config.decide,
+    )  # fmt: skip
+
+
+class ForeignTeam:
+    """A foreign policy in the place of a `TeamPlanner`: all robots hear each other, ways are found as there."""
+
+    def __init__(self, player: Player, config: TrialConfig, num_robots: int):
+        self.config, self.calls = config, ForeignCalls(player.name)
+        self.agent = self.calls.make(player.found)
+        self.poses = np.full((num_robots, 3), np.nan)
+        self.calls.reset(self.agent, {
+            "num_robots": num_robots, "radar_range": config.radar_range, "robot_radius": config.clearance,
+            "max_speed": config.max_speed, "max_accel": config.max_accel, "seconds": config.seconds,
+            "decision_seconds": config.decide, "seed": config.seed,
+        })  # fmt: skip
+
+    def plan(self, grid, resolution, origin, poses, *, velocities, time_left: float, now: float) -> Plan:
+        """Goals and ways of all robots; the arguments of `TeamPlanner.plan`. Who is None in `poses` has collided."""
+        notes: list[str] = []
+        alive = np.array([pose is not None for pose in poses.values()])
+        for robot, pose in poses.items():
+            self.poses[robot] = self.poses[robot] if pose is None else pose
+        known = read_grid(grid, resolution, origin, 50.0, notes)
+        goals = self.calls.act(self.agent, self._observe(known, alive, velocities, time_left, now), len(alive))
+        team = read_team(poses, None, self.config.clearance, notes)
+        return self._plan(known, team, goals, notes)
+
+    def _observe(self, known, alive: np.ndarray, speeds, time_left: float, now: float) -> dict[str, Any]:
+        count, heading = len(alive), self.poses[:, 2]
+        values = np.full(known.known.shape, -1, np.int8)
+        values[known.known == FREE], values[known.known == OBSTACLE] = 0, 100
+        velocities = np.asarray(speeds)[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+        return {
+            "grid": np.repeat(values[None], count, axis=0),
+            "resolution": known.cell,
+            "origin": known.corner,
+            "poses": np.repeat(self.poses[None], count, axis=0),
+            "velocities": np.repeat(velocities[None], count, axis=0),
+            "heard": np.ones((count, count), bool),
+            "alive": alive,
+            "time": now,
+            "time_left": time_left,
+        }
+
+    def _plan(self, known, team, goals: np.ndarray, notes: list[str]) -> Plan:
+        """A way to the place nearest to each goal that the robot gets to; none for robots that stay."""
+        robots, passable, distance = find_ways(known, team, 2.0, notes)
+        active, ways, ends = np.zeros(len(goals), bool), [np.zeros((0, 2))] * len(goals), team.at.copy()
+        for row, robot in enumerate(robots):
+            reached = np.flatnonzero(distance[row] < UNREACHED)
+            if np.isnan(goals[robot]).any() or not len(reached):
+                continue
+            gap = known.centers(reached) - known.from_map(goals[robot])
+            end = reached[(gap**2).sum(-1).argmin()]
+            corners = known.to_map(known.centers(trace(passable[row], distance[row], end)))
+            ways[robot] = np.concatenate([team.at[robot][None], corners])
+            ends[robot], active[robot] = ways[robot][-1], True
+        waits = np.zeros(len(goals), bool)
+        return Plan(team.names, ends, active, waits, ways, np.zeros((0, 2)), False, tuple(notes))

@@ -1,0 +1,126 @@
+"""Planning by rollouts: every robot in turn tries a few targets in a simulated future of its team, and takes the best.
+
+Multi-agent rollout (Bertsekas 2021): the others keep to what they have chosen or would choose by themselves; the first
+decision is played, then the rollout policy goes on for some more; what is covered over that time decides. The future
+is played in the simulator itself: in a world of what the robots know (`lookahead`) or in the true one (`clairvoyant`,
+a reference that cheats).
+"""
+
+from __future__ import annotations
+
+import torch
+
+from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
+from maexp.agents.policies.rollouts import Rollouts, check_rollout_policy, pick_places
+from maexp.envs import ExplorationEnv, LookaheadConfig
+from maexp.envs.targets import Scene, plan_in_turn, value_targets
+
+
+class LookaheadPlanner(FrontierPlanner):
+    """The search as a policy; calling it plans for all envs.
+
+    Args:
+        env: the env to plan for.
+        config: how; None: as the env's settings say.
+        true_world: play in the true world.
+
+    Raises:
+        ValueError: the rollout policy is none.
+    """
+
+    def __init__(self, env: ExplorationEnv, config: LookaheadConfig | None = None, true_world: bool = False):
+        config = env.lookahead_config if config is None else config
+        check_rollout_policy(config)
+        super().__init__(env, CLASSICAL[config.rollout_policy])
+        self.env, self.config = env, config
+        self.rollouts = Rollouts(env, config, self.tracker, true_world)
+
+    def choose(self, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+        """The target of each robot, and which robots wait: as the rollout policy says, but where a branch is better."""
+        preference = self.rank(scene)
+        own, waits = self.tracker.share(preference, scene.travel, scene.points)
+        offers = self._offer(scene, preference, own, waits)
+        chosen = torch.zeros_like(own)
+        teams = (self.env.simulation.tensors["active"] != 0).nonzero().squeeze(-1)
+        for some in teams.split(self.rollouts.teams):
+            chosen[some] = self._search(some, {name: one[some] for name, one in offers.items()})
+        if not bool(chosen.any()):
+            return own, waits
+        best = offers["index"].gather(2, chosen.unsqueeze(-1))
+        wanted = torch.where((own >= 0).unsqueeze(-1), torch.inf, preference.gather(2, best))
+        return self.tracker.share(preference.scatter(2, best, wanted), scene.travel, scene.points)
+
+    def _offer(
+        self, scene: Scene, preference: torch.Tensor, own: torch.Tensor, waits: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """What each robot may try, the choice of the rollout policy first.
+
+        Returns:
+            "index", "block", "region": int64 [E, N, K], "offset", "point": float32 [E, N, K, 2], "value": float32
+            [E, N, K], more than the own choice [radar discs], "wanted": bool [E, N, K], "body": float32 [E, N] [m],
+            "hears": bool [E, N, N].
+        """
+        index = list_candidates(preference, own, self.config.candidates)
+        there = (index >= 0) & scene.alive.unsqueeze(-1)
+        place = index.clamp_min(0)
+        cell, block = scene.cells().gather(2, place), scene.block.gather(2, place)
+        toward, point = (pick_places(one, place) for one in (scene.middle, scene.points))
+        block = torch.where(index >= 0, block, -1)
+        region, offset = self.rollouts.goals(block, cell, toward, waits)
+        value = _value(scene).gather(2, place)
+        value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)
+        there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & (own >= 0).unsqueeze(-1)
+        return {
+            "index": place, "block": block, "region": region, "offset": offset, "point": point, "value": value,
+            "wanted": there, "body": self.tracker.body, "hears": self.tracker.nav.state["comm"],
+        }  # fmt: skip
+
+    def _search(self, teams: torch.Tensor, mine: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Which candidate each robot of some teams takes, int64 [T, N]."""
+        kept = self.rollouts.look(teams)
+        chosen = torch.zeros(mine["index"].shape[:2], dtype=torch.int64, device=teams.device)
+        for robot in range(chosen.shape[1]):
+            wanted = mine["wanted"][:, robot] & ~self._taken(robot, mine, chosen)
+            if not bool(wanted[:, 1:].any()):
+                continue
+            worth = self.rollouts.weigh(robot, mine, chosen, wanted, kept)
+            score = torch.where(wanted, worth + self.config.prior * mine["value"][:, robot], -torch.inf)
+            best = score.argmax(-1)
+            takes = score.gather(1, best.unsqueeze(-1)).squeeze(-1) - score[:, 0] > self.config.margin
+            chosen[:, robot] = torch.where(takes, best, 0)
+            kept = self.rollouts.keep(kept, worth, wanted, chosen[:, robot])
+        return chosen
+
+    def _taken(self, robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor) -> torch.Tensor:
+        """Which of a robot's candidates leave no room beside what those before it have chosen, bool [T, K]."""
+        if robot == 0 or not self.env.targets_config.distinct:
+            return torch.zeros_like(mine["wanted"][:, robot])
+        where = pick_places(mine["point"], chosen.unsqueeze(-1)).squeeze(2)[:, :robot]  # [T, robot, 2]
+        gap = (mine["point"][:, robot].unsqueeze(2) - where.unsqueeze(1)).norm(dim=-1)  # [T, K, robot]
+        apart = (mine["body"][:, robot : robot + 1] + mine["body"][:, :robot]).unsqueeze(1)
+        goes = mine["block"].gather(2, chosen.unsqueeze(-1)).squeeze(-1)[:, :robot] >= 0
+        counts = goes & mine["hears"][:, robot, :robot] & mine["wanted"][:, :robot, 0]
+        return ((gap < apart) & counts.unsqueeze(1)).any(-1)
+
+
+def list_candidates(preference: torch.Tensor, own: torch.Tensor, count: int) -> torch.Tensor:
+    """What each robot tries: its own choice, int64 [E, N], -1 = none, then the targets that it likes best.
+
+    Args:
+        preference: float32 [E, N, T], -inf for what is out of reach.
+
+    Returns:
+        int64 [E, N, count]; -1 where there is nothing.
+    """
+    first = preference.scatter(2, own.clamp_min(0).unsqueeze(-1), torch.inf)
+    order = first.sort(dim=-1, descending=True, stable=True)
+    place = torch.where(order.values > -torch.inf, order.indices, -1)[..., :count]
+    place = torch.nn.functional.pad(place, (0, count - place.shape[-1]), value=-1)
+    return torch.cat([own.unsqueeze(-1), place[..., 1:]], -1)
+
+
+def _value(scene: Scene) -> torch.Tensor:
+    """What targets are worth to `cost_utility` when it is the robot's turn [radar discs], float32 [E, N, T]."""
+    hears = torch.ones((*scene.alive.shape, scene.alive.shape[1]), dtype=torch.bool, device=scene.gain.device)
+    value = torch.where(scene.travel.isfinite(), value_targets(scene), -torch.inf)
+    return plan_in_turn(scene.gain, value, scene.points / scene.nav.radar_range, hears)[0]

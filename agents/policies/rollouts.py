@@ -1,0 +1,184 @@
+"""Rollouts: what comes of a decision in copies of a team that a rollout policy plays on with.
+
+The copies live in a world of what the robots know, or in the true one (`maexp.envs.belief`, `maexp.envs.branches`).
+"""
+
+from __future__ import annotations
+
+import torch
+
+from maexp.agents.networks.map_predictor import predict
+from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
+from maexp.envs import ExplorationEnv, LookaheadConfig
+from maexp.envs.belief import Beliefs, Guess, guess_nearest
+from maexp.envs.branches import Branches
+from maexp.envs.targets import TargetTracker
+
+BRANCHES = 256  # teams' branches that are played at once, at most
+
+
+GUESSES: dict[str, Guess | None] = {"free": None, "nearest": guess_nearest, "predicted": predict}
+"""What stands where nobody has looked: the values of `lookahead.unknown`."""
+
+
+class Rollouts:
+    """Branches of an env's teams, and the policy that plays on in them.
+
+    Args:
+        env: whose teams; only read.
+        config: how.
+        tracker: of the env's targets, up to date when branches are played.
+        true_world: play in the true world.
+
+    Attributes:
+        teams: how many branch at once.
+
+    Raises:
+        ValueError: the rollout policy is none.
+    """
+
+    def __init__(self, env: ExplorationEnv, config: LookaheadConfig, tracker: TargetTracker, true_world: bool = False):
+        check_rollout_policy(config)
+        self.config, self.tracker = config, tracker
+        self.teams = max(1, min(env.num_envs, BRANCHES // config.candidates))
+        self.branches = (
+            Branches(env, self.teams, config.candidates) if true_world
+            else Beliefs(env, self.teams, config.candidates, tracker.nav, GUESSES[config.unknown])
+        )  # fmt: skip
+        self.follower = None
+        if config.horizon > 1:
+            self.follower = FrontierPlanner(self.branches.env, CLASSICAL[config.rollout_policy])
+            self.branches.attach(self.follower.tracker)
+
+    def goals(
+        self, block: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The actions that lead to candidates: region int64 [E, N, K] and offset float32 [E, N, K, 2].
+
+        Args:
+            block, cell: int64 [E, N, K], as for `TargetTracker.take`.
+            toward: float32 [E, N, K, 2] [m].
+            waits: bool [E, N], robots whose first candidate is to wait.
+        """
+        actions = [
+            self.tracker.goals(block[..., k], cell[..., k], toward[..., k, :], waits if k == 0 else None)
+            for k in range(block.shape[-1])
+        ]
+        region, offset = (torch.stack(one, 2) for one in zip(*actions, strict=True))
+        return region, offset
+
+    def look(self, teams: torch.Tensor) -> torch.Tensor:
+        """Take up what some teams know now, and that no choice of theirs has been played: float32 [T], NaN.
+
+        The branch in which nobody changes a choice need not be played for every robot: its worth is handed on from one
+        to the next.
+        """
+        self.branches.look(teams)
+        return torch.full((len(teams),), torch.nan, device=teams.device)
+
+    def weigh(
+        self, robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor, wanted: torch.Tensor, kept: torch.Tensor
+    ) -> torch.Tensor:
+        """What a robot's candidates are worth while the others keep to theirs, float32 [T, K] [radar discs].
+
+        Args:
+            robot: its number.
+            mine: what robots are offered: "region" int64 [T, N, K], "offset" float32 [T, N, K, 2] and "block" int64
+                [T, N, K], as of `LookaheadPlanner`.
+            chosen: int64 [T, N], the candidates of all robots; the robot's own one is the first.
+            wanted: bool [T, K], candidates that are tried; what is returned for the others means nothing.
+            kept: float32 [T], what the first is worth as far as that is known, else NaN (`keep`).
+        """
+        unknown, wanted = kept.isnan(), wanted.clone()
+        wanted[:, 0] &= unknown
+        tried = chosen.unsqueeze(1).repeat(1, self.config.candidates, 1)
+        tried[:, :, robot] = torch.arange(self.config.candidates, device=chosen.device)
+        score = self._play(robot, mine, tried, wanted)
+        score[:, 0] = torch.where(unknown, score[:, 0], kept)
+        return score
+
+    def keep(self, kept: torch.Tensor, score: torch.Tensor, wanted: torch.Tensor, best: torch.Tensor) -> torch.Tensor:
+        """What the choices made so far are worth after a robot's, for the next one; NaN where robots decide in worlds
+        of their own, or where none has been played yet.
+
+        Args:
+            score, wanted: of `weigh`, float32 and bool [T, K].
+            best: int64 [T], the candidate that the robot takes.
+        """
+        if not self.branches.one_world:
+            return kept
+        best = best.unsqueeze(-1)
+        return torch.where(wanted.gather(1, best).squeeze(-1), score.gather(1, best).squeeze(-1), kept)
+
+    def _play(
+        self, robot: int, mine: dict[str, torch.Tensor], tried: torch.Tensor, wanted: torch.Tensor
+    ) -> torch.Tensor:
+        """What the branches wanted, bool [T, K], are worth, in which robots take the candidates tried, int64 [T, K, N].
+
+        Returns:
+            float32 [T, K], radar discs.
+        """
+        env, count = self.branches.env, wanted.numel()
+        state = env.simulation.tensors
+        self.branches.branch(robot, wanted)
+        names = ("covered", "covered_sum", "local_step", "collided")
+        before = {name: state[name].clone() for name in names}
+        state["region"][:count] = pick_tried(mine["region"], tried)
+        state["offset"][:count] = pick_tried(mine["offset"], tried)
+        if self.follower is not None:
+            self._brief(pick_tried(mine["block"], tried))
+        self._step()
+        for _ in range(1, self.config.horizon):
+            region, offset = self.follower(None)
+            state["region"].copy_(region)
+            state["offset"].copy_(offset)
+            self._step()
+        return self._score(before)[:count].view(wanted.shape)
+
+    def _score(self, before: dict[str, torch.Tensor]) -> torch.Tensor:
+        """What has been covered since on average over the horizon and what comes after, less robots lost: [T * K]."""
+        state, steps = self.branches.env.simulation.tensors, self.config.horizon * self.branches.env.local_steps
+        gained, played, lost = (state[name] - before[name] for name in ("covered", "local_step", "collided"))
+        over_time = state["covered_sum"] - before["covered_sum"] - played * before["covered"].long()
+        over_time = over_time + (steps - played) * gained  # of an episode that has ended
+        area = (over_time / steps + self.config.rest * gained) / self.branches.disc()
+        return (area - self.config.loss * lost.sum(-1)).float()
+
+    def _brief(self, block: torch.Tensor) -> None:
+        """Let the rollout policy remember what was given up, and where robots go now."""
+        theirs, ours = self.tracker.state, self.follower.tracker.state
+        rows = self.branches.listed.repeat_interleave(self.config.candidates)
+        count = len(rows)
+        ours["dwell"][:count] = self.branches.spread_blocks(theirs["dwell"])
+        for name in ("stood", "counted", "home"):
+            ours[name][:count] = theirs[name][rows]
+        named = self.branches.blocks(block.clamp_min(0).view(len(self.branches.listed), -1)).view(block.shape)
+        ours["chosen"][:count] = torch.where(block >= 0, named, -1).unsqueeze(-1)
+
+    def _step(self) -> None:
+        """One decision's time in all branches."""
+        env, state = self.branches.env, self.branches.env.simulation.tensors
+        running = state["active"].clone()
+        env.simulation.set_goals()
+        env.simulation.step(0, env.local_steps)
+        env._raise_errors()
+        state["macro_step"] += running
+
+
+def pick_tried(offered: torch.Tensor, tried: torch.Tensor) -> torch.Tensor:
+    """What branches try, [T * K, N, ...], of what robots are offered, [T, N, K, ...]; `tried` int64 [T, K, N]."""
+    rows, robots = torch.arange(len(tried), device=tried.device), torch.arange(tried.shape[2], device=tried.device)
+    return offered[rows.view(-1, 1, 1), robots, tried].flatten(0, 1)
+
+
+def pick_places(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Entries [E, N, M, 2] of [E, N, T, 2]; `index` int64 [E, N, M]."""
+    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))
+
+
+def check_rollout_policy(config: LookaheadConfig) -> None:
+    """Raise ValueError where the rollout policy is none."""
+    if config.rollout_policy not in CLASSICAL:
+        raise ValueError(
+            f"lookahead.rollout_policy={config.rollout_policy!r} is unknown: choose one of {', '.join(CLASSICAL)}"
+        )

@@ -1,0 +1,166 @@
+"""The folder of a run of a suite: `run.json`, the actions of every batch of episodes, and at the end `results.json`."""
+
+import json
+import os
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.errors import UserError
+from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.files import short, write_file, write_text
+from maexp.agents.suites.play import Batch
+from maexp.agents.suites.score import Results
+from maexp.agents.suites.suite import Suite, sha256
+from maexp.agents.versions import PACKAGES, find_commit
+from maexp.envs.map import MapError, read_npz
+
+RUN, RESULTS, ACTIONS = "run.json", "results.json", "actions"
+FORMAT = "maexp-suite-result-1"
+ARRAYS = {"decisions": "i", "region": "u", "offset": "f", "seconds": "f", "maps": "U", "reasons": "U"}
+"""Of a file of actions, with the kinds of their numbers."""
+
+
+def batch_file(where: Path, part: str, first: int) -> Path:
+    """Where the batch is that begins with an episode."""
+    return where / ACTIONS / f"{part}-{first:04d}.npz"
+
+
+def write_batch(where: Path, suite: Suite, part: str, batch: Batch) -> None:
+    """The actions of a batch, and the metrics that came of them."""
+    arrays = {name: getattr(batch, name) for name in ARRAYS}
+    arrays["metrics"] = np.stack([batch.metrics[name] for name in suite.metrics], 1)
+    write_file(batch_file(where, part, batch.first), lambda file: np.savez_compressed(file, **arrays))
+
+
+def read_batch(where: Path, suite: Suite, part: str, first: int) -> Batch:
+    """The batch that begins with an episode.
+
+    Raises:
+        UserError: its file is missing, damaged or holds something else.
+    """
+    path = batch_file(where, part, first)
+    try:
+        arrays = read_npz(path)
+        metrics = arrays.pop("metrics")
+        for name, kind in ARRAYS.items():
+            if arrays[name].dtype.kind != kind:
+                raise ValueError(f"{name} is {arrays[name].dtype}")
+        _check_shapes(arrays, suite.parts[part].num_robots, metrics, len(suite.metrics))
+    except (MapError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{short(path)} is damaged or holds something else ({error}).") from error
+    return Batch(first, metrics=dict(zip(suite.metrics, metrics.T, strict=True)), **arrays)
+
+
+def _check_shapes(arrays: dict[str, np.ndarray], robots: int, metrics: np.ndarray, count: int) -> None:
+    episodes, most = arrays["region"].shape[:2]
+    wanted = {
+        "decisions": (episodes,), "region": (episodes, most, robots), "offset": (episodes, most, robots, 2),
+        "seconds": (episodes, most), "maps": (episodes,), "reasons": (episodes,),
+    }  # fmt: skip
+    for name, shape in wanted.items():
+        if arrays[name].shape != shape or not episodes or not most:
+            raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
+    if metrics.shape != (episodes, count) or metrics.dtype != np.float64:
+        raise ValueError(f"metrics has shape {metrics.shape}")
+    if not ((0 <= arrays["decisions"]) & (arrays["decisions"] <= most)).all():
+        raise ValueError("decisions are out of range")
+    if arrays["region"].max() >= 64 or not np.isfinite(arrays["offset"]).all():
+        raise ValueError("an action is out of range")
+
+
+def to_results(policy: str, suite: Suite, batches: dict[str, list[Batch]]) -> Results:
+    """Part -> its episodes."""
+    found = {}
+    for name, several in batches.items():
+        episodes = {one: np.concatenate([batch.metrics[one] for batch in several]) for one in suite.metrics}
+        maps = np.concatenate([batch.maps for batch in several])
+        found[name] = EvaluationResult(policy, suite.parts[name].num_robots, episodes, 0.0, maps)
+    return found
+
+
+def describe_suite(suite: Suite, seed: int | None) -> dict[str, Any]:
+    """Which suite this is; of another seed than its own it has other maps and starts."""
+    own = {"seed": suite.key(seed), "frozen_maps": seed is None}
+    return {"name": suite.name, "version": suite.version, "checksum": suite.checksum} | own
+
+
+def describe_machine() -> dict[str, Any]:
+    """Where it ran: bits of results are promised on one platform alone."""
+    return {
+        "platform": platform.platform(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+    }
+
+
+def describe_code() -> dict[str, Any]:
+    """Which code ran."""
+    return {"commit": find_commit(), "versions": {name: metadata.version(name) for name in PACKAGES}}
+
+
+def list_files(where: Path) -> dict[str, str]:
+    """Name -> SHA-256 of the files of actions."""
+    return {f"{ACTIONS}/{one.name}": sha256(one) for one in sorted((where / ACTIONS).glob("*.npz"))}
+
+
+def describe_episodes(suite: Suite, batches: dict[str, list[Batch]]) -> dict[str, dict]:
+    """Part -> {map, decisions, each metric}, a value for each episode; and why those ended that were lost."""
+    found = {}
+    for name, several in batches.items():
+        rows = {"map": [place for batch in several for place in batch.maps.tolist()]}
+        rows["decisions"] = [count for batch in several for count in batch.decisions.tolist()]
+        rows |= {one: [x for batch in several for x in batch.metrics[one].tolist()] for one in suite.metrics}
+        why = [(batch.first + k, reason) for batch in several for k, reason in enumerate(batch.reasons.tolist())]
+        found[name] = rows | {"lost": {str(number): reason for number, reason in why if reason}}
+    return found
+
+
+def write_results(where: Path, content: dict[str, Any]) -> None:
+    """`results.json`, lists on one line each."""
+    write_text(where / RESULTS, dump(content) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The content of `run.json` or `results.json`.
+
+    Raises:
+        UserError: it is missing, damaged or holds something else.
+    """
+    try:
+        content = json.loads(path.read_text())
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']}")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise UserError(f"{short(path)} is missing, damaged, or not of maexp suite run ({told}).") from error
+    return content
+
+
+def dump(value: Any, indent: str = "") -> str:
+    """JSON with lists on one line each, null where a number is none."""
+    if not isinstance(value, dict) or not value:
+        return json.dumps(_without_nan(value))
+    inner = indent + "  "
+    lines = [f"{inner}{json.dumps(str(name))}: {dump(one, inner)}" for name, one in value.items()]
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_without_nan(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

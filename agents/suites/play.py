@@ -1,0 +1,148 @@
+"""The episodes of a part: built, played with every action noted, and played again from those."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from maexp.agents.evaluation.evaluate import play
+from maexp.agents.suites.suite import Part, Suite
+from maexp.envs import (
+    CommConfig,
+    ExplorationEnv,
+    ObservationConfig,
+    PlannerConfig,
+    PointCloudMap,
+    RadarConfig,
+    RobotConfig,
+    make_map,
+)
+from maexp.envs.metrics import episode_metrics
+
+REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
+
+
+@dataclass
+class Batch:
+    """Episodes of a part that were played at once, K of them, at most T decisions each.
+
+    Attributes:
+        first: number of the first
+        decisions: int32 [K], made in each
+        region, offset: uint8 [K, T, N] and float32 [K, T, N, 2], where the robots were sent; 0 after the last decision
+        seconds: float32 [K, T], processor time of the policy [s]
+        maps: of each episode, names [K]
+        metrics: each metric's value in each episode, float64 [K]
+        reasons: why the policy's episode ended early, "" where it did not, [K]
+    """
+
+    first: int
+    decisions: np.ndarray
+    region: np.ndarray
+    offset: np.ndarray
+    seconds: np.ndarray
+    maps: np.ndarray
+    metrics: dict[str, np.ndarray]
+    reasons: np.ndarray
+
+
+def build_maps(part: Part, seed: int | None = None) -> list[PointCloudMap]:
+    """The maps of a part; of another seed: others."""
+    return [make_map(part.scenario, index) for index in part.indices(seed)]
+
+
+def build_env(
+    part: Part, maps: list[PointCloudMap], num_envs: int, seed: int, observation: ObservationConfig, **others
+) -> ExplorationEnv:
+    """The env of a part; `others` are further arguments of `ExplorationEnv`, such as `device`.
+
+    Raises:
+        ValueError: the file of the suite has a value out of range; MapError: no room for the team.
+    """
+    return ExplorationEnv(
+        maps, num_envs, part.num_robots, seed=seed, robot=RobotConfig(**part.robot), radar=RadarConfig(**part.radar),
+        planner=PlannerConfig(**part.planner), comm=CommConfig(**part.comm), observation=observation,
+        local_steps=part.local_steps, macro_steps=part.macro_steps, collision=part.collision,
+        success_coverage=part.success_coverage, starts=part.starts, **others,
+    )  # fmt: skip
+
+
+class Recorder:
+    """A policy that notes where the robots were sent and what each decision took."""
+
+    def __init__(self, policy: Callable, env: ExplorationEnv):
+        self.policy, self.env = policy, env
+        self.sent: list[tuple[np.ndarray, np.ndarray]] = []
+        self.seconds: list[np.ndarray] = []
+        self.reasons = np.full(env.num_envs, "", dtype=object)
+
+    def __call__(self, state: TensorDictBase) -> TensorDictBase:
+        self._note()
+        playing = max(int((self.env.simulation.tensors["active"] != 0).sum()), 1)
+        begin = time.process_time()
+        acted = self.policy(state)
+        share = (time.process_time() - begin) / playing
+        own = acted.get("decision_seconds", None)
+        self.seconds.append(np.full(self.env.num_envs, share) if own is None else own.reshape(-1).numpy().copy())
+        return acted
+
+    def _note(self) -> None:
+        """What the env made of the last decision: targets, too, have become regions and offsets there."""
+        if len(self.sent) < len(self.seconds):
+            tensors = self.env.simulation.tensors
+            self.sent.append(tuple(tensors[name].cpu().numpy().copy() for name in ("region", "offset")))
+
+    def batch(self, first: int, count: int, decisions: np.ndarray, metrics: dict, maps: np.ndarray) -> Batch:
+        """What was noted of the first `count` envs."""
+        self._note()
+        decisions, most = decisions[:count].astype(np.int32), max(int(decisions[:count].max()), 1)
+        region, offset = (np.stack([one[k] for one in self.sent[:most]], 1)[:count] for k in (0, 1))
+        seconds = np.stack(self.seconds[:most], 1)[:count]
+        made = np.arange(most) < decisions[:, None]
+        reasons = getattr(self.policy, "reasons", [""] * self.env.num_envs)
+        return Batch(
+            first, decisions,
+            np.where(made[..., None], region, 0).astype(np.uint8),
+            np.where(made[..., None, None], offset, 0.0).astype(np.float32),
+            np.where(made, seconds, 0.0).astype(np.float32), maps, metrics, np.array(list(reasons)[:count], dtype=str),
+        )  # fmt: skip
+
+
+class Replay:
+    """A policy that does what was noted; a team whose notes end before its episode is lost there."""
+
+    def __init__(self, batch: Batch, num_envs: int, device: torch.device):
+        rows = np.minimum(np.arange(num_envs), len(batch.decisions) - 1)
+        self.region = torch.from_numpy(batch.region[rows].astype(np.int64)).to(device)
+        self.offset = torch.from_numpy(batch.offset[rows]).to(device)
+        self.decisions = torch.from_numpy(batch.decisions[rows].astype(np.int64)).to(device)
+        self.step = 0
+
+    def __call__(self, state: TensorDictBase) -> TensorDictBase:
+        at = min(self.step, self.region.shape[1] - 1)
+        state[REGION], state[OFFSET] = self.region[:, at], self.offset[:, at]
+        state["lost"] = (self.step >= self.decisions).unsqueeze(-1)
+        self.step += 1
+        return state
+
+
+def play_batch(suite: Suite, env: ExplorationEnv, policy: Callable, first: int) -> Batch:
+    """Episodes `first` and following, as many as the env has teams or the suite has left."""
+    count = min(env.num_envs, suite.episodes - first)
+    numbers = torch.arange(first, first + env.num_envs, device=env.device).clamp(max=suite.episodes - 1)
+    recorder = Recorder(policy, env)
+    with torch.random.fork_rng([env.device] if env.device.type == "cuda" else []):
+        torch.manual_seed(int(env.simulation.tensors["seed"]) + first)
+        final = play(recorder, env, numbers)[:count]
+    decisions = -(-final["local_steps"][:, 0].cpu().numpy() // env.local_steps)
+    metrics = episode_metrics(final, env.local_steps * env.macro_steps, env.success_coverage)
+    maps = np.array([env.maps[index].name for index in env.simulation.tensors["map_id"][:count].tolist()])
+    return recorder.batch(first, count, decisions, {name: metrics[name] for name in suite.metrics}, maps)
+
+
+def replay_batch(suite: Suite, env: ExplorationEnv, noted: Batch) -> Batch:
+    """The same episodes from their actions."""
+    return play_batch(suite, env, Replay(noted, env.num_envs, env.device), noted.first)

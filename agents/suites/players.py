@@ -1,0 +1,80 @@
+"""Policies of a suite, by the words that name them: what they see, and one for each env."""
+
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+from maexp.agents.errors import UserError
+from maexp.agents.policies.classical import POLICIES
+from maexp.agents.policies.hosted import HostedPolicy, greet
+from maexp.agents.policies.load import is_exported
+from maexp.agents.policies.own import plug_ins
+from maexp.agents.policies.process import APART, EXEC, command_of
+from maexp.agents.training.named import Player as Named
+from maexp.agents.training.named import find_player
+from maexp.agents.training.named import short_name as name_of
+from maexp.envs import ExplorationEnv, ObservationConfig
+
+
+class Player:
+    """A policy by the word that names it.
+
+    Args:
+        word: what `policy=` takes: a name or a folder; module:Class; `exec:COMMAND`, a program that speaks
+            `maexp.agents.policies.wire`; or `process:NAME`, one of ours as if it were a stranger's.
+        limit: processor time that a decision may take a policy in processes of its own [s].
+        patience: how long an answer of such a one may take otherwise [s].
+
+    Raises:
+        UserError: there is none of that name, it is damaged, or does not start.
+    """
+
+    def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0):
+        self.word, self.limit, self.patience = word, limit, patience
+        self.command = self._find_command()
+        self.name = short_name(word)
+        self.found: Named | None = None if self.hosted else find_player(word, name=self.name)
+
+    def _find_command(self) -> list[str] | None:
+        """Of a policy in processes of its own; None: it plays in this one."""
+        if not self.word.startswith((EXEC, APART)) and not is_own(self.word):
+            return None
+        try:
+            command = command_of(self.word)
+        except ValueError as error:
+            raise UserError(f"policy={self.word} cannot be started: {error}.") from error
+        if not greet(command, self.word):
+            raise UserError(f"policy={self.word} is no class with act(observation): see docs/arena.md.")
+        return command
+
+    @property
+    def hosted(self) -> bool:
+        """Whether each team has a process of its own."""
+        return self.command is not None
+
+    def observation(self) -> ObservationConfig:
+        """What its env shows."""
+        found = self.found
+        if found is None:
+            return ObservationConfig(pictures=False)
+        return ObservationConfig(map=found.map or "seen", pictures=found.pictures, targets=found.targets or 0)
+
+    def open(self, env: ExplorationEnv) -> AbstractContextManager[Callable]:
+        """The policy for an env; at the end of the context its processes end."""
+        if self.found is None:
+            return HostedPolicy(env, self.command, self.name, self.limit, self.patience)
+        return nullcontext(self.found.make(env))
+
+
+def is_own(word: str) -> bool:
+    """Whether this is module:Class or the name of a plug-in: told without running anything of it."""
+    if word in POLICIES or is_exported(word):
+        return False
+    return word in plug_ins() or (":" in word and not os.path.exists(word))
+
+
+def short_name(word: str) -> str:
+    """What tables call a policy: its name, that of its folder, or that of its program."""
+    if word.startswith(EXEC):
+        return os.path.basename(command_of(word)[0])
+    return word if ":" in word else name_of(word)

@@ -1,0 +1,108 @@
+"""A suite and its results as text: what is in it, a table, sentences; and a picture of the profiles."""
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.measure import Measurement
+from rich.table import Table
+
+from maexp.agents.evaluation.plots import COLOURS, LOOK, save
+from maexp.agents.suites.score import RANDOM
+from maexp.agents.suites.suite import Suite
+
+COLUMNS = ("part", "score", "95 % interval", RANDOM, "reference", "between", "less reference", "95 % at", "lost")
+
+
+def describe_suite(suite: Suite) -> list[str]:
+    """What `maexp suite show` prints."""
+    scores = suite.frozen.get("scores", {})
+    told = ", ".join(f"{name} {values['score']:.4f}" for name, values in scores.items())
+    lines = [
+        f"{suite.name}, version {suite.version}, checksum {suite.checksum[:16]}",
+        f"score: mean {suite.score} of {suite.episodes} episodes of each of {len(suite.parts)} parts",
+        f"frozen scores: {told or 'none yet'} (0 and 1 of the normalised score)",
+        "", "| part | maps | robots | radar [m] | starts | episode [s] |", "| --- | --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
+    for name, part in suite.parts.items():
+        maps = f"{part.scenario} {part.first} to {part.first + part.count - 1}"
+        robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"
+        seconds = f"{0.1 * part.limit:g}, a decision every {0.1 * part.local_steps:g}"
+        lines.append(f"| {name} | {maps} | {robots} | {part.radar['range']:g} | {part.starts} | {seconds} |")
+    return [*lines, "", f"File: {suite.path}"]
+
+
+def print_table(suite: Suite, results: dict[str, Any]) -> None:
+    """A row for each part and one for all."""
+    title = f"{results['policy']} on {suite.name}, version {suite.version}, checksum {suite.checksum[:16]}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in COLUMNS:
+        table.add_column(escape(column), justify="left" if column == "part" else "right", no_wrap=True)
+    reference, zero, name = results["reference"], results[RANDOM], suite.score
+    for part, one in results["parts"].items():
+        ends = (zero["parts"][part], reference["parts"][part])
+        table.add_row(part, *_cells(one[name], ends, one["normalised"], reference["differences"][part]), *_more(one))
+    ends = (zero["score"], reference["score"])
+    score = results["score"]
+    table.add_row("all", *_cells(score, ends, score["normalised"], reference["difference"][name]), "", "")
+    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
+    Console(width=max(natural, Console().width)).print(table)
+
+
+def _cells(score: dict, ends: tuple[float, float], normalised: float | None, less: dict) -> list[str]:
+    low, high = score["ci95"]
+    between = "-" if normalised is None else f"{normalised:.2f}"
+    mean, *interval = (100 * value for value in (less["mean"], *less["ci95"]))
+    difference = f"{mean:+.1f} [{interval[0]:+.1f}, {interval[1]:+.1f}]"
+    return [f"{score['mean']:.3f}", f"[{low:.3f}, {high:.3f}]", *(f"{end:.3f}" for end in ends), between, difference]
+
+
+def _more(part: dict) -> list[str]:
+    steps = part.get("coverage_step_95", {"n": 0})
+    when = f"{0.1 * steps['mean']:.1f} s ({steps['n']})" if steps["n"] else "-"
+    return [when, f"{part['collisions']['mean']:.2f}" if "collisions" in part else ""]
+
+
+def describe_results(suite: Suite, results: dict[str, Any]) -> list[str]:
+    """Sentences below the table."""
+    found, better = results["reference"]["difference"][suite.score], results["reference"]["improvement"]
+    low, high = (100 * end for end in found["ci95"])
+    where = "is ahead of" if low > 0 else "is behind" if high < 0 else "cannot be told from"
+    lines = [
+        f"{results['policy']} {where} the reference, {suite.reference} as it was frozen: {100 * found['mean']:+.2f} "
+        f"points of {suite.score} [{low:+.2f}, {high:+.2f}] in the same episodes. An episode of its is better than one "
+        f"of the reference with probability {better['mean']:.2f}.",
+    ]
+    if results["decisions"]["count"]:
+        spent = results["decisions"]
+        lines.append(
+            f"Processor time of the policy: {1000 * spent['mean_seconds']:.1f} ms a decision of a team, "
+            f"at most {1000 * spent['largest_seconds']:.0f} ms; no part of the score."
+        )
+    lost = {part: rows["lost"] for part, rows in results["episodes"].items() if rows["lost"]}
+    for part, reasons in lost.items():
+        number, reason = next(iter(reasons.items()))
+        lines.append(f"{part}: {len(reasons)} of {suite.episodes} episodes ended early, {number} first: {reason}.")
+    if not results["suite"]["frozen_maps"]:
+        lines.append(f"Other maps and starts, of seed {results['suite']['seed']}: not the score of {suite.name}.")
+    return lines
+
+
+def draw_profiles(suite: Suite, results: dict[str, Any], path: Path) -> Path:
+    """How many episodes are above each level of the score: the policy, the reference and random."""
+    names = {"policy": results["policy"], "reference": f"{suite.reference} (reference)", RANDOM: RANDOM}
+    with rc_context(LOOK):
+        figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+        ax = figure.subplots()
+        for number, (key, name) in enumerate(names.items()):
+            profile = results["profile"]
+            ax.plot(profile[suite.score], profile[key], color=COLOURS[number], label=name)
+        ax.set_xlabel(suite.score)
+        ax.set_ylabel("share of episodes above")
+        ax.set_title(f"{suite.name}, version {suite.version}", loc="left")
+        ax.legend()
+        return save(figure, path)

@@ -1,0 +1,112 @@
+"""A run of a suite: every part batch by batch, each kept as soon as it is done, then the score."""
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.errors import UserError, blame_input
+from maexp.agents.suites import folder
+from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
+from maexp.agents.suites.play import Batch, build_env, build_maps, play_batch
+from maexp.agents.suites.players import Player
+from maexp.agents.suites.score import summarise_suite
+from maexp.agents.suites.suite import Suite
+
+
+@dataclass
+class SuiteRun:
+    """What is played.
+
+    Attributes:
+        seed: None: the suite's own maps and starts
+        num_envs: teams at once
+        device: of the simulation
+        advance: called with the number of episodes that are done
+    """
+
+    suite: Suite
+    player: Player
+    where: Path
+    seed: int | None
+    num_envs: int
+    device: Any
+    advance: Callable[[int], None] = lambda count: None
+
+    def play(self) -> dict[str, Any]:
+        """Play what is left, write `results.json`, and return its content."""
+        begin = time.perf_counter()
+        batches, points = {}, {}
+        for name in self.suite.parts:
+            batches[name], points[name] = self._play_part(name)
+        with blame_input():
+            rivals = read_frozen(self.suite) if self.seed is None else play_rivals(self.suite, self.seed)["results"]
+        summary = summarise_suite(self.suite, folder.to_results(self.player.name, self.suite, batches), rivals)
+        code = folder.describe_code()
+        content = {
+            "format": folder.FORMAT,
+            "suite": folder.describe_suite(self.suite, self.seed),
+            "policy": self.player.name,
+            **summary,
+            "decisions": describe_decisions(batches),
+            "episodes": folder.describe_episodes(self.suite, batches),
+            "maps": points,
+            "files": folder.list_files(self.where),
+            "run": {
+                "policy": self.player.word, **code, "machine": folder.describe_machine(), "device": str(self.device),
+                "seconds": round(time.perf_counter() - begin, 1),
+            },
+        }  # fmt: skip
+        folder.write_results(self.where, content)
+        return content
+
+    def _play_part(self, name: str) -> tuple[list[Batch], dict[str, str]]:
+        """The batches of a part, and the checksums of its maps."""
+        suite, part = self.suite, self.suite.parts[name]
+        with blame_input():
+            maps = build_maps(part, self.seed)
+            if self.seed is None:
+                check_maps(suite, part, maps)
+        size = min(self.num_envs, suite.episodes)
+        played, env = [], None
+        with ExitStack() as stack:
+            for first in range(0, suite.episodes, size):
+                if folder.batch_file(self.where, name, first).exists():
+                    played.append(self._read(name, first))
+                else:
+                    if env is None:
+                        with blame_input():
+                            env = build_env(part, maps, size, suite.key(self.seed), self.player.observation(),
+                                            device=self.device)  # fmt: skip
+                            policy = stack.enter_context(self.player.open(env))
+                    played.append(play_batch(suite, env, policy, first))
+                    folder.write_batch(self.where, suite, name, played[-1])
+                self.advance(len(played[-1].decisions))
+        return played, sums(part, maps, self.seed)
+
+
+    def _read(self, name: str, first: int) -> Batch:
+        """A batch that was played before."""
+        try:
+            return folder.read_batch(self.where, self.suite, name, first)
+        except UserError as error:
+            raise UserError(f"{str(error).rstrip('.')}: remove it, and it is played again.") from error
+
+
+def describe_decisions(batches: dict[str, list[Batch]]) -> dict[str, Any]:
+    """Processor time that the decisions of a team took the policy [s]; no part of any score."""
+    several = [batch for one in batches.values() for batch in one]
+    spent = [batch.seconds[k, :count] for batch in several for k, count in enumerate(batch.decisions)]
+    seconds = np.concatenate(spent).astype(np.float64) if spent else np.zeros(0)
+    if not len(seconds):
+        return {"count": 0}
+    return {
+        "count": len(seconds),
+        "mean_seconds": float(seconds.mean()),
+        "median_seconds": float(np.median(seconds)),
+        "largest_seconds": float(seconds.max()),
+    }

@@ -1,0 +1,93 @@
+"""The score of a suite: mean over its episodes, beside `random` (0) and the reference planner (1), with intervals.
+
+Intervals resample the maps of each part and the episodes on each. Differences are paired: the same episodes.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.benchmark.compare import improvement
+from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.suites.suite import Suite
+from maexp.envs.metrics import resample_weights, resampled_means
+
+Results = dict[str, EvaluationResult]  # part -> its episodes
+RANDOM = "random"
+LEVELS = 101  # of a performance profile, from 0 to 1
+
+
+def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> dict[str, Any]:
+    """All that follows from the episodes of a policy.
+
+    Args:
+        mine: its episodes
+        frozen: those of `random` and of the reference planner, by name
+    """
+    name, theirs, worst = suite.score, frozen[suite.reference], frozen[RANDOM]
+    own, zero, one = (_values(name, results) for results in (mine, worst, theirs))
+    ends = {part: (zero[part].mean(), one[part].mean()) for part in own}
+    overall = mean_over_parts(mine, own)
+    return {
+        "score": overall | {"normalised": place_between(overall["mean"], mean_of(zero), mean_of(one))},
+        "parts": {
+            part: result.summary() | {"normalised": place_between(own[part].mean(), *ends[part])}
+            for part, result in mine.items()
+        },
+        RANDOM: {"score": mean_of(zero), "parts": {part: float(one.mean()) for part, one in zero.items()}},
+        "reference": {
+            "policy": suite.reference,
+            "score": mean_of(one),
+            "parts": {part: float(values.mean()) for part, values in one.items()},
+            "difference": {metric: subtract(mine, theirs, metric) for metric in suite.metrics},
+            "differences": {part: result.minus(theirs[part])[name] for part, result in mine.items()},
+            "improvement": improvement(own, one),
+        },
+        "profile": {
+            name: np.linspace(0.0, 1.0, LEVELS).round(3).tolist(),
+            "policy": profile(own), RANDOM: profile(zero), "reference": profile(one),
+        },
+    }  # fmt: skip
+
+
+def mean_of(values: dict[str, np.ndarray]) -> float:
+    """Mean over parts of the means of their episodes."""
+    return float(np.mean([one.mean() for one in values.values()]))
+
+
+def mean_over_parts(results: Results, values: dict[str, np.ndarray]) -> dict[str, Any]:
+    """{mean, ci95, n} of values [episodes] of each part; NaN where an episode has none."""
+    kept = {part: ~np.isnan(one) for part, one in values.items()}
+    have = {part: one for part, one in values.items() if kept[part].any()}
+    if not have:
+        return {"mean": np.nan, "ci95": [np.nan, np.nan], "n": 0}
+    means = []
+    for number, (part, one) in enumerate(have.items()):
+        weights = resample_weights(results[part].maps, seed=number)[:, kept[part]]
+        drawn = resampled_means(one[kept[part]], weights)
+        means.append(np.resize(drawn, len(weights)))  # a resample without any value is left out: others stand for it
+    low, high = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
+    middle = mean_of({part: one[kept[part]] for part, one in have.items()})
+    return {"mean": middle, "ci95": [float(low), float(high)], "n": int(sum(one.sum() for one in kept.values()))}
+
+
+def subtract(mine: Results, theirs: Results, metric: str) -> dict[str, Any]:
+    """`mean_over_parts` of the paired differences."""
+    pairs = {part: one.episodes[metric] - theirs[part].episodes[metric] for part, one in mine.items()}
+    return mean_over_parts(mine, pairs)
+
+
+def place_between(value: float, zero: float, one: float) -> float | None:
+    """Where a score lies between that of `random` (0) and that of the reference (1); None where these are the same."""
+    return None if one == zero else float((value - zero) / (one - zero))
+
+
+def profile(values: dict[str, np.ndarray]) -> list[float]:
+    """Performance profile (Agarwal et al. 2021): the share of episodes above each level, every part counting alike."""
+    levels = np.linspace(0.0, 1.0, LEVELS)
+    shares = [(one[:, None] > levels).mean(0) for one in values.values()]
+    return np.mean(shares, axis=0).round(6).tolist()
+
+
+def _values(metric: str, results: Results) -> dict[str, np.ndarray]:
+    return {part: one.episodes[metric] for part, one in results.items()}

@@ -1,0 +1,230 @@
+"""A suite: parts with their maps, robots, radar, radios, starts and episodes, from a file that never changes.
+
+`NAME.yaml` defines it and ends with what was frozen: checksums of the points of its maps, the scores of `random` and of
+the reference planner, and a checksum over all of it. `NAME.csv` holds their episodes.
+"""
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+import maexp.conf
+from maexp.agents.errors import UserError
+from maexp.envs.config import STARTS
+from maexp.envs.scenarios import SCENARIOS
+
+FOLDER = Path(maexp.conf.__path__[0]) / "_suite"
+KEYS = ("name", "version", "score", "metrics", "reference", "seed", "episodes", "decision_limit", "parts")
+PART_KEYS = (
+    "scenario", "first", "count", "num_robots", "starts", "local_steps", "macro_steps", "success_coverage", "collision",
+    "robot", "radar", "planner", "comm",
+)  # fmt: skip
+OTHER_MAPS = 10_000, 2**31
+"""Between these lie the numbers of the maps of another seed."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Teams of one size on maps of one scenario; fields as in the file, lengths in metres, times in local steps."""
+
+    name: str
+    scenario: str
+    first: int
+    count: int
+    num_robots: int
+    starts: str
+    local_steps: int
+    macro_steps: int
+    success_coverage: float
+    collision: str
+    robot: dict
+    radar: dict
+    planner: dict
+    comm: dict
+
+    @property
+    def limit(self) -> int:
+        """Local steps of an episode."""
+        return self.local_steps * self.macro_steps
+
+    def indices(self, seed: int | None = None) -> list[int]:
+        """Numbers of its maps in the scenario; of another `seed` others, none of them twice."""
+        if seed is None:
+            return list(range(self.first, self.first + self.count))
+        drawn = np.random.default_rng([seed, *self.scenario.encode()]).integers(*OTHER_MAPS, 4 * self.count)
+        return list(dict.fromkeys(drawn.tolist()))[: self.count]
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A suite as its file has it; `content` is all that the file says."""
+
+    path: Path
+    content: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        return self.content["name"]
+
+    @property
+    def version(self) -> int:
+        return self.content["version"]
+
+    @property
+    def seed(self) -> int:
+        return self.content["seed"]
+
+    def key(self, seed: int | None) -> int:
+        """What random numbers of a run start from; `seed` None: the suite's own."""
+        return self.seed if seed is None else seed
+
+    @property
+    def episodes(self) -> int:
+        """Episodes of each part."""
+        return self.content["episodes"]
+
+    @property
+    def score(self) -> str:
+        """The metric whose mean over all episodes is the score."""
+        return self.content["score"]
+
+    @property
+    def metrics(self) -> list[str]:
+        return self.content["metrics"]
+
+    @property
+    def reference(self) -> str:
+        """The planner whose score counts as 1."""
+        return self.content["reference"]
+
+    @property
+    def decision_limit(self) -> float:
+        """Processor time that a decision may take a policy in a process of its own [s]."""
+        return self.content["decision_limit"]
+
+    @cached_property
+    def parts(self) -> dict[str, Part]:
+        return {name: Part(name, **values) for name, values in self.content["parts"].items()}
+
+    @property
+    def frozen(self) -> dict[str, Any]:
+        """What `maexp suite freeze` wrote; {} before."""
+        return self.content.get("frozen", {})
+
+    @property
+    def episodes_file(self) -> Path:
+        """The episodes of `random` and of the reference planner."""
+        return self.path.with_suffix(".csv")
+
+    @cached_property
+    def checksum(self) -> str:
+        """SHA-256 over the definition, the points of the maps, the frozen scores and the frozen episodes."""
+        frozen = {name: value for name, value in self.frozen.items() if name not in ("checksum", "made")}
+        text = json.dumps(_plain(self.content | {"frozen": frozen}), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def check(self) -> None:
+        """Raise UserError unless the file and the episodes beside it are as they were frozen."""
+        if not self.frozen:
+            raise UserError(f"{self.path} is not frozen: play its reference with maexp suite freeze {self.path}.")
+        if sha256(self.episodes_file) != self.frozen["episodes"]:
+            raise UserError(f"{self.episodes_file} is not the file that {self.path.name} was frozen with: restore it.")
+        if self.checksum != self.frozen["checksum"]:
+            raise UserError(
+                f"{self.path} was changed since it was frozen (checksum {self.checksum[:16]}, not "
+                f"{self.frozen['checksum'][:16]}): restore it, or give it a new version and freeze it."
+            )
+
+
+def suite_names() -> list[str]:
+    """The suites that come with the package, the quick one first."""
+    return sorted((one.stem for one in FOLDER.glob("*.yaml")), key=lambda name: (name != "minival", name))
+
+
+def load_suite(word: str) -> Suite:
+    """A suite by its name, or by the path of its .yaml file.
+
+    Raises:
+        UserError: there is none of that name, or its file does not define one.
+    """
+    path = FOLDER / f"{word}.yaml" if word in suite_names() else Path(word).expanduser()
+    if path.suffix not in (".yaml", ".yml") or not path.is_file():
+        raise UserError(f"{word} is no suite: choose one of {', '.join(suite_names())}, or give a .yaml file.")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path} cannot be read as YAML ({' '.join(str(error).split())[:200]}).") from error
+    _check_content(path, content)
+    return Suite(path, content)
+
+
+def sha256(path: Path) -> str:
+    """Of a file; "" where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _plain(value: Any) -> Any:
+    """For JSON: infinity as text, keys as text."""
+    if isinstance(value, dict):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_plain(one) for one in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_content(path: Path, content: Any) -> None:
+    _check_keys(path, "", content, KEYS, ("frozen",))
+    for name in ("version", "episodes"):
+        _check_count(path, name, content[name])
+    _check_count(path, "seed", content["seed"], least=0)
+    if content["score"] not in content["metrics"]:
+        raise UserError(f"{path}: score={content['score']} must be one of the metrics.")
+    if not isinstance(content["parts"], dict) or not content["parts"]:
+        raise UserError(f"{path}: parts must name at least one part.")
+    for name, part in content["parts"].items():
+        _check_keys(path, f"parts.{name}.", part, PART_KEYS)
+        for count in ("count", "num_robots", "local_steps", "macro_steps"):
+            _check_count(path, f"parts.{name}.{count}", part[count])
+        _check_count(path, f"parts.{name}.first", part["first"], least=0)
+        scenario = SCENARIOS.get(part["scenario"])
+        if scenario is None or scenario.build is None:
+            raise UserError(f"{path}: parts.{name}.scenario={part['scenario']} builds no maps.")
+        if part["starts"] not in STARTS:
+            raise UserError(f"{path}: parts.{name}.starts={part['starts']} is unknown: choose {', '.join(STARTS)}.")
+        for group, kind in _configs().items():
+            _check_group(path, f"parts.{name}.{group}", part[group], kind)
+
+
+def _configs() -> dict[str, type]:
+    from maexp.envs.config import CommConfig, PlannerConfig, RadarConfig, RobotConfig
+
+    return {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig, "comm": CommConfig}
+
+
+def _check_group(path: Path, name: str, values: Any, kind: type) -> None:
+    """Every value that a scenario would else fill in must be given: the table of scenarios may change."""
+    known = [one.name for one in fields(kind)]
+    _check_keys(path, f"{name}.", values, [one.name for one in fields(kind) if one.default is None], known)
+
+
+def _check_keys(path: Path, prefix: str, content: Any, needed, allowed=()) -> None:
+    if not isinstance(content, dict):
+        raise UserError(f"{path} does not define a suite: {prefix.rstrip('.') or 'it'} must hold names with values.")
+    for name in needed:
+        if name not in content:
+            raise UserError(f"{path} leaves {prefix}{name} open: a suite fixes it.")
+    for name in content:
+        if name not in needed and name not in allowed:
+            raise UserError(f"{path}: {prefix}{name} is unknown: choose among {', '.join((*needed, *allowed))}.")
+
+
+def _check_count(path: Path, name: str, value: Any, least: int = 1) -> None:
+    if type(value) is not int or value < least:
+        raise UserError(f"{path}: {name}={value} must be a whole number, {least} or more.")

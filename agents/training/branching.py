@@ -1,0 +1,245 @@
+"""What a team's choices are worth, found by trying them: branches of episodes in the true simulator, as data.
+
+`python -m maexp.agents.training.branching out=FOLDER` plays `cost_utility` on the training maps of every scenario, by
+the targets that a learned policy sees. At some decisions every robot in turn tries a few of its candidates while the
+others keep to their choices; the rollout policy plays on. What is written is what the policy saw, and how much more a
+candidate was worth than the own choice: `branches_<scenario>_<round>.npz`. A file that is there is kept, so a run that
+was stopped goes on.
+
+The true map is used here alone: nothing of it is among the features.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torchrl.envs.utils import step_mdp
+
+from maexp.agents.errors import UserError
+from maexp.agents.files import write_file, write_text
+from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
+from maexp.agents.networks.distributions import ACTION
+from maexp.agents.policies.lookahead import list_candidates
+from maexp.agents.policies.rollouts import Rollouts, pick_places
+from maexp.agents.settings.ranges import check_ranges, number, whole
+from maexp.envs import ExplorationEnv, LookaheadConfig, ObservationConfig, PlannerConfig, make_map
+from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
+from maexp.envs.target_view import FEATURES
+
+SHOWN = 24  # candidates that a policy sees
+DEPARTURE = 0.3  # random part of what a departing robot thinks of candidates [radar discs]
+NEVER = -1e9  # stands for what there is not, where numbers must be finite
+GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
+SCORE, TRAVEL = FEATURES.index("score"), FEATURES.index("travel")
+
+
+@dataclass(frozen=True)
+class BranchingConfig:
+    """Which branches are played.
+
+    Attributes:
+        out: folder for the files.
+        scenarios: whose training maps are played; validation and held-out maps never are.
+        robots: of a team.
+        teams: played at once, each an episode a round.
+        rounds: files of each scenario.
+        every: decisions from one that is branched at to the next.
+        candidates: that a robot tries, its own choice among them.
+        horizon: decisions that are played in a branch.
+        departures: share of the episodes' decisions in which a team departs from what `cost_utility` chooses.
+        seed: of starts, departures and what is tried.
+    """
+
+    out: str = "branches"
+    scenarios: list[str] = field(default_factory=lambda: list(GENERATED))
+    robots: int = whole(3, 1, 64)
+    teams: int = whole(24, 1, 1024)
+    rounds: int = whole(2)
+    every: int = whole(2)
+    candidates: int = whole(5, 2, 24)
+    horizon: int = whole(4, 1, 100)
+    departures: float = number(0.3, 0.0, 1.0)
+    seed: int = whole(0, 0)
+
+
+class BranchPlayer:
+    """Teams that see targets, and what their candidates are worth.
+
+    Args:
+        env: of the teams; shows targets.
+        candidates, horizon: as in `BranchingConfig`.
+        seed: of what is tried.
+    """
+
+    def __init__(self, env: ExplorationEnv, candidates: int, horizon: int, seed: int = 0):
+        self.env, self.view = env, env.target_view
+        config = LookaheadConfig(candidates=candidates, horizon=horizon)
+        self.rollouts = Rollouts(env, config, self.view.tracker, true_world=True)
+        self.draw = torch.Generator().manual_seed(seed)
+
+    def try_candidates(self, features: torch.Tensor, preference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What candidates of every team are worth beside the choice by `preference`.
+
+        Args:
+            features: float32 [E, N, M, F], what the teams see now.
+            preference: float32 [E, N, M], as for `TargetView.take`.
+
+        Returns:
+            int64 [E, N, K], the candidates tried, the own choice first, -1 = none; float32 [E, N, K], how much more
+            than the own choice they were worth [radar discs], NaN where they were not played.
+        """
+        s, tracker = self.view.state, self.view.tracker
+        preference = torch.where(s["mask"], preference, -torch.inf)
+        own, waits = tracker.share(preference, s["way"], s["point"])
+        index = list_candidates(self.rank_for_trial(features), own, self.rollouts.config.candidates)
+        place, there = index.clamp_min(0), index >= 0
+        block = torch.where(there, s["block"].gather(2, place), -1)
+        region, offset = self.rollouts.goals(block, s["cell"].gather(2, place), pick_places(s["toward"], place), waits)
+        active = self.env.simulation.tensors["active"] != 0
+        there = there & active.view(-1, 1, 1)
+        there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & there[..., :1]
+        mine = {"region": region, "offset": offset, "block": block, "wanted": there}
+        worth = torch.full(index.shape, torch.nan)
+        for some in active.nonzero().squeeze(-1).split(self.rollouts.teams):
+            worth[some] = self._weigh(some, {name: one[some] for name, one in mine.items()})
+        return torch.where(there, index, -1), worth - worth[..., :1]
+
+    def rank_for_trial(self, features: torch.Tensor) -> torch.Tensor:
+        """What each robot tries first, float32 [E, N, M]: the best of a classical score whose weight of the way is
+        drawn for every robot, so that near candidates are tried as well as those where there is much to see."""
+        mask = self.view.state["mask"]
+        beta = torch.empty(mask.shape[:2]).uniform_(0.0, 0.3, generator=self.draw).unsqueeze(-1)
+        value = features[..., SCORE] - beta * features[..., TRAVEL].expm1()
+        return torch.where(mask, value, -torch.inf)
+
+    def _weigh(self, teams: torch.Tensor, mine: dict[str, torch.Tensor]) -> torch.Tensor:
+        """What each robot's candidates are worth while the others keep to their own choices, float32 [T, N, K]."""
+        kept, found = self.rollouts.look(teams), []
+        chosen = torch.zeros(mine["block"].shape[:2], dtype=torch.int64)
+        for robot in range(chosen.shape[1]):
+            wanted = mine["wanted"][:, robot]
+            worth = self.rollouts.weigh(robot, mine, chosen, wanted, kept)
+            kept = self.rollouts.keep(kept, worth, wanted, chosen[:, robot])
+            found.append(torch.where(wanted, worth, torch.nan))
+        return torch.stack(found, 1)
+
+
+@torch.no_grad()
+def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfig) -> dict[str, np.ndarray]:
+    """An episode of every team; what was seen and found at the decisions that were branched at.
+
+    Returns:
+        "features" float16 [D, N, M, F], "mask" bool [D, N, M], "index" int8 [D, N, K], "advantage" float32 [D, N, K],
+        "team" int16 [D], "map" int16 [D] (of the env's), "decision" int16 [D]; D decisions of a team.
+
+    Raises:
+        UserError: no decision was branched at.
+    """
+    found, td, draw = [], env.reset(), player.draw
+    running = torch.ones(env.num_envs, dtype=torch.bool)
+    phase = int(torch.randint(config.every, (1,), generator=draw))
+    share = 2.0 * config.departures * torch.rand(env.num_envs, 1, generator=draw)
+    for step in range(env.macro_steps):
+        features, mask = td[TARGETS], td[TARGETS_MASK]
+        preference = torch.where(mask, features[..., SCORE], NEVER)
+        if step % config.every == phase:
+            found += [describe(env, step, features, mask, *player.try_candidates(features, preference))]
+        leaves = torch.rand(mask.shape[:2], generator=draw) < share
+        other = player.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
+        preference = torch.where(leaves.unsqueeze(-1), other, preference).clamp_min(NEVER)
+        td[(*ACTION, "preference")], td[(*ACTION, "target")] = preference, preference.argmax(-1)
+        td = env.step(td)
+        running = running & ~td["next", "done"].squeeze(-1)
+        if not bool(running.any()):
+            break
+        td = step_mdp(td)
+    if not found:
+        raise UserError(f"every={config.every}: the episodes were over before any decision was branched at: lower it.")
+    return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+
+
+def describe(
+    env: ExplorationEnv, step: int, features: torch.Tensor, mask: torch.Tensor, index: torch.Tensor,
+    advantage: torch.Tensor,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """The teams that had anything to choose at a decision, as `play_round` returns them."""
+    teams = (index[..., 1:] >= 0).flatten(1).any(1).nonzero().squeeze(-1)
+    columns = {
+        "features": features.half(), "mask": mask, "index": index.to(torch.int8), "advantage": advantage,
+        "map": env.simulation.tensors["map_id"].to(torch.int16),
+    }  # fmt: skip
+    return {name: one[teams].numpy() for name, one in columns.items()} | {
+        "team": teams.to(torch.int16).numpy(), "decision": np.full(len(teams), step, np.int16)
+    }  # fmt: skip
+
+
+def training_maps(scenario: str) -> list[int]:
+    """Indices of the maps that are trained on."""
+    return list(cut_last_fifth(split(scenario)[0])[0])
+
+
+def write_branches(config: BranchingConfig) -> None:
+    """Play what is missing and write it, round by round; the costs go to `costs.csv`."""
+    folder = Path(config.out)
+    for turn in range(config.rounds):
+        for scenario in config.scenarios:
+            place = folder / f"branches_{scenario}_{turn}.npz"
+            if not place.exists():
+                _write_round(config, scenario, turn, place)
+
+
+def _write_round(config: BranchingConfig, scenario: str, turn: int, place: Path) -> None:
+    begin, seed = time.perf_counter(), (config.seed << 12) + turn
+    rng = np.random.default_rng([seed, *scenario.encode()])
+    indices = training_maps(scenario)
+    maps = [make_map(scenario, int(k)) for k in rng.choice(indices, min(config.teams, len(indices)), replace=False)]
+    env = ExplorationEnv(
+        maps, config.teams, config.robots, seed=seed, num_threads=1,
+        planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(pictures=False, targets=SHOWN),
+    )  # fmt: skip
+    found = play_round(env, BranchPlayer(env, config.candidates, config.horizon, seed), config)
+    write_file(place, lambda file: np.savez_compressed(file, names=np.array([one.name for one in maps]), **found))
+    tried, seconds = int(np.isfinite(found["advantage"]).sum()), time.perf_counter() - begin
+    log = place.parent / "costs.csv"
+    lines = log.read_text() if log.exists() else "scenario,round,decisions,branches,seconds\n"
+    write_text(log, f"{lines}{scenario},{turn},{len(found['team'])},{tried},{seconds:.1f}\n")
+    print(f"{place.name}: {len(found['team'])} decisions, {tried} branches, {seconds:.0f} s", flush=True)
+
+
+def read_config(words: list[str]) -> BranchingConfig:
+    """The settings given as `name=value`.
+
+    Raises:
+        UserError: a name or value that is none.
+    """
+    try:
+        given = OmegaConf.merge(OmegaConf.structured(BranchingConfig), OmegaConf.from_dotlist(words))
+        config = BranchingConfig(**{one.name: given[one.name] for one in fields(BranchingConfig)})
+        check_ranges(config, "branching")
+        for name in config.scenarios:
+            if find_scenario(name).build is None:
+                raise ValueError(f"scenarios={name} has no training maps: choose among {', '.join(GENERATED)}.")
+    except (OmegaConfBaseException, ValueError) as error:
+        raise UserError(" ".join(str(error).split())) from error
+    return config
+
+
+def main(words: list[str]) -> int:
+    """The command; see the head of this file."""
+    try:
+        write_branches(read_config(words))
+    except UserError as error:
+        print(f"branching: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,225 @@
+"""Train the map predictor on beliefs that `maexp.agents.training.beliefs` wrote.
+
+`python -m maexp.agents.training.map_predictor data=FOLDER out=FOLDER` goes on where it was stopped, with the same
+numbers as if it had not been.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from scipy import ndimage
+from torch.nn import functional as F
+
+from maexp.agents.errors import UserError
+from maexp.agents.files import write_file, write_text
+from maexp.agents.networks.map_predictor import MapPredictor
+from maexp.agents.settings.ranges import check_ranges, number, whole
+from maexp.agents.training.beliefs import Episode, load_groups
+from maexp.kernels.frontier import FREE, UNKNOWN
+
+BAND = 2.0  # radar ranges from known free ground within which cells count
+EDGE = 8  # cells at the edge of a crop that do not count: what is known beyond is cut off
+CHECKPOINT, LOG = "checkpoint.pt", "metrics.csv"
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """How the predictor is trained.
+
+    Attributes:
+        data: folder of beliefs.
+        out: folder of the checkpoint and the log.
+        start: folder of an earlier training whose weights are the first ones; "": none.
+        width: channels of the network's finest level.
+        steps: gradient steps of the whole training.
+        batch: beliefs in a step.
+        crop: side of the square cut out around a frontier cell of each [cells].
+        learning_rate: of Adam after 100 steps; falls to 0 along a cosine.
+        seed: of weights and of what is drawn.
+        save_every: steps between checkpoints.
+    """
+
+    data: str = "beliefs"
+    out: str = "map_predictor"
+    start: str = ""
+    width: int = whole(16, 1, 256)
+    steps: int = whole(4000)
+    batch: int = whole(16, 1, 4096)
+    crop: int = whole(80, 32, 512)
+    learning_rate: float = number(2e-3, 0.0, 1.0, open_ends=True)
+    seed: int = whole(0, 0)
+    save_every: int = whole(100)
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Beliefs to learn from.
+
+    Attributes:
+        known: uint8 [B, S, S].
+        truth: bool [B, S, S], what is free.
+        counts: bool [B, S, S], unknown cells that the loss is about.
+    """
+
+    known: torch.Tensor
+    truth: torch.Tensor
+    counts: torch.Tensor
+
+
+def draw_crops(groups: dict[str, list[Episode]], count: int, side: int, rng: np.random.Generator) -> Crops:
+    """Beliefs of scenarios drawn evenly, around frontier cells, turned and mirrored."""
+    names = sorted(groups)
+    drawn = []
+    while len(drawn) < count:
+        group = groups[names[rng.integers(len(names))]]
+        episode = group[rng.integers(len(group))]
+        known = episode.known(int(rng.integers(episode.decisions)))
+        crop = cut_around(known, episode, side, rng)
+        if crop is not None:
+            drawn.append(turn(crop, int(rng.integers(8))))
+    known, truth, counts = (torch.from_numpy(np.stack(one)) for one in zip(*drawn, strict=True))
+    return Crops(known, truth, counts)
+
+
+def cut_around(known: np.ndarray, episode: Episode, side: int, rng: np.random.Generator):
+    """A square around a frontier cell that is drawn: known, truth, counts, [side, side] each; None without frontier."""
+    frontier = np.argwhere((known == FREE) & ndimage.binary_dilation(known == UNKNOWN))
+    if not len(frontier):
+        return None
+    corner = frontier[rng.integers(len(frontier))] - side // 2 + rng.integers(-side // 8, side // 8 + 1, 2)
+    known, truth = (cut(one, corner, side) for one in (known, episode.truth))
+    counts = matters(known, BAND * episode.reach)
+    counts[:EDGE] = counts[-EDGE:] = False
+    counts[:, :EDGE] = counts[:, -EDGE:] = False
+    return known, truth, counts
+
+
+def cut(grid: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
+    """The square of `side` cells from `corner` on; 0 outside of the grid."""
+    out = np.zeros((side, side), dtype=grid.dtype)
+    low, high = np.maximum(corner, 0), np.minimum(corner + side, grid.shape)
+    to = low - corner
+    size = np.maximum(high - low, 0)
+    out[to[0] : to[0] + size[0], to[1] : to[1] + size[1]] = grid[low[0] : low[0] + size[0], low[1] : low[1] + size[1]]
+    return out
+
+
+def matters(known: np.ndarray, band: float) -> np.ndarray:
+    """Unknown cells within `band` cells of known free ground, bool [H, W]."""
+    if not (known == FREE).any():
+        return np.zeros(known.shape, dtype=bool)
+    return (known == UNKNOWN) & (ndimage.distance_transform_edt(known != FREE) <= band)
+
+
+def turn(grids: tuple[np.ndarray, ...], number: int) -> list[np.ndarray]:
+    """One of the eight symmetries of a square."""
+    turned = [np.rot90(one, number % 4) for one in grids]
+    return [np.ascontiguousarray(one.T if number >= 4 else one) for one in turned]
+
+
+def rate(step: int, config: PredictorConfig) -> float:
+    """The learning rate of a step."""
+    return config.learning_rate * min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+
+
+def train_predictor(config: PredictorConfig, report: Callable[[str], None] = print) -> MapPredictor:
+    """Train, or go on, to the end.
+
+    Raises:
+        ValueError: a setting is out of its range, or the folder holds a training with others.
+    """
+    check_ranges(config, "map_predictor")
+    groups = load_groups(Path(config.data))
+    torch.manual_seed(config.seed)
+    net = start_net(config).to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=config.learning_rate, weight_decay=1e-4)
+    step, rows = resume(config, net, optimizer)
+    begin, losses = time.perf_counter(), []
+    while step < config.steps:
+        crops = draw_crops(groups, config.batch, config.crop, np.random.default_rng([config.seed, step]))
+        for group in optimizer.param_groups:
+            group["lr"] = rate(step, config)
+        loss = F.binary_cross_entropy_with_logits(net(crops.known)[crops.counts], crops.truth[crops.counts].float())
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimizer.step()
+        losses.append(loss.item())
+        step += 1
+        if step % config.save_every == 0 or step == config.steps:
+            rows.append([step, float(np.mean(losses))])
+            losses = []
+            save(config, net, optimizer, step, rows)
+            report(f"step {step} of {config.steps}: log-loss {rows[-1][1]:.4f}, {time.perf_counter() - begin:.0f} s")
+    return net.eval()
+
+
+def start_net(config: PredictorConfig) -> MapPredictor:
+    """The network before the first step."""
+    net = MapPredictor(config.width)
+    if config.start:
+        path = Path(config.start) / CHECKPOINT
+        saved = torch.load(path, weights_only=True) if path.is_file() else {"config": {"width": 0}}
+        if saved["config"]["width"] != config.width:
+            raise UserError(
+                f"start={config.start} holds no training with width={config.width}: give the folder of one."
+            )
+        net.load_state_dict(saved["net"])
+    return net
+
+
+def resume(config: PredictorConfig, net: MapPredictor, optimizer: torch.optim.Optimizer) -> tuple[int, list]:
+    """Where a training stands, and the rows of its log."""
+    path = Path(config.out) / CHECKPOINT
+    if not path.exists():
+        return 0, []
+    saved = torch.load(path, weights_only=True)
+    now = trained_with(config)
+    if saved["config"] != now:
+        other = next(name for name in now if saved["config"].get(name) != now[name])
+        raise UserError(
+            f"out={config.out} holds a training with {other}={saved['config'].get(other)}, not {now[other]}: set that, "
+            "or give another folder."
+        )
+    net.load_state_dict(saved["net"])
+    optimizer.load_state_dict(saved["optimizer"])
+    return saved["step"], saved["rows"]
+
+
+def trained_with(config: PredictorConfig) -> dict:
+    """Settings that the weights depend on."""
+    return {name: value for name, value in asdict(config).items() if name not in ("data", "out", "start", "save_every")}
+
+
+def save(config: PredictorConfig, net: MapPredictor, optimizer: torch.optim.Optimizer, step: int, rows: list) -> None:
+    """Checkpoint and log."""
+    content = {"config": trained_with(config), "net": net.state_dict(), "optimizer": optimizer.state_dict(),
+               "step": step, "rows": rows}  # fmt: skip
+    write_file(Path(config.out) / CHECKPOINT, lambda file: torch.save(content, file))
+    lines = ["step,log_loss", *(f"{one},{loss:.6f}" for one, loss in rows)]
+    write_text(Path(config.out) / LOG, "\n".join(lines) + "\n")
+
+
+def main() -> int:
+    """Train as the command line says."""
+    try:
+        words = OmegaConf.merge(OmegaConf.structured(PredictorConfig), OmegaConf.from_cli())
+        train_predictor(OmegaConf.to_object(words), report=lambda line: print(line, flush=True))
+    except (OmegaConfBaseException, UserError, ValueError) as error:
+        print(str(error).splitlines()[0], file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""One's own policies, runs and exported ones in the commands that take minutes: benchmark, warm start, view."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from maexp.agents.cli import main
+from maexp.agents.training.checkpoint import load_checkpoint
+from maexp.agents.training.named import find_player
+
+TINY = [
+    "preset=smoke", "num_envs=2", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0]",
+    "scenario.held_out=[70]", "device=cpu",
+]  # fmt: skip
+TEACHER = '''
+import torch
+
+class First:
+    def __init__(self, env):
+        self.shape = (env.num_envs, env.num_robots)
+    def __call__(self, td):
+        td["agents", "action", "target"] = torch.zeros(self.shape, dtype=torch.int64)
+
+def regions(env):
+    from maexp.agents.policies import POLICIES
+    return POLICIES["voronoi"](env)
+'''
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with a module, a run on targets and a run on regions."""
+    folder = tmp_path_factory.mktemp("own runs")
+    (folder / "teachers.py").write_text(TEACHER)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name, words in (("aims", ["action=targets"]), ("regions", ["action=regions", "model.channels=4"])):
+            words = [*TINY, *words, "total_frames=6", "episodes=0", f"hydra.run.dir={name}"]
+            assert main(["train", *words]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def inside(place, monkeypatch):
+    monkeypatch.chdir(place)
+
+
+def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
+    words = ["policy=aims,regions,universal", "episodes=2", "num_envs=2", "num_robots=2", "scenario.macro_steps=2"]
+    assert main(["evaluate", *words, "scenario.held_out=[70]", "device=cpu", "hydra.run.dir=beside"]) == 0
+    found = json.loads(Path("beside/results.json").read_text())
+    assert list(found)[:3] == ["aims", "regions", "universal"] and set(found["difference"]["aims"]) > {"universal"}
+    alone = ["checkpoint=aims", "episodes=2", "scenario.macro_steps=2", "reward=default"]
+    assert main(["evaluate", *alone, "scenario.local_steps=20", "hydra.run.dir=alone"]) == 0
+    trained = json.loads(Path("alone/results.json").read_text())["trained"]
+    assert trained["coverage_auc"] == found["aims"]["coverage_auc"]
+    saved = find_player("aims").saved
+    assert load_checkpoint(Path("aims/checkpoints/iteration_000001.pt"))["maps"] == saved["maps"]
+    saved["maps"] = dict.fromkeys(saved["maps"], "0" * 16)
+    from maexp.envs import make_map
+
+    with pytest.warns(UserWarning, match="maze_small_70 has changed"):
+        find_player("aims").__class__("aims", None, "checkpoint", saved=saved).check_maps([make_map("maze_small", 70)])
+
+
+def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
+    words = [*TINY[:4], "scenarios=maze_small", "algorithms=[]", "seeds=0", "episodes=2", "scenario.macro_steps=2",
+             "test_maps=1", "workers=1", "estimate=false", "device=cpu"]  # fmt: skip
+    policies = "policies=[voronoi,universal,teachers:First,aims,./regions]"
+    assert main(["benchmark", *words, policies, "hydra.run.dir=table"]) == 0
+    names = ["voronoi", "universal", "teachers.First", "aims", "regions"]
+    summary = json.loads(Path("table/summary.json").read_text())
+    assert [name for name in summary["maze_small"] if name != "difference"] == names
+    assert set(summary["maze_small"]["difference"]) == set(names[1:])
+    assert Path("table/table.md").read_text().count("teachers.First") >= 2
+    cells = {one.parent.parent.name for one in Path("table/cells").glob("*/*/*/held_out.json")}
+    assert cells == set(names)
+    capsys.readouterr()
+    assert main(["benchmark", "resume=table"]) == 0
+    source = Path("teachers.py").read_text()
+    Path("teachers.py").write_text(source + "# changed\n")
+    assert main(["benchmark", "resume=table"]) == 2
+    assert "policies: teachers.First has changed since its cells in " in capsys.readouterr().err
+    Path("teachers.py").write_text(source)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["policies=nobody"], "policies=nobody is unknown: choose one of random"),
+        (["policies=teachers:nobody"], "policies=teachers:nobody: teachers has no nobody"),
+        (["policies=aims,aims"], "names aims twice"),
+    ],
+)
+def test_a_benchmark_names_what_it_cannot_play(words, told, capsys):
+    assert main(["benchmark", "algorithms=[]", *words]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_ones_own_policy_is_a_teacher_and_is_told_what_it_must_choose(capsys):
+    words = [*TINY, "total_frames=6", "episodes=0", "warm_start_frames=6"]
+    assert main(["train", *words, "warm_start=teachers:First", "hydra.run.dir=pupil"]) == 0
+    assert Path("pupil/warm_start.csv").is_file()
+    assert main(["train", *words, "warm_start=teachers:regions", "hydra.run.dir=lost"]) == 2
+    told = capsys.readouterr().err
+    assert "warm_start=teachers:regions wrote region and offset, and the policy that is to imitate it chooses" in told
+    for word, sentence in (("regions", "chooses regions, which a policy with action=targets"),
+                           ("nobody", "warm_start=nobody is unknown")):  # fmt: skip
+        assert main(["train", *words, f"warm_start={word}", "hydra.run.dir=no"]) == 2
+        assert sentence in capsys.readouterr().err
+
+
+def test_a_team_of_ones_own_can_be_seen(capsys):
+    words = ["view", "policy=teachers:regions", "scenario=maze_small", "out=team.png", "renderer=painter"]
+    assert main([*words, "scenario.macro_steps=2", "num_robots=2", "hydra.run.dir=seen"]) == 0
+    assert Path("team.png").is_file() and "teachers.regions" in capsys.readouterr().out
+    assert Path("seen/episodes/teachers.regions_0.npz").is_file()
+
+
+def test_what_stands_beside_a_training_may_be_ones_own(capsys):
+    shutil.rmtree("beside_training", ignore_errors=True)
+    words = [*TINY, "total_frames=6", "episodes=2", "classical=[voronoi,universal,teachers:regions]"]
+    assert main(["train", *words, "hydra.run.dir=beside_training"]) == 0
+    summary = json.loads(Path("beside_training/summary.json").read_text())
+    assert list(summary)[:5] == ["trained", "random", "voronoi", "universal", "teachers.regions"]
+    assert summary["voronoi"] == summary["teachers.regions"]
