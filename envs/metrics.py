@@ -12,6 +12,9 @@ from maexp.kernels.reward import MARKS
 
 RESAMPLES = 5000
 GROUPED_RESAMPLES = 2000  # of maps, seeds and episodes: each takes a weight for every episode
+LEAST_DISTINCT = 5
+"""Distinct episodes that an interval takes: of two or three, a bootstrap's 95 % interval is their range, which holds
+the true mean in half or three quarters of all cases."""
 
 
 def succeeded(coverage: torch.Tensor, success_coverage: float) -> torch.Tensor:
@@ -65,30 +68,55 @@ def in_reach(metric: str, success_coverage: float) -> bool:
     return mark is None or int(mark[1]) <= round(100 * success_coverage, 6)
 
 
-def resample_weights(*factors: np.ndarray, seed: int = 0) -> np.ndarray:
+def label_copies(maps: np.ndarray, *tables: dict[str, np.ndarray]) -> np.ndarray:
+    """A number for each episode, the same for copies: the same map, and the same metrics to the last bit.
+
+    Where all episodes begin alike and nothing is drawn in them, many say no more than one.
+
+    Args:
+        maps: of each episode, labels [episodes]
+        tables: the metrics [episodes] of each policy that played them; copies are the same in all
+
+    Returns:
+        int [episodes], counted from 0 in the order of the first of each.
+    """
+    columns = [np.unique(maps, return_inverse=True)[1].ravel()]
+    for values in (one for table in tables for one in table.values()):
+        values = np.asarray(values, dtype=np.float64) + 0.0  # -0 is 0
+        columns.append(np.where(np.isnan(values), np.nan, values).view(np.int64))
+    _, first, inverse = np.unique(np.stack(columns, 1), axis=0, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse.ravel()]
+
+
+def resample_weights(*factors: np.ndarray, copies: np.ndarray | None = None, seed: int = 0) -> np.ndarray:
     """How often each episode counts in each resample of a bootstrap of groups, float32 [GROUPED_RESAMPLES, episodes].
 
     Args:
         factors: what each episode belongs to, labels [episodes] each: its map, the seed of the training. Every factor
             is resampled with replacement by itself, and the episodes within each combination (Owen 2007). One label
             for all changes nothing.
+        copies: of `label_copies`: copies are drawn together; None: there are none.
         seed: of the drawing: what is drawn apart from something else needs another one.
     """
-    codes = (np.unique(labels, return_inverse=True)[1] for labels in factors)
+    codes = [np.unique(labels, return_inverse=True)[1] for labels in factors]
+    codes.append(np.arange(len(factors[0])) if copies is None else copies)
     return _resample_weights(seed, *(tuple(one.ravel().tolist()) for one in codes))
 
 
 @lru_cache(maxsize=32)
-def _resample_weights(seed: int, *factors: tuple[int, ...]) -> np.ndarray:
+def _resample_weights(seed: int, *codes: tuple[int, ...]) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    codes = np.array(factors)
+    *factors, copies = codes
+    codes, copies = np.array(factors), np.array(copies)
     counts = [max(one) + 1 for one in factors]
     often = [rng.multinomial(count, np.full(count, 1 / count), size=GROUPED_RESAMPLES) for count in counts]
     weights = np.zeros((GROUPED_RESAMPLES, codes.shape[1]), dtype=np.float32)
     for combination in np.unique(codes, axis=1).T:
         episodes = np.flatnonzero((codes == combination[:, None]).all(0))
         count = np.prod([one[:, code] for one, code in zip(often, combination, strict=True)], axis=0)
-        weights[:, episodes] = rng.multinomial(count * len(episodes), np.full(len(episodes), 1 / len(episodes)))
+        distinct, group = np.unique(copies[episodes], return_inverse=True)
+        drawn = rng.multinomial(count * len(distinct), np.full(len(distinct), 1 / len(distinct)))
+        weights[:, episodes] = drawn[:, group]
     return weights
 
 
@@ -100,27 +128,35 @@ def resampled_means(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return middle + (sums[total.ravel() > 0] / total[total.ravel() > 0]).astype(np.float64)
 
 
-def summarise(values: np.ndarray, weights: np.ndarray | None = None) -> dict:
+def summarise(values: np.ndarray, weights: np.ndarray | None = None, copies: np.ndarray | None = None) -> dict:
     """Mean, standard deviation and bootstrap 95 % interval of the mean over the episodes that have a value.
 
     Args:
         values: one for each episode; NaN: it has none.
         weights: of `resample_weights`; None: episodes alone are resampled.
+        copies: of `label_copies`; None: there are none.
 
     Returns:
-        ``{mean, std, ci95: [low, high], n}``; NaN where no episode has a value.
+        ``{mean, std, ci95: [low, high], n}``; NaN where no episode has a value, and for the ends where fewer than
+        `LEAST_DISTINCT` distinct episodes have one.
     """
     kept = np.asarray(values, dtype=np.float64)
     have = ~np.isnan(kept)
+    distinct = have.sum() if copies is None else len(np.unique(copies[have]))
     kept = kept[have]
     if not len(kept):
         return {"mean": np.nan, "std": np.nan, "ci95": [np.nan, np.nan], "n": 0}
-    low = high = float(kept.mean())
-    if np.ptp(kept) > 0.0 and weights is not None:
-        low, high = (float(x) for x in np.percentile(resampled_means(kept, weights[:, have]), [2.5, 97.5]))
-    elif np.ptp(kept) > 0.0:
-        found = bootstrap(
-            (kept,), np.mean, n_resamples=RESAMPLES, batch=500, method="percentile", rng=np.random.default_rng(0)
-        )
-        low, high = (float(x) for x in found.confidence_interval)
-    return {"mean": float(kept.mean()), "std": float(kept.std()), "ci95": [low, high], "n": len(kept)}
+    ends = [np.nan, np.nan]
+    if distinct >= LEAST_DISTINCT:
+        ends = _interval(kept, None if weights is None else weights[:, have])
+    return {"mean": float(kept.mean()), "std": float(kept.std()), "ci95": ends, "n": len(kept)}
+
+
+def _interval(values: np.ndarray, weights: np.ndarray | None) -> list[float]:
+    if np.ptp(values) == 0.0:
+        return [float(values.mean())] * 2
+    if weights is not None:
+        return np.percentile(resampled_means(values, weights), [2.5, 97.5]).tolist()
+    rng = np.random.default_rng(0)
+    found = bootstrap((values,), np.mean, n_resamples=RESAMPLES, batch=500, method="percentile", rng=rng)
+    return [float(end) for end in found.confidence_interval]

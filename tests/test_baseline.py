@@ -13,10 +13,11 @@ from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.results import FORMAT
 
 TINY = ["evaluate", "policy=random,nearest_frontier", "scenario.held_out=[70,71]", "scenario.macro_steps=2",
-        "scenario.local_steps=5", "num_robots=2", "num_envs=4", "episodes=4",
+        "scenario.local_steps=5", "num_robots=2", "num_envs=6", "episodes=6",
         "device=cpu", "num_threads=1"]  # fmt: skip
 RUN = {"format": FORMAT, "scenario": "maze_small", "maps": ["a", "b"], "seed": 0, "episodes": 2, "steps": [300]}
-MAPS = np.array(["a", "a", "b", "b"])
+MAPS = np.repeat(["a", "b"], 5)
+ONE = np.linspace(0.1, 0.8, 10)
 
 
 def result(coverage: list, size: int = 3, place: str = "", policy: str = "voronoi") -> EvaluationResult:
@@ -31,13 +32,13 @@ def result(coverage: list, size: int = 3, place: str = "", policy: str = "vorono
 @pytest.fixture
 def saved(tmp_path):
     """A folder with an earlier evaluation of two team sizes."""
-    write_episodes(tmp_path / "episodes.csv", [result([0.1, 0.2, 0.3, 0.7]), result([0.5] * 4, size=2)])
+    write_episodes(tmp_path / "episodes.csv", [result(ONE), result(ONE, size=2)])
     (tmp_path / "results.json").write_text(json.dumps({"run": RUN}))
     return tmp_path
 
 
 def test_episodes_come_back_as_they_were(saved):
-    before, wanted = load_baseline(str(saved)), result([0.1, 0.2, 0.3, 0.7])
+    before, wanted = load_baseline(str(saved)), result(ONE)
     assert list(before.results) == [("voronoi", 3), ("voronoi", 2)] and before.run == RUN
     for metric, values in wanted.episodes.items():
         np.testing.assert_array_equal(before.results["voronoi", 3].episodes[metric], values)
@@ -47,14 +48,14 @@ def test_episodes_come_back_as_they_were(saved):
 def test_changes_are_paired_and_maps_have_their_own(saved):
     """Episodes differ far more than the two runs do, and the change is certain all the same."""
     now = [
-        result([0.2, 0.3, 0.4, 0.8]), result([0.2, 0.3], place="a"), result([0.4, 0.8], place="b"),
-        result([0.9] * 4, policy="hungarian"), result([0.4] * 4, size=2),
+        result(ONE + 0.1), result(ONE[:5] + 0.1, place="a"), result(ONE[5:] + 0.1, place="b"),
+        result([0.9] * 10, policy="hungarian"), result(ONE - 0.1, size=2),
     ]  # fmt: skip
     found = load_baseline(str(saved)).changes(now)
     assert list(found) == ["voronoi N=3", "voronoi on a N=3", "voronoi on b N=3", "voronoi N=2"]
     for name in list(found)[:3]:
         assert found[name]["coverage_auc"]["ci95"] == [pytest.approx(0.1)] * 2
-    assert found["voronoi on b N=3"]["coverage_auc"]["n"] == 2 and found["voronoi N=2"]["coverage_auc"]["n"] == 4
+    assert found["voronoi on b N=3"]["coverage_auc"]["n"] == 5 and found["voronoi N=2"]["coverage_auc"]["n"] == 10
     assert describe_changes({"voronoi N=2": found["voronoi N=2"]}, saved) == [
         f"voronoi N=2 less {saved}: -10.0 points of coverage over time [-10.0, -10.0], "
         "+0 steps to 95 % [+0, +0], +0.00 robots lost [+0.00, +0.00]."
@@ -87,10 +88,10 @@ def test_the_command_compares_settings(tmp_path, monkeypatch, capsys):
     assert "results.json, episodes.csv, " in capsys.readouterr().out
     with open("old/episodes.csv") as file:
         rows = list(csv.DictReader(file))
-    assert [row["policy"] for row in rows] == ["random"] * 4 + ["nearest_frontier"] * 4
+    assert [row["policy"] for row in rows] == ["random"] * 6 + ["nearest_frontier"] * 6
     assert [row["map"] for row in rows[:4]] == ["maze_small_70", "maze_small_71"] * 2
     assert main([*TINY, "hydra.run.dir=same", "baseline=old"]) == 0
-    assert "random less old: +0.0 points of coverage over time [+0.0, +0.0]" in capsys.readouterr().out
+    assert "random less old: +0.0 points of coverage over time [+0.0, +0.0]," in capsys.readouterr().out
     changes = json.loads((tmp_path / "same" / "changes.json").read_text())
     assert changes["nearest_frontier"]["path_length"]["mean"] == 0 and changes["baseline"]["folder"].endswith("old")
     assert main([*TINY, "hydra.run.dir=slow", "baseline=old", "policy=random", "robot.max_speed=0.5"]) == 0

@@ -14,6 +14,7 @@ from maexp.agents.benchmark.table import (
     ROWS,
     best,
     best_columns,
+    evidence_of,
     pool_column,
     print_tables,
     table_csv,
@@ -23,9 +24,11 @@ from maexp.agents.benchmark.table import (
 
 
 def column(policy: str, seed: int = 0, **values: list[float]):
+    """Each value in three episodes, which differ in the metrics that are not given."""
     names = [row.metric for row in ROWS]
-    episodes = {name: np.array(values.get(name, [0.5, 0.7]), dtype=float) for name in names}
-    return pool_column(policy, "held_out", [(seed, episodes)], [np.array(["a", "b"])])
+    episodes = {name: np.repeat(np.array(values.get(name, [0.5, 0.7]), dtype=float), 3) for name in names}
+    episodes["path_length"] = np.arange(6.0)
+    return pool_column(policy, "held_out", [(seed, episodes)], [np.repeat(["a", "b"], 3)])
 
 
 ZERO = {"mean": 0.0, "ci95": [0.0, 0.0]}
@@ -52,10 +55,10 @@ def tables() -> dict:
 
 def test_csv_has_a_row_for_every_scenario_policy_and_metric(tables):
     rows = list(csv.DictReader(StringIO(table_csv(tables))))
-    assert len(rows) == 4 * len(ROWS)
+    assert len(rows) == 4 * (len(ROWS) + 1)
     found = {(row["scenario"], row["policy"], row["metric"]): row for row in rows}
     one = found["maze", "ippo", "coverage_step_95"]
-    assert (float(one["mean"]), one["reached"], one["episodes"], one["best"]) == (400, "1", "2", "1")
+    assert (float(one["mean"]), one["reached"], one["episodes"], one["best"]) == (400, "3", "6", "1")
     assert float(one["paper_mean"]) == 441
     assert found["maze", "random", "coverage_step_95"]["mean"] == ""
     assert float(found["maze", "ippo", "exploration_ratio"]["paper_mean"]) == pytest.approx(0.9317)
@@ -66,9 +69,10 @@ def test_csv_has_a_row_for_every_scenario_policy_and_metric(tables):
 def test_markdown_and_latex_mark_the_best(tables):
     text = table_markdown(tables)
     row = next(line for line in text.splitlines() if line.startswith("| CS95"))
-    assert row.split("|")[2].strip() == "-<br>(0/2)"
-    assert row.split("|")[3].strip() == "**400 ± 0**<br>[400, 400] (1/2)<br>paper 441 ± 57"
+    assert row.split("|")[2].strip() == "-<br>(0/6)"
+    assert row.split("|")[3].strip() == "**400 ± 0**<br>(3/6)<br>paper 441 ± 57"  # three: too few
     rows = [line for line in text.splitlines() if line.startswith("| ER")]
+    assert "93.5 ± 3.5**<br>[90.0, 97.0]<br>" in rows[0]
     assert rows[1].count("**60.0 ±") == 2 and rows[0].count("**") == 2
     latex = table_latex(tables)
     assert r"$\mathbf{93.5} \pm 3.5$" in latex and r"$93.17 \pm 4.27$" in latex
@@ -107,17 +111,33 @@ def played(policy: str, coverage: list, seed: int = 0, maps: list = ("a", "b")) 
 
 
 def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training():
-    maps = ["a", "a", "b", "b"]
-    planner = [played("voronoi", [0.1, 0.2, 0.6, 0.9], seed, maps) for seed in (0, 1, 2)]
-    alike = [played("ippo", [0.2, 0.3, 0.7, 1.0], seed, maps) for seed in (2, 0)]
+    maps = ["a", "a", "b", "b", "b"]
+    planner = [played("voronoi", [0.1, 0.2, 0.6, 0.9, 0.8], seed, maps) for seed in (0, 1, 2)]
+    alike = [played("ippo", [0.2, 0.3, 0.7, 1.0, 0.9], seed, maps) for seed in (2, 0)]
     found = subtract("ippo", alike, planner)["coverage_auc"]
-    assert (found["n"], found["mean"]) == (8, pytest.approx(0.1)) and found["ci95"] == [pytest.approx(0.1)] * 2
-    unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8], 1, maps)]
+    assert (found["n"], found["mean"]) == (10, pytest.approx(0.1)) and found["ci95"] == [pytest.approx(0.1)] * 2
+    unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8, 0.7], 1, maps)]
     found = subtract("ippo", unlike, planner)["coverage_auc"]
     assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
     assert subtract("ippo", [played("ippo", [0.5, 0.5], 7)], planner) == {}
     text = differences_markdown("voronoi", {"ippo": subtract("ippo", alike, planner)})
     assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
+
+
+def test_copies_of_an_episode_are_told_and_give_no_interval():
+    """Three seeds of a planner that draws nothing, from one start: nine episodes are one."""
+    values = {name: np.full(3, 0.5) for name in (row.metric for row in ROWS)}
+    maps = [np.repeat("a", 3)] * 3
+    columns = [pool_column("voronoi", "held_out", [(seed, values) for seed in (0, 1, 2)], maps)]
+    (told,) = evidence_of(columns)
+    assert told == "Of 9 episodes 1 is distinct, the rest copies: too few for an interval, which takes 5."
+    text = table_markdown({"maze": columns})
+    assert "| 50.0 ± 0.0 |" in text and "1 is distinct" in text and "50.0, 50.0" not in text
+    assert ",0.5,0,,,9,9," in table_csv({"maze": columns})
+    means = {"one": 0.6, "two": 0.5}
+    pairs = [[played(name, [mean] * 3, seed, ["a"] * 3) for seed in (0, 1)] for name, mean in means.items()]
+    text = differences_markdown("two", {"one": subtract("one", *pairs)})
+    assert "| one | +10.0 | -10 | +0.00 |" in text
 
 
 def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():

@@ -197,18 +197,18 @@ def test_maps_import_of_a_real_floor(capsys, data_dir, tmp_path):
 
 
 def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
-    words = ["policy=random,nearest_frontier", "num_robots=1,2", "episodes=3", f"hydra.run.dir={tmp_path}/e"]
+    words = ["policy=random,nearest_frontier", "num_robots=1,2", "episodes=5", f"hydra.run.dir={tmp_path}/e"]
     assert main(["evaluate", *[one for one in TINY if "collector" not in one], *words]) == 0
     results = json.loads((tmp_path / "e" / "results.json").read_text())
     assert set(results) == {"random N=1", "random N=2", "nearest_frontier N=1", "nearest_frontier N=2", "run"}
     coverage = results["random N=2"]["exploration_ratio"]
-    assert coverage["n"] == 3 and coverage["ci95"][0] <= coverage["mean"] <= coverage["ci95"][1]
-    assert results["run"]["num_robots"] == [1, 2] and results["run"]["episodes"] == 3
+    assert coverage["n"] == 5 and coverage["ci95"][0] <= coverage["mean"] <= coverage["ci95"][1]
+    assert results["run"]["num_robots"] == [1, 2] and results["run"]["episodes"] == 5
     for name in ("picture.png", "coverage.png", "metrics.png", "shares.png"):
         assert (tmp_path / "e" / name).stat().st_size > 5000
     printed = capsys.readouterr().out
     assert "results.json, episodes.csv, coverage.png, metrics.png, shares.png, picture.png, config.yaml" in printed
-    assert "nearest_frontier N=2" in printed and "maze_small: 3 held-out episodes, for each team size" in printed
+    assert "nearest_frontier N=2" in printed and "maze_small: 5 held-out episodes, for each team size" in printed
 
 
 def test_a_sweep_leaves_the_loggers_of_the_program_around_it_alone(tmp_path, monkeypatch):

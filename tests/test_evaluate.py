@@ -16,12 +16,13 @@ from maexp.agents.commands.evaluate import describe_episodes
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
+from maexp.agents.evaluation.evidence import Evidence, describe_evidence
 from maexp.agents.evaluation.results import COLUMNS, paired_differences, print_results
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map
-from maexp.envs.metrics import episode_metrics, in_reach, resample_weights, summarise
+from maexp.envs.metrics import episode_metrics, in_reach, label_copies, resample_weights, summarise
 
 POINTCLOUD = ("scenario=pointcloud", "policy=random")
 
@@ -211,13 +212,70 @@ def test_weights_count_episodes_and_values_that_are_missing_are_left_out():
     assert (weights == np.round(weights)).all() and weights.shape[1] == 5
     totals = {0: 4, 1: 5, 2: 6}  # twice a, once each, twice b
     assert set(weights.sum(1)) == set(totals.values()) and ((weights[:, :2].sum(1) % 2) == 0).all()
-    found = summarise(np.array([1.0, np.nan, 3.0, np.nan, 5.0]), weights)
-    assert (found["mean"], found["n"]) == (3.0, 3) and 1.0 <= found["ci95"][0] < 3.0 < found["ci95"][1] <= 5.0
+    values, maps = np.array([1.0, np.nan, 2.0, 3.0, np.nan, 4.0, 5.0]), np.array(list("aabbbbb"))
+    found = summarise(values, resample_weights(maps))
+    assert (found["mean"], found["n"]) == (3.0, 5) and 1.0 <= found["ci95"][0] < 3.0 < found["ci95"][1] <= 5.0
+    assert np.isnan(summarise(values[1:], resample_weights(maps[1:]))["ci95"]).all()  # four have a value
+
+
+def test_copies_say_no_more_than_one():
+    """Ten episodes, each copied twenty times: the interval is that of ten; of four copied there is none."""
+    values = np.random.default_rng(2).normal(size=10)
+    maps, many = np.repeat("a", 200), np.repeat(values, 20)
+    copies = label_copies(maps, {"one": many, "none": np.full(200, np.nan)})
+    assert copies.tolist() == np.repeat(np.arange(10), 20).tolist()
+    alone, told = summarise(values), summarise(many, resample_weights(maps, copies=copies), copies)
+    assert spread(told) == pytest.approx(spread(alone), rel=0.1) and told["n"] == 200
+    assert spread(summarise(many)) < 0.3 * spread(alone)
+    few = copies.clip(max=3)
+    assert np.isnan(summarise(many, resample_weights(maps, copies=few), few)["ci95"]).all()
+    assert (resample_weights(maps) == resample_weights(maps, copies=np.arange(200))).all()
+
+
+def test_copies_are_alike_on_one_map_in_all_metrics_of_all_policies():
+    one = {"coverage_auc": np.array([0.5, 0.5, 0.5, 0.5]), "steps": np.array([np.nan, np.nan, 7.0, np.nan])}
+    assert label_copies(np.array(list("aaab")), one).tolist() == [0, 0, 1, 2]
+    drawn = {"coverage_auc": np.array([0.1, 0.2, 0.1, 0.1])}
+    assert label_copies(np.array(list("aaab")), one, drawn).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("rows, wanted", [
+    ([(64, 64, 16), (64, 64, 16)], []),
+    ([(8, 1, 1), (8, 1, 1)], ["Of 8 episodes 1 is distinct, the rest copies: too few for an interval, which takes 5."]),
+    ([(8, 1, 1), (8, 8, 1)], ["Of 8 episodes of p0 1 is distinct, the rest copies: too few for an interval, "
+                              "which takes 5.",
+                              "The intervals rest on 1 map: they tell little of others."]),
+    ([(64, 8, 5)], ["Of 64 episodes 8 are distinct, the rest copies: the intervals count each once."]),
+    ([(3, 3, 3)], ["3 episodes: too few for an interval, which takes 5."]),
+    ([(99, 99, 4)], ["The intervals rest on 4 maps: they tell little of others."]),
+])  # fmt: skip
+def test_what_figures_rest_on_is_said_where_it_is_little(rows, wanted):
+    assert describe_evidence([Evidence(f"p{k}", *row) for k, row in enumerate(rows)]) == wanted
+
+
+def test_eight_copies_are_not_ahead(tmp_path, monkeypatch, capsys):
+    """All episodes from one start: policies that draw nothing play one and the same eight times."""
+    monkeypatch.chdir(tmp_path)
+    words = ["policy=cost_utility,universal,random", "scenario.held_out=[70]", "scenario.macro_steps=2", "num_envs=4",
+             "scenario.local_steps=5", "num_robots=2", "episodes=8", "device=cpu", "num_threads=1"]  # fmt: skip
+    assert main(["evaluate", *words, "scenario.starts=fixed", "hydra.run.dir=run"]) == 0
+    out = capsys.readouterr().out
+    assert "Of 8 episodes of cost_utility, universal 1 is distinct" in out and "ahead" not in out
+    assert "universal has played too few distinct episodes to be compared with cost_utility" in out
+    assert "[+" not in out and "[-" not in out
+    found = json.loads((tmp_path / "run/results.json").read_text())
+    assert found["universal"]["coverage_auc"]["ci95"] == [None, None] == found["cost_utility"]["path_length"]["ci95"]
+    assert found["difference"]["universal"]["cost_utility"]["coverage_auc"]["ci95"] == [None, None]
+    distinct = found["run"]["distinct_episodes"]
+    assert distinct | {"random": 0} == {"cost_utility": 1, "universal": 1, "random": 0} and distinct["random"] > 4
 
 
 def result(policy: str, coverage: list, steps: list, learned: bool = False, **others) -> EvaluationResult:
-    episodes = {"coverage_auc": np.array(coverage), "coverage_step_95_censored": np.array(steps)}
-    return EvaluationResult(policy, others.pop("num_robots", 3), episodes, 1.0, np.array(["a", "b"]), learned, **others)
+    """Three episodes on map a and two on b, a little apart."""
+    values = {"coverage_auc": coverage, "coverage_step_95_censored": steps}
+    episodes = {name: np.repeat(pair, (3, 2)) + 0.01 * np.arange(5) for name, pair in values.items()}
+    maps = np.repeat(["a", "b"], (3, 2))
+    return EvaluationResult(policy, others.pop("num_robots", 3), episodes, 1.0, maps, learned, **others)
 
 
 def test_differences_are_those_of_the_same_episodes():
@@ -233,7 +291,7 @@ def test_differences_are_those_of_the_same_episodes():
         "+10.0 points of coverage over time [+10.0, +10.0], -50 steps to 95 % [-50, -50]."
     ]
     assert describe_differences(teams, {}) == [] and paired_differences(teams[1:]) == {}
-    tied = [result("trained", [0.9, 0.1], [100.0, 300.0], True), teams[1]]
+    tied = [result("trained", [0.9, 0.05], [100.0, 300.0], True), teams[1]]
     assert "The trained team cannot be told from voronoi" in describe_differences(tied, {3: "voronoi"})[0]
 
 

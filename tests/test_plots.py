@@ -126,14 +126,17 @@ def test_unusable_logs_are_named(tmp_path):
 
 def test_coverage_over_time(tmp_path, figures):
     seconds = np.linspace(0, 10, 21)
-    coverage = np.stack([np.linspace(0, level, 21) for level in (0.7, 0.8, 0.9)])
-    assert readable(draw_coverage({"a": (seconds, coverage), "b": (seconds, coverage[:1])}, tmp_path / "a.png"))
+    levels = np.linspace(0.7, 0.9, 101)
+    coverage = np.stack([np.linspace(0, level, 21) for level in levels])
+    curves = {"a": (seconds, coverage), "b": (seconds, coverage[:4]), "c": (seconds, np.repeat(coverage[:1], 9, 0))}
+    assert readable(draw_coverage(curves, tmp_path / "a.png"))
     ax = figures[0].axes[0]
     assert ax.get_xlabel() == "time [s]" and ax.get_ylabel() == "coverage [%]"
-    assert ax.lines[0].get_label() == "a (n = 3)"
+    assert ax.lines[0].get_label() == "a (n = 101)"
     assert ax.lines[0].get_ydata()[-1] == pytest.approx(80)
-    band = ax.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.max() == pytest.approx(80 + 1.96 * 100 * np.std([0.7, 0.8, 0.9]) / np.sqrt(3))
+    (band,) = ax.collections  # four episodes have none, and no more have nine copies of one
+    wide = 1.96 * 100 * levels.std() / np.sqrt(len(levels))
+    assert band.get_paths()[0].vertices[:, 1].max() - 80 == pytest.approx(wide, rel=0.1)
     with pytest.raises(ValueError, match="'a'.*21"):
         draw_coverage({"a": (seconds, coverage[:, :5])}, tmp_path / "b.png")
     with pytest.raises(ValueError, match="curves is empty"):

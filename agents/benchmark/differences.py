@@ -4,9 +4,10 @@ import numpy as np
 
 from maexp.agents.benchmark.cell import CellResult
 from maexp.agents.benchmark.plan import Cell
-from maexp.agents.benchmark.table import weigh
+from maexp.agents.benchmark.table import pool_episodes, weigh
 from maexp.agents.evaluation.comparison import DECIDES
-from maexp.envs.metrics import in_reach, summarise
+from maexp.agents.evaluation.evidence import brackets
+from maexp.envs.metrics import in_reach, label_copies, summarise
 
 Played = list[tuple[Cell, CellResult]]
 SHOWN = (("coverage_auc", "AUC, points", 100, 1), ("coverage_step_95_censored", "to 95, steps", 1, 0),
@@ -21,11 +22,10 @@ def subtract(policy: str, one: Played, other: Played) -> dict[str, dict]:
     if not pairs:
         return {}
     maps, counts = [mine.maps for _, mine, _ in pairs], [len(mine.coverage) for _, mine, _ in pairs]
-    weights = weigh(policy, [seed for seed, _, _ in pairs], counts, maps)
-    return {
-        name: summarise(np.concatenate([mine.episodes[name] - his.episodes[name] for _, mine, his in pairs]), weights)
-        for name in pairs[0][1].episodes
-    }
+    ours, theirs = (pool_episodes([pair[k].episodes for pair in pairs]) for k in (1, 2))
+    copies = label_copies(np.concatenate(maps), ours, theirs)
+    weights = weigh(policy, [seed for seed, _, _ in pairs], counts, maps, copies)
+    return {name: summarise(values - theirs[name], weights, copies) for name, values in ours.items()}
 
 
 def find_best(played: dict[str, Played]) -> str | None:
@@ -49,8 +49,7 @@ def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:
 
 
 def _cell(one: dict, scale: float, digits: int) -> str:
-    low, high = (f"{scale * end:+.{digits}f}" for end in one["ci95"])
-    return f"{scale * one['mean']:+.{digits}f} [{low}, {high}]"
+    return f"{scale * one['mean']:+.{digits}f}{brackets(one, lambda end: f'{scale * end:+.{digits}f}')}"
 
 
 def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) -> str:

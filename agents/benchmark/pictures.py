@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, finish, save
+from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, finish, reach, save
 from maexp.agents.evaluation.plots import draw_coverage_lines
 
 KINDS = {"trained": (COLOURS[0], MARKERS[0]), "classical": (COLOURS[1], MARKERS[1]), "paper": ("#606060", MARKERS[3])}
@@ -18,7 +18,7 @@ def draw_coverage_panels(curves: dict[str, dict], title: str, path) -> Path:
     """Coverage over time of one scenario, trained and classical policies side by side; returns the path.
 
     Args:
-        curves: panel's title -> {policy: (seconds (records,), coverage (episodes, records) in [0, 1])}
+        curves: panel's title -> {policy: (seconds (records,), coverage (episodes, records) in [0, 1], maps of these)}
         title: of the whole
         path: picture to write
 
@@ -44,7 +44,7 @@ def draw_overview(coverage: dict[str, list], path) -> Path:
     """Coverage at the end of every policy in every scenario; returns the path.
 
     Args:
-        coverage: scenario -> [(policy, kind, mean, (low, high), paper's mean or None)] in [0, 1], kind `trained` or
+        coverage: scenario -> [(policy, kind, {mean, ci95}, paper's mean or None)] in [0, 1], kind `trained` or
             `classical`.
         path: picture to write
 
@@ -60,8 +60,9 @@ def draw_overview(coverage: dict[str, list], path) -> Path:
         figure = Figure(figsize=(1.6 + 2.1 * columns, (0.9 + 0.19 * len(names)) * lines + 0.5), layout="constrained")
         axes = np.ravel(figure.subplots(lines, columns, sharey=True, squeeze=False))
         for ax, (scenario, rows) in zip(axes, coverage.items(), strict=False):
-            for policy, kind, mean, (low, high), published in rows:
-                _draw_point(ax, names.index(policy), kind, mean, low, high)
+            for policy, kind, found, published in rows:
+                colour, marker = KINDS[kind]
+                _draw_point(ax, names.index(policy), found, colour, marker)
                 if published is not None:
                     colour, marker = KINDS["paper"]
                     ax.plot(100 * published, names.index(policy), marker, color=colour, mfc="none", markersize=5)
@@ -77,17 +78,17 @@ def draw_overview(coverage: dict[str, list], path) -> Path:
         return save(figure, path)
 
 
-def _draw_point(ax, row: int, kind: str, mean: float, low: float, high: float) -> None:
-    colour, marker = KINDS[kind]
-    error = [[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]]
-    ax.errorbar(100 * mean, row, xerr=error, fmt=marker, color=colour, markersize=4, capsize=2, linewidth=1.2)
+def _draw_point(ax, row: int, found: dict, colour: str, marker: str) -> None:
+    """A mean {mean, ci95} in per cent with its interval."""
+    look = {"fmt": marker, "color": colour, "markersize": 4, "capsize": 2, "linewidth": 1.2}
+    ax.errorbar(100 * found["mean"], row, xerr=reach(found, 100), **look)
 
 
 def _kinds(figure: Figure, coverage: dict[str, list]) -> list:
     from matplotlib.lines import Line2D
 
     have = {row[1] for rows in coverage.values() for row in rows}
-    have |= {"paper"} if any(row[4] is not None for rows in coverage.values() for row in rows) else set()
+    have |= {"paper"} if any(row[3] is not None for rows in coverage.values() for row in rows) else set()
     labels = {"paper": "paper (same map trained and tested)"}
     return [
         Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=5, label=labels.get(kind, kind),
@@ -144,9 +145,7 @@ def _draw_matrix(figure: Figure, ax, pairs: dict, names: list[str]) -> None:
 
 def _draw_pairs(ax, pairs: dict, chosen: list[tuple[str, str]]) -> None:
     for row, (one, other) in enumerate(chosen):
-        mean, (low, high) = pairs[one, other]["mean"], pairs[one, other]["ci95"]
-        error = [[100 * max(mean - low, 0)], [100 * max(high - mean, 0)]]
-        ax.errorbar(100 * mean, row, xerr=error, fmt="o", color=COLOURS[0], markersize=4, capsize=2, linewidth=1.2)
+        _draw_point(ax, row, pairs[one, other], COLOURS[0], "o")
     ax.axvline(50, color="#606060", linewidth=1, linestyle=(0, (4, 2)))
     ax.set_yticks(range(len(chosen)), [f"{one} > {other}" for one, other in chosen])
     ax.set_ylim(len(chosen) - 0.5, -0.5)

@@ -12,6 +12,7 @@ from maexp.agents.benchmark.plan import SUITES, Cell, as_list, is_learned, train
 from maexp.agents.benchmark.table import (
     Column,
     pool_column,
+    pool_episodes,
     print_tables,
     table_csv,
     table_latex,
@@ -21,7 +22,9 @@ from maexp.agents.files import short, write_json, write_text
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.versions import PACKAGES, find_commit
+from maexp.envs.metrics import label_copies
 
+Samples = dict[str, dict[str, np.ndarray]]  # policy -> scenario -> a number for each episode
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
 
 
@@ -217,27 +220,30 @@ class Report:
         points = {scenario: _points(scenario, columns) for scenario, columns in played.items()}
         paths.append(draw_overview(points, self.where / f"overview{mark}.png"))
         values = self._coverage(suite, played)
-        if len(values) > 1:
-            pairs = compare_all(values)
+        if len(values[0]) > 1:
+            pairs = compare_all(*values)
             paths.append(self.where / f"improvement{mark}.csv")
             write_text(paths[-1], pairs_csv(pairs))
-            trained = [name for name in values if is_learned(name)]
-            listed = trained if len(trained) > 1 else list(values)[:6]
+            trained = [name for name in values[0] if is_learned(name)]
+            listed = trained if len(trained) > 1 else list(values[0])[:6]
             paths.append(draw_improvement(pairs, listed, self.where / f"improvement{mark}.png"))
         return [path.name for path in paths]
 
-    def _coverage(self, suite: str, played: dict[str, list[Column]]) -> dict[str, dict[str, np.ndarray]]:
-        """Policy -> scenario -> final coverage of all episodes."""
-        values: dict[str, dict[str, np.ndarray]] = {}
+    def _coverage(self, suite: str, played: dict[str, list[Column]]) -> tuple[Samples, Samples]:
+        """Policy -> scenario -> final coverage of all episodes; and which of these are copies."""
+        values: Samples = {}
+        copies: Samples = {}
         for scenario, columns in played.items():
             for one in columns:
-                found = self.results(scenario, one.policy, suite)
-                cells = [result.episodes["exploration_ratio"] for _, result in found]
-                values.setdefault(one.policy, {})[scenario] = np.concatenate(cells)
-        return values
+                found = [result for _, result in self.results(scenario, one.policy, suite)]
+                pooled = pool_episodes([result.episodes for result in found])
+                values.setdefault(one.policy, {})[scenario] = pooled["exploration_ratio"]
+                labels = label_copies(np.concatenate([result.maps for result in found]), pooled)
+                copies.setdefault(one.policy, {})[scenario] = labels
+        return values, copies
 
     def _curves(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
-        """Panel -> policy -> (seconds, coverage of all episodes); `random` is in both panels, to compare with."""
+        """Panel -> policy -> `pool_curves` of its cells; `random` is in both panels, to compare with."""
         curves = {}
         for one in columns:
             curves[one.policy] = pool_curves([result for _, result in self.results(scenario, one.policy, one.suite)])
@@ -248,11 +254,11 @@ class Report:
         return {"trained": trained, "classical": classical}
 
 
-def pool_curves(results: list[CellResult]) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and coverage [episodes, times] of several cells; what has ended keeps its coverage."""
+def pool_curves(results: list[CellResult]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times [s], coverage [episodes, times] and maps [episodes] of several cells; what has ended keeps its coverage."""
     times = np.unique(np.concatenate([one.seconds for one in results]))
     coverage = [np.stack([np.interp(times, one.seconds, curve) for curve in one.coverage]) for one in results]
-    return times, np.concatenate(coverage)
+    return times, np.concatenate(coverage), np.concatenate([one.maps for one in results])
 
 
 def against(apart: dict[str, dict], rival: str | None) -> dict[str, dict]:
@@ -270,5 +276,5 @@ def _points(scenario: str, columns: list[Column]) -> list[tuple]:
     for one in columns:
         kind = "trained" if is_learned(one.policy) else "classical"
         found, published = one.summary["exploration_ratio"], paper_value(scenario, one.policy, "exploration_ratio")
-        points.append((one.policy, kind, found["mean"], found["ci95"], published and published[0] / 100))
+        points.append((one.policy, kind, found, published and published[0] / 100))
     return points

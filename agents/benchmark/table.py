@@ -12,7 +12,8 @@ from rich.text import Text
 
 from maexp.agents.algorithms.table import ALGORITHMS
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.envs.metrics import in_reach, resample_weights, summarise
+from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence
+from maexp.envs.metrics import in_reach, label_copies, resample_weights, summarise
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,24 @@ class Column:
 
     Attributes:
         summary: {metric: {mean, std, ci95, n}}
-        total: episodes
+        evidence: what that rests on
         seeds: {seed: mean of each metric}, to see how far trainings differ
     """
 
     policy: str
     suite: str
     summary: dict[str, dict]
-    total: int
+    evidence: Evidence
     seeds: dict[int, dict[str, float]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         return self.policy + SHORT[self.suite]
+
+    @property
+    def total(self) -> int:
+        """Episodes."""
+        return self.evidence.episodes
 
 
 def pool_column(
@@ -107,25 +113,37 @@ def pool_column(
     """The column of a policy from the (seed, episodes) of its cells, and the map of each episode."""
     counts = [len(episodes["exploration_ratio"]) for _, episodes in cells]
     metrics = list(cells[0][1])
-    pooled = {name: np.concatenate([episodes[name] for _, episodes in cells]) for name in metrics}
+    pooled = pool_episodes([episodes for _, episodes in cells])
     seeds: dict[int, dict[str, float]] = {}
     for seed in dict.fromkeys(seed for seed, _ in cells):
         same = [episodes for one, episodes in cells if one == seed]
         seeds[seed] = {name: _mean(np.concatenate([one[name] for one in same])) for name in metrics}
-    weights = weigh(policy, [seed for seed, _ in cells], counts, maps)
-    summary = {name: summarise(values, weights) for name, values in pooled.items()}
-    return Column(policy, suite, summary, len(pooled["exploration_ratio"]), seeds)
+    copies = label_copies(np.concatenate(maps), pooled)
+    weights = weigh(policy, [seed for seed, _ in cells], counts, maps, copies)
+    summary = {name: summarise(values, weights, copies) for name, values in pooled.items()}
+    distinct, places = len(np.unique(copies)), len(np.unique(np.concatenate(maps)))
+    evidence = Evidence(policy + SHORT[suite], len(copies), distinct, places)
+    return Column(policy, suite, summary, evidence, seeds)
 
 
-def weigh(policy: str, seeds: list[int], counts: list[int], maps: list[np.ndarray]) -> np.ndarray:
+def pool_episodes(cells: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The metrics of the episodes of all cells."""
+    return {name: np.concatenate([episodes[name] for episodes in cells]) for name in cells[0]}
+
+
+def weigh(
+    policy: str, seeds: list[int], counts: list[int], maps: list[np.ndarray], copies: np.ndarray
+) -> np.ndarray:
     """Resamples of maps, of the episodes on each and, where a policy was trained, of the seeds of its trainings.
 
     Args:
         policy: whose
         seeds, counts: of each cell, and its episodes
         maps: the map of each episode, for each cell
+        copies: of `label_copies`, of all cells
     """
-    return resample_weights(np.concatenate(maps), *([np.repeat(seeds, counts)] if policy in ALGORITHMS else []))
+    trainings = [np.repeat(seeds, counts)] if policy in ALGORITHMS else []
+    return resample_weights(np.concatenate(maps), *trainings, copies=copies)
 
 
 def _mean(values: np.ndarray) -> float:
@@ -151,6 +169,11 @@ def best_columns(columns: list[Column], row: Row) -> set[str]:
     return found
 
 
+def evidence_of(columns: list[Column]) -> list[str]:
+    """Sentences on what the figures rest on, where that is little."""
+    return describe_evidence([one.evidence for one in columns])
+
+
 # Parts of a cell
 
 
@@ -161,13 +184,10 @@ def value_text(column: Column, row: Row) -> str:
 
 
 def interval_text(column: Column, row: Row) -> str:
-    """[67.2, 70.1], and of how many episodes where it can be fewer than all."""
+    """[67.2, 70.1], and of how many episodes where it can be fewer than all; "" where there is neither."""
     one = column.summary[row.metric]
-    count = f"({one['n']}/{column.total})"
-    if not one["n"]:
-        return count
-    low, high = (row.number(end) for end in one["ci95"])
-    return f"[{low}, {high}]" + (f" {count}" if row.label.startswith(("CS", "MO")) else "")
+    counted = row.label.startswith(("CS", "MO")) or not one["n"]
+    return (brackets(one, row.number) + f" ({one['n']}/{column.total})" * counted).strip()
 
 
 def paper_text(scenario: str, column: Column, row: Row, digits: int | None = None) -> str | None:
@@ -190,6 +210,8 @@ def print_tables(tables: dict[str, list[Column]], console: Console | None = None
     console = Console(file=console.file, width=max(100, console.width), force_terminal=console.is_terminal)
     for scenario, columns in tables.items():
         console.print(draw_table(scenario, columns, shown_for(goal)))
+        for sentence in evidence_of(columns):
+            console.print(Text(sentence))
     if len(tables) > 1:
         console.print(draw_overview(tables))
     console.print(Group(*(Text(one, style="dim") for one in NOTES)))
@@ -238,8 +260,7 @@ def _narrow(column: Column, row: Row) -> str:
     one = column.summary[row.metric]
     if row.label.startswith("CS") or not one["n"]:
         return f"({one['n']}/{column.total})"
-    low, high = (row.number(end) for end in one["ci95"])
-    return f"[{low}, {high}]"
+    return brackets(one, row.number).strip()
 
 
 # Files
@@ -260,7 +281,7 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
                 published = paper_value(scenario, column.policy, metric) or ("", "")
                 scale = row.scale if row else 1.0
                 published = [value / scale if value != "" else "" for value in published]
-                numbers = [one["mean"], one["std"], *one["ci95"]] if one["n"] else [""] * 4
+                numbers = [one["mean"], one["std"], *one["ci95"]]
                 seeds = " ".join(f"{seed}:{means[metric]:.6g}" for seed, means in column.seeds.items())
                 is_best = int(column.name in bold[metric]) if row else ""
                 writer.writerow([scenario, column.policy, column.suite, metric, *map(_csv_number, numbers), one["n"],
@@ -269,7 +290,7 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
 
 
 def _csv_number(value) -> str:
-    return value if value == "" else f"{value:.6g}"
+    return "" if value == "" or value != value else f"{value:.6g}"
 
 
 def table_markdown(
@@ -285,6 +306,7 @@ def table_markdown(
     parts = [heading] if heading else []
     for scenario, columns in tables.items():
         lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
+        lines += [f"{sentence}\n" for sentence in evidence_of(columns)]
         lines += ["| | " + " | ".join(one.name for one in columns) + " |", "| --- |" + " --- |" * len(columns)]
         for row in rows_for(goal):
             bold = best_columns(columns, row)
@@ -300,7 +322,7 @@ def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> s
     text = value_text(column, row)
     text = f"**{text}**" if column.name in bold else text
     published = paper_text(scenario, column, row)
-    return "<br>".join([text, interval_text(column, row), *([f"paper {published}"] if published else [])])
+    return "<br>".join(filter(None, [text, interval_text(column, row), f"paper {published}" if published else ""]))
 
 
 def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float = 0.95) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import DECIDES
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.evaluation.results import FORMAT, result_names
 from maexp.agents.files import short, write_text
 
@@ -116,8 +117,9 @@ def describe_changes(changes: dict[str, dict], folder: Path) -> list[str]:
 def _amounts(found: dict[str, dict]) -> list[str]:
     words = []
     for metric, (what, factor, digits) in SHOWN.items():
-        mean, low, high = (factor * value for value in (found[metric]["mean"], *found[metric]["ci95"]))
-        words.append(f"{mean:+.{digits}f} {what} [{low:+.{digits}f}, {high:+.{digits}f}]")
+        one = found[metric]
+        interval = brackets(one, lambda value, factor=factor, digits=digits: f"{factor * value:+.{digits}f}")
+        words.append(f"{factor * one['mean']:+.{digits}f} {what}{interval}")
     return words
 
 

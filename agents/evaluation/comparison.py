@@ -5,6 +5,7 @@ from typing import Any
 
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
+from maexp.agents.evaluation.evidence import brackets, verdict
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
@@ -53,15 +54,12 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
 
 def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
     auc = found[DECIDES]
-    low, high = (100 * end for end in auc["ci95"])
-    points = f"{100 * auc['mean']:+.1f} points of coverage over time [{low:+.1f}, {high:+.1f}]"
-    where = "is ahead of" if low > 0 else "is behind" if high < 0 else "cannot be told from"
+    points = f"{100 * auc['mean']:+.1f} points of coverage over time{brackets(auc, lambda end: f'{100 * end:+.1f}')}"
     later = ", ".join(_later(found, mark) for mark in (95, 99) if mark == 95 or in_reach(f"_{mark}", goal))
     name = name.replace("trained", "The trained team", 1)
-    return f"{name} {where} {rival}, the best classical planner on the validation maps: {points}, {later}."
+    return f"{name} {verdict(auc)} {rival}, the best classical planner on the validation maps: {points}, {later}."
 
 
 def _later(found: dict[str, dict], mark: int) -> str:
     steps = found[f"coverage_step_{mark}_censored"]
-    low, high = steps["ci95"]
-    return f"{steps['mean']:+.0f} steps to {mark} % [{low:+.0f}, {high:+.0f}]"
+    return f"{steps['mean']:+.0f} steps to {mark} %{brackets(steps, '{:+.0f}'.format)}"

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from maexp.envs.metrics import episode_metrics, resample_weights, summarise
+from maexp.agents.evaluation.evidence import Evidence
+from maexp.envs.metrics import episode_metrics, label_copies, resample_weights, summarise
 from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
@@ -45,10 +46,14 @@ class EvaluationResult:
     shares: np.ndarray | None = None
     success_coverage: float = 0.95
 
+    def copies(self, *others: "EvaluationResult") -> np.ndarray:
+        """A number for each episode, the same for copies (`label_copies`); `others` played the same episodes."""
+        return label_copies(self.maps, *(one.episodes for one in (self, *others)))
+
     @property
-    def weights(self) -> np.ndarray:
-        """Resamples of maps, and of the episodes on each."""
-        return resample_weights(self.maps)
+    def evidence(self) -> Evidence:
+        """What its figures rest on."""
+        return Evidence(self.policy, len(self.maps), len(np.unique(self.copies())), len(np.unique(self.maps)))
 
     def summary(self) -> dict[str, dict]:
         """{metric: {mean, std, ci95: [lo, hi], n}}."""
@@ -56,11 +61,16 @@ class EvaluationResult:
 
     @cached_property
     def _summary(self) -> dict[str, dict]:
-        return {name: summarise(values, self.weights) for name, values in self.episodes.items()}
+        return self._summarise(self.episodes, self.copies())
 
     def minus(self, other: "EvaluationResult") -> dict[str, dict]:
         """The same of the paired differences to another result on the same episodes."""
-        return {name: summarise(values - other.episodes[name], self.weights) for name, values in self.episodes.items()}
+        apart = {name: values - other.episodes[name] for name, values in self.episodes.items()}
+        return self._summarise(apart, self.copies(other))
+
+    def _summarise(self, values: dict[str, np.ndarray], copies: np.ndarray) -> dict[str, dict]:
+        weights = resample_weights(self.maps, copies=copies)
+        return {name: summarise(one, weights, copies) for name, one in values.items()}
 
 
 def pool(parts: list[EvaluationResult]) -> EvaluationResult:

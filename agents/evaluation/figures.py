@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from maexp.agents.evaluation.evidence import has_interval
 from maexp.envs.files import whole_file
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
@@ -51,6 +52,14 @@ def finish(ax, title: str, unit: str, legend: bool) -> None:
         ax.legend(loc="upper left", ncols=2)
     elif entries:
         ax.legend()
+
+
+def reach(found: dict, factor: float = 1.0) -> list[list[float]] | None:
+    """How far the interval of a mean {mean, ci95, n} goes to both sides, matplotlib's `xerr`; None: there is none."""
+    if not has_interval(found):
+        return None
+    mean, (low, high) = found["mean"], found["ci95"]
+    return [[factor * max(mean - low, 0)], [factor * max(high - mean, 0)]]
 
 
 def save(figure: Figure, path) -> Path:

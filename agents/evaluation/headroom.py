@@ -3,7 +3,7 @@
 import numpy as np
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.envs.metrics import resampled_means
+from maexp.envs.metrics import LEAST_DISTINCT, resample_weights, resampled_means
 
 BASE, CEILING = "cost_utility", "clairvoyant"
 """The planner that leads are measured from, and the reference whose lead is the headroom."""
@@ -18,7 +18,7 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
 
     Returns:
         {name: {mean, ci95: [low, high], n}} of the others, where both were played in the same place with a team of the
-        same size and `CEILING` is ahead in all resamples of maps and episodes; else nothing of that place and size.
+        same size and `CEILING` is ahead in all resamples of maps and of at least `LEAST_DISTINCT` distinct episodes.
     """
     groups: dict[tuple, list[tuple[str, EvaluationResult]]] = {}
     for name, one in zip(names, results, strict=True):
@@ -33,14 +33,15 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
 
 
 def _shares(others: dict[str, EvaluationResult], base: EvaluationResult, ceiling: EvaluationResult) -> dict[str, dict]:
-    headroom = _lead(ceiling, base)
-    drawn = resampled_means(headroom, base.weights)
-    if headroom.mean() <= 0.0 or drawn.min() <= 0.0:
-        return {}
-    found = {}
+    headroom, found = _lead(ceiling, base), {}
     for name, one in others.items():
+        copies = base.copies(ceiling, one)
+        weights = resample_weights(base.maps, copies=copies)
+        drawn = resampled_means(headroom, weights)
+        if headroom.mean() <= 0.0 or drawn.min() <= 0.0 or len(np.unique(copies)) < LEAST_DISTINCT:
+            continue
         lead = _lead(one, base)
-        low, high = np.percentile(resampled_means(lead, base.weights) / drawn, [2.5, 97.5])
+        low, high = np.percentile(resampled_means(lead, weights) / drawn, [2.5, 97.5])
         found[name] = {"mean": float(lead.mean() / headroom.mean()), "ci95": [float(low), float(high)], "n": len(lead)}
     return found
 

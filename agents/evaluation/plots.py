@@ -9,8 +9,9 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, save
-from maexp.envs.metrics import in_reach, resample_weights, resampled_means
+from maexp.agents.evaluation.evidence import has_interval
+from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, reach, save
+from maexp.envs.metrics import LEAST_DISTINCT, in_reach, label_copies, resample_weights, resampled_means
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (
@@ -202,7 +203,7 @@ def draw_coverage(curves: dict, path) -> Path:
     Args:
         curves: name -> (seconds (records,), coverage (episodes, records) in [0, 1]), as
             ``CoverageRecorder.curves`` returns them; third, where known, the map of each episode: the interval
-            then resamples maps, too.
+            then resamples maps, too. Where too few episodes are distinct there is none.
         path: picture to write.
 
     Raises:
@@ -237,11 +238,11 @@ def draw_coverage_lines(ax, curves: dict, looks: dict[str, int] | None = None) -
                 f"curves[{name!r}]: coverage has shape {coverage.shape}, which must be (episodes, {len(seconds)})"
             )
         mean = 100 * coverage.mean(axis=0)
-        low, high = _band(coverage, *maps)
         k = k if looks is None else looks[name]
         colour, style = COLOURS[k % len(COLOURS)], STYLES[(k + k // len(COLOURS)) % len(STYLES)]
         ax.plot(seconds, mean, label=f"{name} (n = {len(coverage)})", color=colour, linestyle=style)
-        ax.fill_between(seconds, np.clip(low, 0, 100), np.clip(high, 0, 100), color=colour, alpha=0.2, linewidth=0)
+        if (band := _band(coverage, *maps)) is not None:
+            ax.fill_between(seconds, *np.clip(band, 0, 100), color=colour, alpha=0.2, linewidth=0)
     for mark in (85, 95):
         ax.axhline(mark, color="#808080", linewidth=0.8, linestyle=(0, (2, 2)))
     ax.set_ylim(0, 101)
@@ -249,12 +250,14 @@ def draw_coverage_lines(ax, curves: dict, looks: dict[str, int] | None = None) -
     ax.set_xlabel("time [s]")
 
 
-def _band(coverage: np.ndarray, maps: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """95 % interval of the mean at each record [%]."""
-    if maps is not None:
-        return tuple(100 * np.percentile(resampled_means(coverage, resample_weights(maps)), [2.5, 97.5], axis=0))
-    mean, error = 100 * coverage.mean(axis=0), 196 * coverage.std(axis=0) / np.sqrt(len(coverage))
-    return mean - error, mean + error
+def _band(coverage: np.ndarray, maps: np.ndarray | None = None) -> np.ndarray | None:
+    """95 % interval of the mean at each record [%], shape [2, records]; None where too few episodes are distinct."""
+    maps = np.zeros(len(coverage)) if maps is None else maps
+    copies = label_copies(maps, dict(enumerate(coverage.T)))
+    if len(np.unique(copies)) < LEAST_DISTINCT:
+        return None
+    drawn = resampled_means(coverage, resample_weights(maps, copies=copies))
+    return 100 * np.percentile(drawn, [2.5, 97.5], axis=0)
 
 
 # Metrics
@@ -307,12 +310,11 @@ def _draw_bars(ax, policies: dict, metric: str, factor: float) -> None:
         if mean is None:
             ax.text(0, row, f" never reached (0 of {total})" if total else " no value", va="center", fontsize=8)
             continue
-        low, high = (factor * (mean if end is None else end) for end in value.get("ci95", (mean, mean)))
         ax.barh(row, factor * mean, height=0.62, color=COLOURS[row % len(COLOURS)], alpha=0.85)
-        ax.errorbar(
-            factor * mean, row, xerr=[[max(factor * mean - low, 0)], [max(high - factor * mean, 0)]], color="black",
-            capsize=3, linewidth=1.2,
-        )  # fmt: skip
+        high = factor * mean
+        if has_interval(value):
+            high = factor * value["ci95"][1]
+            ax.errorbar(factor * mean, row, xerr=reach(value, factor), color="black", capsize=3, linewidth=1.2)
         partial |= 0 < count < total
         label = f"{factor * mean:.3g}" + (f" ({count} of {total})" if 0 < count < total else "")
         ax.annotate(label, (max(high, factor * mean), row), (5, 0), textcoords="offset points", va="center", fontsize=8)

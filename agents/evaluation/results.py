@@ -10,6 +10,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.evidence import brackets, describe_evidence
 from maexp.agents.evaluation.headroom import headroom_shares
 from maexp.agents.files import write_json
 from maexp.agents.settings.schema import EpisodeSettings
@@ -70,16 +71,21 @@ def paired_differences(results: list[EvaluationResult]) -> dict[str, dict]:
 def write_results(path: Path, results: list[EvaluationResult], run: dict) -> None:
     """{policy: {metric: {mean, std, ci95, n}}}; `difference`: the same of the learned ones less each other; `run`: what
     was run; `headroom_share`: leads by that of `clairvoyant` (`headroom`)."""
-    named = {name: one.summary() for name, one in zip(result_names(results), results, strict=True)}
-    shares = headroom_shares(results, result_names(results))
+    names = result_names(results)
+    named = {name: one.summary() for name, one in zip(names, results, strict=True)}
+    shares = headroom_shares(results, names)
     named |= {"difference": found} if (found := paired_differences(results)) else {}
     named |= {"headroom_share": shares} if shares else {}
-    named["run"] = run | {"num_robots": sorted({one.num_robots for one in results})}
+    named["run"] = run | {
+        "num_robots": sorted({one.num_robots for one in results}),
+        "distinct_episodes": {name: one.evidence.distinct for name, one in zip(names, results, strict=True)},
+    }
     write_json(path, named)
 
 
 def print_results(results: list[EvaluationResult], title: str) -> None:
-    """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there."""
+    """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there; below it what that
+    rests on, where it is little."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("policy", no_wrap=True)
     columns = [name for name in COLUMNS if in_reach(name, results[0].success_coverage)]
@@ -91,6 +97,10 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
         table.add_row(name, *(_cell(metric, summary[metric], total) for metric in columns))
     natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
     Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
+    whole = [one for one in results if not one.place]
+    named = zip(result_names(whole), whole, strict=True)
+    for sentence in describe_evidence([one.evidence._replace(policy=name) for name, one in named]):
+        print(sentence)
 
 
 def _cell(metric: str, value: dict, total: int) -> str:
@@ -99,6 +109,5 @@ def _cell(metric: str, value: dict, total: int) -> str:
     digits = 0 if metric.startswith(("coverage_step", "path")) else 3
     text = f"{value['mean']:.{digits}f}"
     if metric == "exploration_ratio":
-        low, high = value["ci95"]
-        return f"{text} [{low:.3f}, {high:.3f}]"
+        return text + brackets(value, "{:.3f}".format)
     return text if value["n"] == total else f"{text} ({value['n']}/{total})"

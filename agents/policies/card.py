@@ -1,10 +1,12 @@
 """The card of an exported policy: what it was trained on, how well it does, what it is not good for, in Markdown."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.evidence import has_interval
 
 SHOWN = {
     "exploration_ratio": "coverage",
@@ -102,11 +104,11 @@ def _differences(content: dict[str, Any]) -> list[str]:
         for name, rivals in content.get("difference", {}).items():
             label = next((one for one in (f"{best} N={size}", best) if one in rivals), None)
             if label is not None:
-                low, high = (100 * end for end in rivals[label][NEXT]["ci95"])
+                found = rivals[label][NEXT]
+                interval = _interval(found, lambda end: f"{100 * end:+.2f}")
                 sentences += [
                     f"{name} less {label}, the best classical planner on the validation maps, on the same episodes: "
-                    f"{100 * rivals[label][NEXT]['mean']:+.2f} points of coverage over time "
-                    f"({low:+.2f} to {high:+.2f}).", "",
+                    f"{100 * found['mean']:+.2f} points of coverage over time{interval}.", "",
                 ]  # fmt: skip
     return sentences
 
@@ -114,9 +116,11 @@ def _differences(content: dict[str, Any]) -> list[str]:
 def _cell(value: Any) -> str:
     if not isinstance(value, dict) or value.get("mean") is None:
         return ""
-    low, high = (value.get("ci95") or [None, None])[:2]
-    interval = "" if low is None or high is None else f" ({_short(low)} to {_short(high)})"
-    return f"{_short(value['mean'])}{interval}"
+    return f"{_short(value['mean'])}{_interval(value, _short)}"
+
+
+def _interval(found: dict[str, Any], write: Callable[[float], str]) -> str:
+    return f" ({' to '.join(write(end) for end in found['ci95'])})" if has_interval(found) else ""
 
 
 def _short(value: float) -> str:

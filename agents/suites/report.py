@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from rich import box
@@ -11,9 +12,11 @@ from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
+from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence, verdict
 from maexp.agents.evaluation.plots import COLOURS, LOOK, save
 from maexp.agents.suites.score import RANDOM
 from maexp.agents.suites.suite import Suite
+from maexp.envs.metrics import label_copies
 
 COLUMNS = ("part", "score", "95 % interval", RANDOM, "reference", "between", "less reference", "95 % at", "lost")
 
@@ -54,11 +57,10 @@ def print_table(suite: Suite, results: dict[str, Any]) -> None:
 
 
 def _cells(score: dict, ends: tuple[float, float], normalised: float | None, less: dict) -> list[str]:
-    low, high = score["ci95"]
     between = "-" if normalised is None else f"{normalised:.2f}"
-    mean, *interval = (100 * value for value in (less["mean"], *less["ci95"]))
-    difference = f"{mean:+.1f} [{interval[0]:+.1f}, {interval[1]:+.1f}]"
-    return [f"{score['mean']:.3f}", f"[{low:.3f}, {high:.3f}]", *(f"{end:.3f}" for end in ends), between, difference]
+    difference = f"{100 * less['mean']:+.1f}{brackets(less, lambda end: f'{100 * end:+.1f}')}"
+    interval = brackets(score, "{:.3f}".format).strip()
+    return [f"{score['mean']:.3f}", interval, *(f"{end:.3f}" for end in ends), between, difference]
 
 
 def _more(part: dict) -> list[str]:
@@ -70,13 +72,13 @@ def _more(part: dict) -> list[str]:
 def describe_results(suite: Suite, results: dict[str, Any]) -> list[str]:
     """Sentences below the table."""
     found, better = results["reference"]["difference"][suite.score], results["reference"]["improvement"]
-    low, high = (100 * end for end in found["ci95"])
-    where = "is ahead of" if low > 0 else "is behind" if high < 0 else "cannot be told from"
+    interval = brackets(found, lambda end: f"{100 * end:+.2f}")
     lines = [
-        f"{results['policy']} {where} the reference, {suite.reference} as it was frozen: {100 * found['mean']:+.2f} "
-        f"points of {suite.score} [{low:+.2f}, {high:+.2f}] in the same episodes. An episode of its is better than one "
-        f"of the reference with probability {better['mean']:.2f}.",
+        f"{results['policy']} {verdict(found)} the reference, {suite.reference} as it was frozen: "
+        f"{100 * found['mean']:+.2f} points of {suite.score}{interval} in the same episodes. An episode of its is "
+        f"better than one of the reference with probability {better['mean']:.2f}.",
     ]
+    lines += describe_evidence([_evidence(suite, results)])
     if results["decisions"]["count"]:
         spent = results["decisions"]
         lines.append(
@@ -90,6 +92,15 @@ def describe_results(suite: Suite, results: dict[str, Any]) -> list[str]:
     if not results["suite"]["frozen_maps"]:
         lines.append(f"Other maps and starts, of seed {results['suite']['seed']}: not the score of {suite.name}.")
     return lines
+
+
+def _evidence(suite: Suite, results: dict[str, Any]) -> Evidence:
+    """What the figures of all parts rest on."""
+    parts = results["episodes"].values()
+    metrics = [{name: np.array(rows[name], dtype=np.float64) for name in suite.metrics} for rows in parts]
+    copies = [label_copies(np.array(rows["map"]), own) for rows, own in zip(parts, metrics, strict=True)]
+    distinct, maps = sum(len(np.unique(one)) for one in copies), {place for rows in parts for place in rows["map"]}
+    return Evidence(results["policy"], sum(map(len, copies)), distinct, len(maps))
 
 
 def draw_profiles(suite: Suite, results: dict[str, Any], path: Path) -> Path:

@@ -1,6 +1,7 @@
 """The score of a suite: mean over its episodes, beside `random` (0) and the reference planner (1), with intervals.
 
-Intervals resample the maps of each part and the episodes on each. Differences are paired: the same episodes.
+Intervals resample the maps of each part and the episodes on each, copies together. Differences are paired: the same
+episodes.
 """
 
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from maexp.agents.benchmark.compare import improvement
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.suites.suite import Suite
-from maexp.envs.metrics import resample_weights, resampled_means
+from maexp.envs.metrics import LEAST_DISTINCT, resample_weights, resampled_means
 
 Results = dict[str, EvaluationResult]  # part -> its episodes
 RANDOM = "random"
@@ -27,7 +28,8 @@ def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> 
     name, theirs, worst = suite.score, frozen[suite.reference], frozen[RANDOM]
     own, zero, one = (_values(name, results) for results in (mine, worst, theirs))
     ends = {part: (zero[part].mean(), one[part].mean()) for part in own}
-    overall = mean_over_parts(mine, own)
+    overall = mean_over_parts(own, mine)
+    copies = tuple({part: one.copies() for part, one in results.items()} for results in (mine, theirs))
     return {
         "score": overall | {"normalised": place_between(overall["mean"], mean_of(zero), mean_of(one))},
         "parts": {
@@ -41,7 +43,7 @@ def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> 
             "parts": {part: float(values.mean()) for part, values in one.items()},
             "difference": {metric: subtract(mine, theirs, metric) for metric in suite.metrics},
             "differences": {part: result.minus(theirs[part])[name] for part, result in mine.items()},
-            "improvement": improvement(own, one),
+            "improvement": improvement(own, one, copies),
         },
         "profile": {
             name: np.linspace(0.0, 1.0, LEVELS).round(3).tolist(),
@@ -55,26 +57,35 @@ def mean_of(values: dict[str, np.ndarray]) -> float:
     return float(np.mean([one.mean() for one in values.values()]))
 
 
-def mean_over_parts(results: Results, values: dict[str, np.ndarray]) -> dict[str, Any]:
-    """{mean, ci95, n} of values [episodes] of each part; NaN where an episode has none."""
+def mean_over_parts(values: dict[str, np.ndarray], *results: Results) -> dict[str, Any]:
+    """{mean, ci95, n} of values [episodes] of each part; NaN where an episode has none.
+
+    Args:
+        values: part -> a value for each episode
+        results: what they are of: one's episodes, or those of two that played the same
+    """
     kept = {part: ~np.isnan(one) for part, one in values.items()}
     have = {part: one for part, one in values.items() if kept[part].any()}
     if not have:
         return {"mean": np.nan, "ci95": [np.nan, np.nan], "n": 0}
-    means = []
+    means, distinct = [], 0
     for number, (part, one) in enumerate(have.items()):
-        weights = resample_weights(results[part].maps, seed=number)[:, kept[part]]
+        first, *others = (played[part] for played in results)
+        copies = first.copies(*others)
+        distinct += len(np.unique(copies[kept[part]]))
+        weights = resample_weights(first.maps, copies=copies, seed=number)[:, kept[part]]
         drawn = resampled_means(one[kept[part]], weights)
         means.append(np.resize(drawn, len(weights)))  # a resample without any value is left out: others stand for it
-    low, high = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
+    ends = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
+    ends = ends.tolist() if distinct >= LEAST_DISTINCT else [np.nan, np.nan]
     middle = mean_of({part: one[kept[part]] for part, one in have.items()})
-    return {"mean": middle, "ci95": [float(low), float(high)], "n": int(sum(one.sum() for one in kept.values()))}
+    return {"mean": middle, "ci95": ends, "n": int(sum(one.sum() for one in kept.values()))}
 
 
 def subtract(mine: Results, theirs: Results, metric: str) -> dict[str, Any]:
     """`mean_over_parts` of the paired differences."""
     pairs = {part: one.episodes[metric] - theirs[part].episodes[metric] for part, one in mine.items()}
-    return mean_over_parts(mine, pairs)
+    return mean_over_parts(pairs, mine, theirs)
 
 
 def place_between(value: float, zero: float, one: float) -> float | None:
