@@ -119,7 +119,7 @@ def grid(*sizes: int) -> list[tuple]:
 TINY = [
     "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
     "scenario.local_steps=5", "num_envs=4", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
-    "device=cpu",
+    "device=cpu", "evaluate_every=0",
 ]  # fmt: skip
 BATCH = 8
 
@@ -400,7 +400,7 @@ def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     for place in ("draw_rollout", "draw_curves"):
         monkeypatch.setattr(f"maexp.agents.commands.train.{place}", lambda *args: None)
-    words = [f"logger.backends=[{','.join(present)}]", "logger.mode=offline"]
+    words = [f"logger.backends=[{','.join(present)}]", "logger.mode=offline", "evaluate_every=1", "evaluate_episodes=2"]
     assert main(["train", *TINY, *words, "hydra.run.dir=run", f"total_frames={2 * BATCH}"]) == 0
     assert main(["train", "resume=run", f"total_frames={3 * BATCH}"]) == 0
     written = read_metrics(Path("run/metrics.csv"))

@@ -27,7 +27,10 @@ PAGES = [*(page for page in sorted((ROOT / "docs").rglob("*.md")) if LOG not in 
 PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger
-    "train": (*PLACES, "total_frames=8", "warm_start_frames=8", "collector.steps=2", "episodes=2", "model.channels=4"),
+    "train": (
+        *PLACES, "total_frames=8", "warm_start_frames=8", "collector.steps=2", "episodes=2", "model.channels=4",
+        "evaluate_episodes=2",
+    ),
     "evaluate": (*PLACES, "episodes=2"),
     "benchmark": (
         *PLACES, "scenarios=maze_small", "algorithms=mappo", "policies=random", "seeds=0", "iterations=null",

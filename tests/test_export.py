@@ -200,7 +200,8 @@ def test_weights_are_kept_without_pickle(policy, folder):
 def test_from_a_run_to_a_plan(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = ("scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]", "scenario.held_out=[1]")
-    train = ("total_frames=8", "num_envs=2", "episodes=2", "classical=[]", "device=cpu", "hydra.run.dir=run")
+    train = ("total_frames=8", "num_envs=2", "episodes=2", "evaluate_every=0", "classical=[]", "device=cpu",
+             "hydra.run.dir=run")  # fmt: skip
     assert main(["train", "action=targets", *small, *train]) == 0
     assert main(["export", "run", "out=made", "note=The first of three."]) == 0
     told = capsys.readouterr().out

@@ -30,7 +30,7 @@ CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
 RUN = [
     "scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2", "scenario.local_steps=2", "num_envs=2",
-    "num_robots=2", "collector.steps=2", "episodes=2",
+    "num_robots=2", "collector.steps=2", "episodes=2", "evaluate_episodes=2",
 ]  # fmt: skip
 
 

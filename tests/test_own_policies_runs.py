@@ -12,7 +12,7 @@ from maexp.agents.training.named import find_player
 
 TINY = [
     "preset=smoke", "num_envs=2", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0]",
-    "scenario.held_out=[70]", "device=cpu",
+    "scenario.held_out=[70]", "device=cpu", "evaluate_every=0",
 ]  # fmt: skip
 TEACHER = '''
 import torch

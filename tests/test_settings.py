@@ -183,7 +183,7 @@ def test_the_papers_clearance_follows_the_scenario():
 def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["num_envs=2", "num_robots=2", "scenario.maps=[0]", "scenario.held_out=[64]", "scenario.macro_steps=3"]
-    words += ["collector.steps=3", "device=cpu", "num_threads=1", "checkpoint_every=1"]
+    words += ["collector.steps=3", "device=cpu", "num_threads=1", "checkpoint_every=1", "evaluate_every=0"]
     monkeypatch.setattr("maexp.agents.commands.train.finish", lambda done: None)
     assert main(["train", *words, "total_frames=6", "hydra.run.dir=run"]) == 0
     path, saved = find_checkpoint("run")

@@ -134,7 +134,8 @@ def test_a_team_is_viewed_and_imitated(tmp_path, monkeypatch, capsys):
     view = ("renderer=painter", "size=200", "num_envs=1", *SMALL[:2], "hydra.run.dir=seen")
     assert main(["view", "policy=universal", *view]) == 0
     assert "universal, 3 robots" in capsys.readouterr().out and (tmp_path / "seen" / "episodes").is_dir()
-    train = ("total_frames=8", "warm_start_frames=16", "episodes=0", "model.target_width=8", "hydra.run.dir=pupil")
+    train = ("total_frames=8", "warm_start_frames=16", "episodes=0", "evaluate_every=0", "model.target_width=8",
+             "hydra.run.dir=pupil")  # fmt: skip
     assert main(["train", "warm_start=universal", *SMALL, *train]) == 0
     log = (tmp_path / "pupil" / "warm_start.csv").read_text().splitlines()
     assert "nll_target" in log[0] and len(log) == 5

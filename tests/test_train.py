@@ -21,11 +21,13 @@ from maexp.agents.training.logs import MetricsLog, read_metrics
 TINY = [
     "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
     "scenario.local_steps=5", "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
+    "evaluate_every=0", "evaluate_episodes=4",
 ]  # fmt: skip
 BATCH = 6
 CLOCKS = (
-    "seconds", "frames_per_second", "time_wait", "time_simulate", "time_policy", "time_advantage", "time_update"
-)
+    "seconds", "frames_per_second", "time_wait", "time_simulate", "time_policy", "time_advantage", "time_update",
+    "time_validation",
+)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -77,15 +79,18 @@ def assert_same_runs(first: Path, second: Path) -> None:
 
 def test_the_files_of_a_run(capsys):
     folder = run("a run", 3, "episodes=4", "checkpoint_keep=2", "evaluate_every=2")
-    rows = read_metrics(folder / "metrics.csv")
+    start, *rows = read_metrics(folder / "metrics.csv")
+    assert start["iteration"] == start["frames"] == 0 and start["reward"] != start["reward"]
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert [row["frames"] for row in rows] == [BATCH, 2 * BATCH, 3 * BATCH]
-    assert all(row[name] > 0 for row in rows for name in CLOCKS)
+    assert all(row[name] > 0 for row in rows for name in CLOCKS[:-1])
+    assert [row["time_validation"] > 0 for row in (start, *rows)] == [True, False, True, False]
     assert all(sum(row[name] for name in CLOCKS[3:]) < row["seconds"] for row in rows)
     assert all(row["time_simulate"] + row["time_policy"] <= row["time_wait"] + 2e-4 for row in rows)
     assert {row["policy_lag"] for row in rows} == {0}
     assert sum(row["episodes"] for row in rows) == 3 * 2  # 6 macro steps of 3 teams, 3 to an episode
     assert rows[1]["validation_coverage"] > 0 and rows[0]["validation_coverage"] != rows[0]["validation_coverage"]
+    assert start["validation_coverage"] > 0
     assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2"]
     assert (folder / "checkpoints" / "best.pt").is_file()
     assert "num_robots: 2" in (folder / "config.yaml").read_text()
@@ -160,7 +165,7 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
     """Each with its own robots and episodes; resumed it goes on with all of them."""
     words = [
         "scenario=maze_small", "scenario.also=[indoor_small]", "scenario.maps=[0]", "scenario.held_out=[70]",
-        "scenario.macro_steps=2", "num_envs=4", "episodes=0", "action=targets",
+        "scenario.macro_steps=2", "num_envs=4", "episodes=0", "evaluate_every=0", "action=targets",
     ]  # fmt: skip
     batch = 2 * 2 + 2 * 15
     assert main(["train", *words, "hydra.run.dir=whole", f"total_frames={2 * batch}"]) == 0
@@ -194,6 +199,51 @@ def test_a_batch_is_an_episode_of_every_team_unless_told_otherwise(steps, frames
     folder = run("whole", 1, f"collector.steps={steps}")
     (row,) = read_metrics(folder / "metrics.csv")
     assert (row["frames"], row["episodes"]) == (frames, ends)
+
+
+def test_the_gain_is_the_paired_difference_to_the_best_planner(monkeypatch):
+    """What metrics.csv says of a team equals what evaluate says of its checkpoint, on the validation maps."""
+    words = ["scenario.validation=[5,6]", "classical=[nearest_frontier,cost_utility]"]
+    folder = run("run", 2, *words, "evaluate_every=2")
+    rows = read_metrics(folder / "metrics.csv")
+    for name, row in (("000000", rows[0]), ("000002", rows[2])):
+        where = ["scenario.held_out=[5,6]", "episodes=4", "num_envs=3", f"hydra.run.dir={name}"]
+        place = f"checkpoint={folder}/checkpoints/iteration_{name}.pt"
+        assert main(["evaluate", place, "policy=nearest_frontier,cost_utility", *where]) == 0
+        told = json.loads(Path(name, "results.json").read_text())
+        planners = ("nearest_frontier", "cost_utility")
+        best = max(planners, key=lambda one: told[one]["coverage_auc"]["mean"])
+        assert row["validation_coverage_auc"] == pytest.approx(told["trained"]["coverage_auc"]["mean"], abs=1e-6)
+        found = told["difference"]["trained"][best]
+        for column, metric, factor in (
+            ("gain", "coverage_auc", 100), ("steps_95", "coverage_step_95_censored", 1)
+        ):  # fmt: skip
+            values = [found[metric]["mean"], *found[metric]["ci95"]]
+            columns = [row[f"validation_{column}{end}"] for end in ("", "_low", "_high")]
+            assert columns == pytest.approx([factor * value for value in values], abs=1e-4)
+    assert rows[0]["validation_gain"] < 0, "a team that knows nothing is behind"
+
+
+@pytest.mark.parametrize("words", [["classical=[]"], ["planner=direct"], ["classical=[random]"]])
+def test_without_a_classical_planner_there_is_no_gain(words):
+    row = read_metrics(run("run", 1, "evaluate_every=1", *words) / "metrics.csv")[1]
+    assert row["validation_coverage_auc"] > 0 and row["validation_gain"] != row["validation_gain"]
+
+
+def test_resumed_the_planners_need_not_play_again(monkeypatch, capsys):
+    """The columns of the validation, too, are those of a run in one go; other settings let the planners play anew."""
+    from maexp.agents.training import validation
+
+    played, play_best = [], validation.play_best
+    monkeypatch.setattr(validation, "play_best", lambda *args: played.append(1) or play_best(*args))
+    whole = run("whole", 5, "evaluate_every=2")
+    parts = run("parts", 3, "evaluate_every=2")
+    assert len(played) == 2
+    assert_same_runs(whole, resume(parts, 5))
+    assert len(played) == 2
+    assert "gain over" in capsys.readouterr().err
+    resume(parts, 6, "evaluate_episodes=2")
+    assert len(played) == 3
 
 
 def test_evaluations_in_between_change_nothing():

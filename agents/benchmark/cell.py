@@ -29,6 +29,7 @@ from maexp.agents.files import short, write_file, write_json
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import resolve
+from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.training.named import Player, suit_observation
@@ -37,11 +38,6 @@ from maexp.envs.recorder import CoverageRecorder
 
 RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
-PLAYED = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "num_envs",
-    "num_robots", "seed", "num_threads",
-)  # fmt: skip
-"""Settings that matter to who only plays."""
 CURVE = ("curve_seconds", "curve_coverage")
 TRAINED = "training.json"
 """Written last where a training has come to its end."""

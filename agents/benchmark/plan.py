@@ -197,7 +197,8 @@ def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
     words += [f"algorithm={cell.policy}"] if cell.trains else []
     usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), unresolved(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
-    changed |= _maps_of(cfg, cell) | length_of(cfg, cell) | {"episodes": 0, "num_threads": cfg.num_threads or 1}
+    changed |= _maps_of(cfg, cell) | length_of(cfg, cell)
+    changed |= {"episodes": 0, "evaluate_every": 0, "num_threads": cfg.num_threads or 1}
     changed = {name: value for name, value in changed.items() if not (name.startswith("algorithm.") and value is None)}
     if not cell.trains:
         changed = {name: value for name, value in changed.items() if not name.startswith("algorithm.")}

@@ -24,7 +24,7 @@ from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, wr
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
 from maexp.agents.files import short, write_json
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -58,13 +58,6 @@ def check(cfg: EvaluateSettings) -> None:
     team_sizes(cfg.num_robots)
     check_planner(cfg.planner.name, find_players(words_of(cfg.policy)))
     check_render(cfg)
-
-
-def words_of(value: Any) -> list[str]:
-    """The words of a setting that names one policy or several."""
-    if value is None:
-        return []
-    return [value] if isinstance(value, str) else [str(one) for one in value]
 
 
 def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:

@@ -5,12 +5,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from maexp.agents.build import choose_device, make_env, model_settings
-from maexp.agents.commands.evaluate import draw_results, evaluate_all, report, words_of
+from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.comparison import choose_best
 from maexp.agents.files import short
-from maexp.agents.settings.checks import check_counts, team_sizes
+from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import TrainSettings
@@ -57,7 +56,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 def check(cfg: TrainSettings) -> None:
     """Raise UserError for counts out of range."""
-    check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep")
+    check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep", "evaluate_episodes")
     check_counts(cfg, "episodes", "evaluate_every", least=0)
     team_sizes(cfg.num_robots)
     check_collector(cfg.collector)
@@ -110,12 +109,11 @@ def finish(done: TrainingRun) -> None:
     written = ["config.yaml", "metrics.csv", "checkpoints/"]
     draw_curves(where)
     written.append("curves.png")
-    best: dict[int, str | None] = {}
+    best: dict[int, str] = {}
     if cfg.episodes:
         device = choose_device(cfg, "train_device")
         others = find_others(cfg)
-        names = [one.name for one in others]
-        best = {size: choose_best(cfg, done.suite, names, size, device=device) for size in done.sizes}
+        best = done.validation.best
         shown = copy.deepcopy(cfg)
         suit_observation(shown, [trained_player(done), *others])
         envs = (make_env(shown, done.suite.held_out, size, device=device) for size in done.sizes)

@@ -1,7 +1,6 @@
 """Who did better on the same episodes: differences, the best classical planner, and a plain sentence."""
 
 from collections.abc import Sequence
-from typing import Any
 
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
@@ -10,31 +9,31 @@ from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.schema import EpisodeSettings
+from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"
 
 
-def choose_best(
-    cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num_robots: int, **others: Any
-) -> str | None:
-    """The classical planner among `names` that sees most over time on the validation maps; None where there is none.
-
-    Args:
-        others: arguments of the env
-    """
+def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num_robots: int) -> str | None:
+    """The classical planner among `names` that sees most over time on the validation maps; None where there is none."""
     planners = [name for name in names if name in CLASSICAL]
     if len(planners) < 2:
         return next(iter(planners), None)
     count = min(CHOOSING, cfg.episodes)
-    env = make_env(cfg, suite.validation, num_robots, min(cfg.num_envs, count), **others)
-    scores = {}
+    env = make_env(cfg, suite.validation, num_robots, min(cfg.num_envs, count))
+    return play_best(env, planners, count, cfg.seed).policy
+
+
+def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
+    """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
-        for name in planners:
-            played = evaluate(POLICIES[name](env), env, count, name=name, seed=cfg.seed, advance=progress.advance)
-            scores[name] = played.episodes[DECIDES].mean()
-    return max(scores, key=scores.get)
+        played = [
+            evaluate(POLICIES[name](env), env, count, name=name, seed=seed, advance=progress.advance)
+            for name in planners
+        ]
+    return max(played, key=lambda one: one.episodes[DECIDES].mean())
 
 
 def describe_differences(results: list[EvaluationResult], best: dict[int, str | None]) -> list[str]:

@@ -73,22 +73,26 @@ class EvaluationResult:
         return {name: summarise(one, weights, copies) for name, one in values.items()}
 
 
+def join(parts: list[EvaluationResult]) -> EvaluationResult:
+    """The episodes of several results as those of one, without what was recorded."""
+    return replace(
+        parts[0],
+        episodes={metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes},
+        seconds=sum(one.seconds for one in parts),
+        maps=np.concatenate([one.maps for one in parts]),
+        place="",
+        times=None,
+        coverage=None,
+        shares=None,
+    )
+
+
 def pool(parts: list[EvaluationResult]) -> EvaluationResult:
     """The episodes of several recorded results of one policy as one result."""
     times = np.unique(np.concatenate([one.times for one in parts]))
     lines = [np.interp(times, one.times, line) for one in parts for line in one.coverage]
-    return EvaluationResult(
-        parts[0].policy,
-        parts[0].num_robots,
-        {metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes},
-        sum(one.seconds for one in parts),
-        np.concatenate([one.maps for one in parts]),
-        parts[0].learned,
-        times=times,
-        coverage=np.stack(lines),
-        shares=np.concatenate([one.shares for one in parts]),
-        success_coverage=parts[0].success_coverage,
-    )
+    shares = np.concatenate([one.shares for one in parts])
+    return replace(join(parts), times=times, coverage=np.stack(lines), shares=shares)
 
 
 def evaluate_recorded(policy: Callable, env, episodes: int, **settings) -> EvaluationResult:

@@ -46,6 +46,13 @@ def check_goals(policies: Sequence[str], planner: str) -> None:
         )
 
 
+def words_of(value: Any) -> list[str]:
+    """The words of a setting that names one policy or several."""
+    if value is None:
+        return []
+    return [value] if isinstance(value, str) else [str(one) for one in value]
+
+
 def team_sizes(value: Any) -> list[int]:
     """The team sizes of num_robots=3 or num_robots=1,2,6.
 

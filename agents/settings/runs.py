@@ -20,6 +20,11 @@ GROUPS = (
     "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "algorithm",
     "model",
 )  # fmt: skip
+PLAYED = (
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "num_envs",
+    "num_robots", "seed", "num_threads",
+)  # fmt: skip
+"""Settings that matter to who only plays."""
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
 CALLED = {"radar.range": "radar_range", "robot.length": "body_length", "robot.width": "body_width"}
 """What the scenario calls them, where that is another name."""

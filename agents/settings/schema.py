@@ -192,7 +192,8 @@ class TrainSettings(LearnerSettings):
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints")
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")
-    evaluate_every: int = setting(0, "iterations between two evaluations on validation maps; 0: none")
+    evaluate_every: int = setting(5, "iterations between two evaluations on validation maps, from the start; 0: none")
+    evaluate_episodes: int = setting(64, "validation episodes, of the team and of the planners it is compared with")
     collector: CollectorSettings = field(default_factory=CollectorSettings)
     logger: LoggerSettings = field(default_factory=LoggerSettings)
 

@@ -16,7 +16,7 @@ MODES = ("online", "offline")
 
 
 class MetricsLog:
-    """Rows of metrics, one an iteration, each on disk before the next iteration begins.
+    """Rows of metrics, one an iteration, each on disk before the next iteration begins; and one from before the first.
 
     Args:
         folder: the run's folder
@@ -29,18 +29,30 @@ class MetricsLog:
     def __init__(self, folder: Path, settings: LoggerSettings, kept: int, frames: int, config: dict):
         self.path = folder / "metrics.csv"
         self.columns = _keep_rows(self.path, kept)
+        self.first: dict[str, float] | None = None
         self.file = open(self.path, "a", newline="")
         self.backends = [BACKENDS[name](folder, settings, config, frames) for name in settings.backends]
 
+    def begin(self, row: dict[str, float]) -> None:
+        """What is known before the first iteration; in the file it waits for that, whose names are the columns."""
+        self.first = row
+        self._send(row)
+
     def write(self, row: dict[str, float]) -> None:
-        """Add a row; the first row's names are the columns of all."""
+        """Add an iteration's row; the first one's names are the columns of all."""
         if self.columns is None:
             self.columns = list(row)
             self.file.write(_line(self.columns))
+            if self.first is not None:
+                self.file.write(_line([self.first.get(name, "") for name in self.columns]))
         if unknown := [name for name in row if name not in self.columns]:
             raise RuntimeError(f"{unknown[0]} was not among the first row's metrics {self.columns}")
         self.file.write(_line([row.get(name, "") for name in self.columns]))
         self.file.flush()
+        self._send(row)
+
+    def _send(self, row: dict[str, float]) -> None:
+        """To TensorBoard and Weights & Biases what has a value."""
         known = {name: value for name, value in row.items() if not math.isnan(value)}
         for backend in self.backends:
             backend.write(known)

@@ -6,10 +6,9 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 from omegaconf import DictConfig
@@ -25,7 +24,6 @@ from maexp.agents.build import (
     set_steps,
 )
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluation.evaluate import evaluate
 from maexp.agents.files import write_text
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
@@ -33,6 +31,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
+from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import (
     check_action,
@@ -44,6 +43,7 @@ from maexp.agents.training.checkpoint import (
 from maexp.agents.training.checksums import checksums, warn_of_changed_maps
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
+from maexp.agents.training.validation import COLUMNS, Validation
 from maexp.agents.versions import find_commit
 from maexp.envs import PointCloudMap
 
@@ -65,6 +65,8 @@ def train(run: "TrainingRun") -> None:
         Progress("training", cfg.total_frames, run.frames) as progress,
     ):
         if run.iteration == 0:
+            if cfg.evaluate_every:
+                log.begin(run.start())
             run.save()
         last = run.iteration >= run.iterations
         while not last:
@@ -75,12 +77,12 @@ def train(run: "TrainingRun") -> None:
                 row |= learner.updater.update(*batches, progress=run.iteration / run.iterations)
                 experience.update_policy_weights_()
                 run.iteration += 1
-                row |= run.evaluate_if_due()
+                row |= run.validate_if_due()
                 log.write(run.timed(row, begin))
-                average = run.smooth(row["coverage"])
+                run.smooth(row["coverage"])
                 last = bool(stop) or run.iteration == run.iterations  # a signal after this waits: the last one is saved
                 run.keep(row, log, last)
-            progress.show(min(run.frames, cfg.total_frames), f"coverage {average:.3f}")
+            progress.show(min(run.frames, cfg.total_frames), run.describe())
     run.stopped = bool(stop)
 
 
@@ -89,8 +91,9 @@ class TrainingRun:
     """The parts of a run and how far it is.
 
     Attributes:
-        best: highest coverage so far, of training episodes or of the evaluations in between
+        best: highest value of `scored_by` so far
         average: running mean of the training's coverage, for the progress bar
+        gains: the first and the latest of `Validation.row`
         seconds: training time so far, over all resumptions
     """
 
@@ -103,6 +106,7 @@ class TrainingRun:
     iteration: int = 0
     best: float = -math.inf
     average: float = math.nan
+    gains: list[dict[str, float]] = field(default_factory=list)
     seconds: float = 0.0
     stopped: bool = False
 
@@ -130,6 +134,11 @@ class TrainingRun:
         return {name: value for name, value in settings.items() if name != "resume"}
 
     @cached_property
+    def validation(self) -> Validation:
+        """The validation episodes of the run."""
+        return Validation(self.cfg, self.suite)
+
+    @cached_property
     def checksums(self) -> dict[str, str]:
         """Of the maps trained on and held out, by their names."""
         return checksums(self.suite.train) | checksums(self.suite.held_out)
@@ -143,6 +152,11 @@ class TrainingRun:
     def sizes(self) -> list[int]:
         """The team sizes, one or several."""
         return team_sizes(self.cfg.num_robots)
+
+    @property
+    def scored_by(self) -> str:
+        """The column of metrics.csv that tells which checkpoint is the best."""
+        return "validation_coverage_auc" if self.cfg.evaluate_every else "coverage"
 
     @property
     def batch_frames(self) -> int:
@@ -169,7 +183,10 @@ class TrainingRun:
             "maps": self.checksums,
             "iteration": self.iteration,
             "best": self.best,
+            "scored_by": self.scored_by,
             "average": self.average,
+            "gains": self.gains,
+            "validation": self.validation.state_dict(),
             "seconds": self.seconds,
             "updater": self.learner.updater.state_dict(),
             "policy": self.learner.policy.state_dict(),
@@ -187,9 +204,19 @@ class TrainingRun:
         load_matching(self.learner.policy, saved["policy"])
         self.learner.updater.load_state_dict(saved["updater"])
         self.restore_experience(saved)
-        self.iteration, self.best = saved["iteration"], saved["best"]
+        self.iteration = saved["iteration"]
+        self.best = saved["best"] if saved.get("scored_by") == self.scored_by else -math.inf
         self.average, self.seconds = saved["average"], saved["seconds"]
+        self.restore_validation(saved)
         set_random_state(saved["random"])
+
+    def restore_validation(self, saved: dict) -> None:
+        """Go on with what the planners of `saved` did, where they would do the same."""
+        self.gains = saved.get("gains", [])
+        names = (*PLAYED, "classical", "evaluate_episodes")
+        alike = all(saved["settings"].get(name) == self.settings.get(name) for name in names)
+        if alike and saved["maps"] == self.checksums:
+            self.validation.load_state_dict(saved.get("validation", {}))
 
     def restore_experience(self, saved: dict) -> None:
         """Go on with the episodes of `saved`, or with new ones where other workers ran them."""
@@ -206,48 +233,60 @@ class TrainingRun:
         )
         self.experience.update_policy_weights_()
 
-    def evaluate_if_due(self) -> dict[str, float]:
-        """Coverage on the validation maps, every `evaluate_every` iterations; else NaN. The mean over team sizes."""
+    def start(self) -> dict[str, float]:
+        """The row of a run that has not begun."""
+        row = self.validate_if_due()
+        self.seconds += row["time_validation"]
+        return {"iteration": 0, "frames": 0} | row | {"seconds": round(self.seconds, 3)}
+
+    def validate_if_due(self) -> dict[str, float]:
+        """`Validation.row` every `evaluate_every` iterations, else NaN."""
         every = self.cfg.evaluate_every
         if not every or self.iteration % every:
-            return {"validation_coverage": math.nan}
-        if not hasattr(self, "_validation_envs"):
-            shares = divide_teams(self.cfg.num_envs, self.sizes)
-            device = choose_device(self.cfg, "train_device")
-            self._validation_envs = [
-                make_env(self.cfg, self.suite.validation, one.num_robots, one.num_envs, device=device) for one in shares
-            ]
-        policy, seed = self.learner.policy, self.cfg.seed
-        results = [evaluate(policy, env, env.num_envs, seed=seed).summary() for env in self._validation_envs]
-        return {"validation_coverage": fmean(one["exploration_ratio"]["mean"] for one in results)}
+            return dict.fromkeys(COLUMNS, math.nan) | {"time_validation": 0.0}
+        begin = time.perf_counter()
+        row = self.validation.row(self.learner.policy)
+        self.gains = [*self.gains[:1], row]
+        return row | {"time_validation": round(time.perf_counter() - begin, 4)}
 
     def keep(self, row: dict[str, float], log: MetricsLog, last: bool) -> None:
-        """Save when it is time to, or when the coverage is the best so far."""
-        score = row["validation_coverage"] if self.cfg.evaluate_every else row["coverage"]
-        due = last or self.iteration % self.cfg.checkpoint_every == 0
-        if due:
+        """Save when it is time to, or when the validation is the best so far."""
+        score = row[self.scored_by]
+        best = score > self.best  # false where the score is NaN
+        validated = best and bool(self.cfg.evaluate_every)
+        if last or validated or self.iteration % self.cfg.checkpoint_every == 0:
             log.sync()
-            best = score > self.best  # false where the score is NaN
             self.best = score if best else self.best
             self.save(best)
 
-    def smooth(self, coverage: float) -> float:
+    def smooth(self, coverage: float) -> None:
         """Running mean of the coverage; iterations where no episode ended do not count."""
         if not math.isnan(coverage):
             self.average = coverage if math.isnan(self.average) else 0.9 * self.average + 0.1 * coverage
-        return self.average
+
+    def describe(self) -> str:
+        """What has been learned so far, for the progress bar."""
+        if not self.gains or not self.validation.rival:
+            return f"coverage {self.average:.3f}"
+        (first, *_), last = self.gains, self.gains[-1]
+        now, low, high = (last[f"validation_gain{end}"] for end in ("", "_low", "_high"))
+        so_far = f"{now:+.1f} points [{low:+.1f}, {high:+.1f}], at the start {first['validation_gain']:+.1f}"
+        return f"gain over {self.validation.rival} {so_far}"
 
     def timed(self, row: dict[str, float], begin: float) -> dict[str, float]:
         """The row with its place in the run in front, and where the time since `begin` went at the end."""
         spent = time.perf_counter() - begin
         self.seconds += spent
         times = self.experience.seconds | {name: row.pop(name) for name in ("advantage", "update")}
+        validating = row.pop("time_validation")
         return (
             {"iteration": self.iteration, "frames": self.frames}
             | row
             | {"policy_lag": self.experience.lag}
             | {f"time_{name}": round(seconds, 4) for name, seconds in times.items()}
-            | {"frames_per_second": round(self.batch_frames / spent, 2), "seconds": round(self.seconds, 3)}
+            | {"time_validation": validating}
+            | {"frames_per_second": round(self.batch_frames / (spent - validating), 2)}
+            | {"seconds": round(self.seconds, 3)}
         )
 
 
