@@ -204,10 +204,10 @@ def test_a_batch_is_an_episode_of_every_team_unless_told_otherwise(steps, frames
 def test_the_gain_is_the_paired_difference_to_the_best_planner(monkeypatch):
     """What metrics.csv says of a team equals what evaluate says of its checkpoint, on the validation maps."""
     words = ["scenario.validation=[5,6]", "classical=[nearest_frontier,cost_utility]"]
-    folder = run("run", 2, *words, "evaluate_every=2")
+    folder = run("run", 2, *words, "evaluate_every=2", "evaluate_episodes=6")
     rows = read_metrics(folder / "metrics.csv")
     for name, row in (("000000", rows[0]), ("000002", rows[2])):
-        where = ["scenario.held_out=[5,6]", "episodes=4", "num_envs=3", f"hydra.run.dir={name}"]
+        where = ["scenario.held_out=[5,6]", "episodes=6", "num_envs=3", f"hydra.run.dir={name}"]
         place = f"checkpoint={folder}/checkpoints/iteration_{name}.pt"
         assert main(["evaluate", place, "policy=nearest_frontier,cost_utility", *where]) == 0
         told = json.loads(Path(name, "results.json").read_text())

@@ -24,6 +24,7 @@ from maexp.agents.build import (
     set_steps,
 )
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import write_text
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
@@ -43,7 +44,7 @@ from maexp.agents.training.checkpoint import (
 from maexp.agents.training.checksums import checksums, warn_of_changed_maps
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
-from maexp.agents.training.validation import COLUMNS, Validation
+from maexp.agents.training.validation import COLUMNS, ENDS, Validation
 from maexp.agents.versions import find_commit
 from maexp.envs import PointCloudMap
 
@@ -269,8 +270,9 @@ class TrainingRun:
         if not self.gains or not self.validation.rival:
             return f"coverage {self.average:.3f}"
         (first, *_), last = self.gains, self.gains[-1]
-        now, low, high = (last[f"validation_gain{end}"] for end in ("", "_low", "_high"))
-        so_far = f"{now:+.1f} points [{low:+.1f}, {high:+.1f}], at the start {first['validation_gain']:+.1f}"
+        now, *ends = (last[f"validation_gain{end}"] for end in ENDS)
+        interval = brackets({"ci95": ends}, "{:+.1f}".format)
+        so_far = f"{now:+.1f} points{interval}, at the start {first['validation_gain']:+.1f}"
         return f"gain over {self.validation.rival} {so_far}"
 
     def timed(self, row: dict[str, float], begin: float) -> dict[str, float]:
