@@ -19,7 +19,13 @@ from maexp.agents.networks.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
-from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, planner_config
+from maexp.agents.settings.resolved import (
+    algorithm_settings,
+    find_followers,
+    model_settings,
+    planner_config,
+    robot_config,
+)
 from maexp.agents.settings.schema import (
     SUPPLIED,
     CommonSettings,
@@ -218,13 +224,13 @@ def team_configs(
     An entry of `robot.team` holds settings of a robot, and under `radar` those of its radar. A team larger than
     the list repeats it.
     """
-    robot, radar = given(cfg.robot, "team"), given(cfg.radar)
+    radar = given(cfg.radar)
     if not cfg.robot.team:
-        return RobotConfig(**robot), RadarConfig(**radar)
+        return robot_config(cfg), RadarConfig(**radar)
     entries = OmegaConf.to_container(cfg.robot.team)
     _check_team(entries)
     entries = [entries[i % len(entries)] for i in range(num_robots)]
-    robots = [RobotConfig(**(robot | {k: v for k, v in one.items() if k != "radar"})) for one in entries]
+    robots = [robot_config(cfg, one) for one in entries]
     return robots, [RadarConfig(**(radar | one.get("radar", {}))) for one in entries]
 
 

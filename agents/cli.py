@@ -144,7 +144,8 @@ def run_verb(name: str, words: list[str]) -> int:
     from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
-    from maexp.agents.settings.resolved import without_hydra
+    from maexp.agents.settings.resolved import describe_radius, without_hydra
+    from maexp.agents.settings.words import check_sweep, check_words
 
     verb = VERBS[name]
     flags, rest = split_flags(words)
@@ -157,6 +158,7 @@ def run_verb(name: str, words: list[str]) -> int:
     multirun = bool({"-m", "--multirun"} & set(flags))
     _check_action(name, verb, rest)
     overrides = make_overrides(name, rest, verb.positional, multirun)
+    (check_sweep if multirun else check_words)(name, overrides)
     home = importlib.import_module(f"maexp.agents.commands.{name}")
     if multirun:
         from maexp.agents.commands.sweep import run_sweep
@@ -169,6 +171,8 @@ def run_verb(name: str, words: list[str]) -> int:
         print_settings(cfg, name)
         return 0
     home.check(cfg)
+    if told := describe_radius(cfg):
+        print(told, flush=True)
     chosen = find_override(overrides, "hydra.run.dir") is not None
     folder = home.folder(overrides, partial(claim_folder, composed.hydra.run.dir, chosen))
     try:

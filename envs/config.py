@@ -16,7 +16,8 @@ class RobotConfig:
     """One robot. Lengths in metres, speeds in m/s, angles in radians; None takes the scenario's value.
 
     ``max_yaw_rate`` [rad/s] is the turn limit of a differential drive, ``max_steer`` that of a car.
-    ``wheelbase`` of a car is metres, or "width" (None, the default) or "length" of the body.
+    ``wheelbase`` of a car is metres, or "width" (None, the default) or "length" of the body. ``radius`` makes the body
+    round: length, width and collision threshold follow from it (`Scenario.with_radius`).
     """
 
     kind: Literal["ackermann", "differential", "omnidirectional"] = "ackermann"
@@ -28,6 +29,7 @@ class RobotConfig:
     max_steer: float | None = None
     max_yaw_rate: float = math.pi / 2
     collision_threshold: float | None = None
+    radius: float | None = None
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,13 @@ MOST_HORIZON = 100
 MOST_TARGETS = 256  # that a robot is shown
 CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
+BODY = {"length": "body_length", "width": "body_width", "collision_threshold": "collision_threshold"}
+"""What a radius decides: settings of a robot, and what a scenario calls them."""
+
+
+def supplied(kind: type) -> list[str]:
+    """Settings of a robot, radar or planner whose default is the scenario's value."""
+    return [one.name for one in fields(kind) if one.default is None and one.name != "radius"]
 
 
 def _complete(config, **defaults):
@@ -156,7 +165,9 @@ def _complete(config, **defaults):
 
 
 def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
-    """Fill in what the scenario fixes and check every value."""
+    """Fill in what the radius or the scenario fixes and check every value."""
+    if config.radius is not None:
+        scenario = scenario.with_radius(_check_radius(config))
     config = _complete(
         config,
         length=scenario.body_length,
@@ -171,10 +182,25 @@ def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
     elif not isinstance(config.wheelbase, int | float):
         raise ValueError(f"robot.wheelbase={config.wheelbase!r} must be metres, width or length")
     _check_choice("robot.kind", config.kind, ROBOT_KINDS)
-    _check_positive("robot", config, skip=("kind",))
+    _check_positive("robot", config, skip=("kind", "radius"))
     if config.max_steer >= math.pi / 2:
         raise ValueError(f"robot.max_steer={config.max_steer} must stay below pi/2 = 1.5708 rad")
     return config
+
+
+def _check_radius(config: RobotConfig) -> float:
+    """The radius, if it is one and agrees with what else is said of the body."""
+    radius = config.radius
+    if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0.0 < radius < math.inf:
+        raise ValueError(f"robot.radius={radius!r} must be a positive finite number of metres")
+    for name in BODY:
+        value, round_one = getattr(config, name), radius if name == "collision_threshold" else 2 * radius
+        if value is not None and value != round_one:
+            raise ValueError(
+                f"robot.radius={radius:g} makes robot.{name} {round_one:g} m, and {value} is given: leave one of the "
+                "two out"
+            )
+    return radius
 
 
 def complete_radar(config: RadarConfig, scenario: Scenario) -> RadarConfig:

@@ -26,7 +26,7 @@ from maexp.envs.settings import EnvSettings, complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
-from maexp.envs.starts import check_gathering, check_room, check_starts, fixed_starts
+from maexp.envs.starts import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
 from maexp.envs.target_view import TargetView, draw_targets
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
@@ -301,8 +301,7 @@ class ExplorationEnv(EnvBase):
             raise RuntimeError(f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/bank.py")
         if code & ERROR_START:
             raise MapError(
-                f"no free start was left for num_robots={self.num_robots} robots (env {env}): use fewer robots, "
-                "a smaller robot.collision_threshold or a larger map"
+                f"no free start was left for num_robots={self.num_robots} robots (env {env}): {NO_ROOM}"
             )
         raise ValueError(f"the action of env {env} is NaN or infinite: the policy has diverged or was fed wrongly")
 

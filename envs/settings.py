@@ -154,12 +154,13 @@ def check_bodies(maps: Sequence[PointCloudMap], robots: Sequence[RobotConfig]) -
     """Raise ValueError if a robot is longer than one of the maps."""
     for m in maps:
         sides = [high - low for low, high in zip(*m.extent, strict=True)]
-        for name in ("length", "width"):
-            size = max(getattr(robot, name) for robot in robots)
-            if size > max(sides):
+        for robot in robots:
+            named = ("length", "width") if robot.radius is None else ("radius",)
+            name = max(named, key=lambda name, robot=robot: getattr(robot, name))
+            if max(robot.length, robot.width) > max(sides):
                 raise ValueError(
-                    f"robot.{name}={size:g} m does not fit on map {m.name} of {sides[0]:.4g} x {sides[1]:.4g} m: "
-                    f"give metres, as robot.{name}=0.5"
+                    f"robot.{name}={getattr(robot, name):g} m does not fit on map {m.name} of {sides[0]:.4g} x "
+                    f"{sides[1]:.4g} m: give metres, as robot.{name}=0.5"
                 )
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.kernels.types import BESIDE, START_CLEARANCE
 
-NO_ROOM = "use fewer robots, a smaller robot.collision_threshold or a larger map"
+NO_ROOM = "use fewer robots, a smaller robot.radius or robot.collision_threshold, or a larger map"
 
 
 def check_room(m: PointCloudMap, thresholds: list[float]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,37 @@ def test_help_waits_for_no_heavy_library(verb):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]" and verb in done.stdout
+
+
+@pytest.mark.parametrize("words", [
+    ["train", "scenario=labyrinth"], ["train", "-m", "algorithm=ippo,mapo"], ["train", "num_robots=0"],
+    ["train", "robot.radius=0.3", "robot.length=1"], ["evaluate", "policy=clever"], ["benchmark", "scenario=labyrinth"],
+    ["evaluate", "checkpoint=gone", "polcy=random"], ["maps", "import", "x.png", "impoting.up=y"],
+])  # fmt: skip
+def test_a_wrong_word_waits_for_no_heavy_library(words):
+    program = (
+        f"import sys; from maexp.agents.cli import main; print(main({words!r})); "
+        "print([name for name in ('torch', 'torchrl', 'warp', 'open3d', 'skimage') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["2", "[]"] and done.stderr.startswith("maexp: ")
+
+
+def test_help_shows_what_is_taken_without_a_word(capsys):
+    assert main(["train", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "  num_envs=64 " in text and "\n  time (default) " in text and "\n  targets (default) " in text
+    assert "\n  default (default) " in text.partition("tuning=")[2] and "\naction=CHOICE\n" in text
+    assert main(["evaluate", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "  num_envs=32 " in text and "\n  regions (default) " in text
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_names_each_setting_once(verb, capsys):
+    main([verb, "--help"])
+    names = re.findall(r"^(?:  )?(\w+)=", capsys.readouterr().out, re.MULTILINE)
+    assert len(names) == len(set(names))
 
 
 def test_help_names_the_classical_policies_there_are(capsys):

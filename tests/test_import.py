@@ -98,6 +98,24 @@ def test_a_small_room_gets_fine_cells(tmp_path):
     assert closed.free_area < 15
 
 
+def test_a_radius_decides_what_a_robot_fits_through(tmp_path):
+    image = np.full((150, 150), UNKNOWN, dtype=np.uint8)
+    image[10:140, 10:140] = FREE
+    image[10:140, 74:76] = WALL
+    image[70:80, 74:76] = FREE  # a door of 1 m
+    path = write_ros(tmp_path, image)
+    wide, report = import_map_with_report(path, robot_radius=0.35)
+    assert wide.free_area > 150 and wide.resolution <= 0.35
+    assert "round, 0.7 m across, collides 0.35 m and starts 1.05 m from walls (robot.radius=0.35)" in report.table()
+    assert "closed gaps narrower than 0.7 m" in report.table()
+    assert import_map(path, robot_radius=0.65).free_area < 85
+    assert "round" not in import_map_with_report(path)[1].table()
+    with pytest.raises(MapError, match=r"robot\.radius=3 can use .* room for 0 of num_robots=3 .* smaller robot"):
+        import_map(path, robot_radius=3.0)
+    with pytest.raises(MapError, match=r"robot\.radius=-1 must be a number of metres greater than 0"):
+        import_map(path, robot_radius=-1)
+
+
 def test_coarse_pixels_are_cut_to_what_keeps_a_robot_from_colliding(tmp_path):
     """A robot of `pointcloud` collides 0.3 m from a point, one of `indoor_small` at 0.06 m."""
     for scenario, pixel, threshold in (("pointcloud", 0.5, 0.3), ("indoor_small", 0.1, 0.06)):
@@ -131,7 +149,7 @@ def test_cells_coarser_than_the_collision_threshold_are_warned_of(tmp_path):
         assert world.resolution == pytest.approx(0.4)
         (warning,) = report.warnings
         assert f"{setting}={given}" in warning and "coarser than 0.3 m" in warning and "scenario=pointcloud" in warning
-    advice = int(re.search(r"set max_points=(\d+)", warning)[1])
+    advice = int(re.search(r"set importing.max_points=(\d+)", warning)[1])
     world, report = import_map_with_report(path, max_points=advice)
     assert world.resolution <= 0.3 and len(world.free) <= advice and not report.warnings
 
@@ -146,7 +164,7 @@ def test_a_large_box_is_imported_in_coarser_cells(tmp_path, monkeypatch):
     world, report = import_map_with_report(path)
     assert fine.resolution == 0.3 < world.resolution < 0.5 and check_map(world).ok
     (warning,) = report.warnings
-    assert "coarser than 0.3 m" in warning and warning.endswith("; crop") and "max_points" not in warning
+    assert "coarser than 0.3 m" in warning and warning.endswith("; set importing.crop") and "max_points" not in warning
 
 
 def test_set_by_hand(tmp_path):

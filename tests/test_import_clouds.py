@@ -381,5 +381,5 @@ def test_real_scans(data_dir, name, scenario):
 
 @pytest.mark.parametrize("name", ["upenn_room.pcd", "asl_flying_arena.ply"])
 def test_too_small_for_the_robot(data_dir, name):
-    with pytest.raises(MapError, match="scenario=indoor_small"):
+    with pytest.raises(MapError, match=r"say how large your robots are, as robot\.radius=0\.075"):
         import_map(data_dir / "indoor" / name)

@@ -54,6 +54,15 @@ def test_a_large_cloud_is_shown_by_a_sample_without_loss_of_digits():
     assert len(np.unique(shown[:, 1])) > 0.99 * len(shown), "float32 holds no millimetres of 5,400 km"
 
 
+def test_a_map_for_round_robots(tmp_path, capsys):
+    assert main(["maps", "import", str(write_ros(tmp_path)), "robot.radius=0.2", "out=floor.npz"]) == 0
+    out = capsys.readouterr().out
+    assert "round, 0.4 m across" in out and "starts 0.6 m from walls" in out
+    assert "Next: maexp train scenario=pointcloud scenario.path=floor.npz robot.radius=0.2\n" in out
+    assert main(["maps", "check", "floor.npz", "robot.radius=4"]) == 1, "no room for three of them"
+    assert "12 m from walls and each other" in capsys.readouterr().out
+
+
 def test_the_report_is_written_whole(tmp_path):
     assert main(["maps", "import", str(write_ros(tmp_path)), "hydra.run.dir=run"]) == 0
     text = (tmp_path / "run" / "report.txt").read_text()

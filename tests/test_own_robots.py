@@ -6,9 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from worlds import room
 
+from maexp.agents.build import team_configs
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.resolved import describe_radius, resolve
 from maexp.envs import ExplorationEnv, RadarConfig, RobotConfig
+from maexp.envs.config import complete_robot
 from maexp.envs.render import draw_teams
 from maexp.envs.scenarios import SCENARIOS, default_macro_steps
 from maexp.envs.viewing.quads import make_quads
@@ -43,6 +48,53 @@ def test_an_episode_lasts_as_long_as_its_robots_need():
 def test_a_robot_larger_than_the_map_is_refused(size, told):
     with pytest.raises(ValueError, match=told):
         ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig(**size))
+
+
+ROUND = {"length": 0.7, "width": 0.7, "collision_threshold": 0.35}
+
+
+def test_a_radius_stands_for_the_sizes_of_the_body():
+    round_one, by_hand = (ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig("differential", **body))
+                          for body in ({"radius": 0.35}, ROUND))  # fmt: skip
+    tensors = round_one.simulation.robot_tensors, by_hand.simulation.robot_tensors
+    assert all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[1])
+    again = complete_robot(round_one.robot_configs[0], ROW)
+    assert again == round_one.robot_configs[0] and again.wheelbase == 0.7
+    assert complete_robot(RobotConfig(radius=0.35, **ROUND), ROW).length == 0.7, "the same said twice"
+
+
+@pytest.mark.parametrize(("body", "told"), [
+    ({"radius": 0.3, "length": 1.0}, r"robot\.radius=0\.3 makes robot\.length 0\.6 m, and 1\.0 is given: leave one"),
+    ({"radius": 0.3, "collision_threshold": 0.4}, r"makes robot\.collision_threshold 0\.3 m, and 0\.4 is given"),
+    ({"radius": 0.0}, r"robot\.radius=0\.0 must be a positive finite number of metres"),
+    ({"radius": math.inf}, r"robot\.radius=inf must be"),
+    ({"radius": True}, r"robot\.radius=True must be"),
+    ({"radius": 50.0}, r"robot\.radius=50 m does not fit on map .* of 18\.25 x 16\.25 m: .* robot\.radius=0\.5"),
+    ({"radius": 4.0}, r"room for 0 of num_robots=2 robots with 12 m of clearance: .* a smaller robot\.radius"),
+])  # fmt: skip
+def test_a_radius_that_cannot_be(body, told):
+    with pytest.raises(ValueError, match=told):
+        ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig(**body))
+
+
+def test_a_radius_in_settings():
+    """It replaces what the scenario says of bodies, not what is set by hand; teams may mix sizes."""
+    words = ["scenario=maze", "robot.radius=0.35", "robot=differential"]
+    cfg = compose_config("train", words)
+    robot, _ = team_configs(cfg, 3)
+    assert complete_robot(robot, SCENARIOS["maze"]) == complete_robot(
+        RobotConfig("differential", radius=0.35), SCENARIOS["maze"])  # fmt: skip
+    shown = resolve(cfg)["robot"]
+    assert shown.items() >= (ROUND | {"radius": 0.35, "wheelbase": 0.7, "max_speed": 8.0}).items()
+    assert describe_radius(cfg).startswith("robot.radius=0.35: round, 0.7 m across; collides")
+    with pytest.raises(ValueError, match=r"robot\.radius=0\.35 makes robot\.width 0\.7 m, and 0\.5 is given"):
+        resolve(compose_config("train", [*words, "robot.width=0.5"]))
+    mixed = compose_config("train", ["scenario=maze", "robot.team=[{radius: 0.35}, {}]"])
+    small, car = (complete_robot(one, SCENARIOS["maze"]) for one in team_configs(mixed, 2)[0])
+    assert (small.width, small.collision_threshold) == (0.7, 0.35) and (car.width, car.radius) == (1.0, None)
+    assert "radius" not in resolve(mixed)["robot"]["team"][1] and describe_radius(mixed) is None
+    own = compose_config("train", ["scenario=pointcloud", "scenario.path=x.yaml", "robot.radius=0.35"])
+    assert own.scenario.importing.robot_radius == 0.35, "the import makes room for it"
 
 
 def test_a_radar_without_end_is_drawn_at_once():

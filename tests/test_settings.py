@@ -67,7 +67,8 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     maps = [make_map("maze_small", 0)]
     env, shown = make_env(cfg, maps, 2), resolve(cfg, maps)
     assert [one | {"radar": asdict(radar)} for one, radar in zip(
-        map(asdict, env.robot_configs), env.radar_configs, strict=True)] == shown["robot"]["team"]  # fmt: skip
+        map(asdict, env.robot_configs), env.radar_configs, strict=True)] == [
+            {"radius": None} | one for one in shown["robot"]["team"]]  # fmt: skip
     assert shown["planner"].items() <= asdict(env.planner_config).items()
     assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
@@ -156,6 +157,19 @@ def test_the_wheelbase_follows_the_body():
     saved = save(robot__wheelbase=0.7)
     assert play(saved)["robot.wheelbase"] == 0.7
     assert play(saved, "robot.length=2", "robot.width=2")["robot.wheelbase"] == 2.0
+
+
+def test_a_run_takes_another_radius():
+    saved = save("scenario=maze")
+    assert play(saved, "robot.radius=0.35").items() >= {
+        "robot.length": 0.7, "robot.wheelbase": 0.7, "robot.collision_threshold": 0.35}.items()  # fmt: skip
+    saved = save("scenario=maze", "robot.radius=0.35")
+    assert play(saved)["robot.width"] == 0.7 and play(saved, "robot.radius=0.5")["robot.width"] == 1.0
+    assert play(saved, "scenario=indoor_small")["robot.width"] == 0.7
+    back = play(saved, "robot.radius=null")
+    assert "robot.radius" not in back and (back["robot.length"], back["robot.wheelbase"]) == (1.5, 1.0)
+    with pytest.raises(ValueError, match=r"robot\.radius=0\.35 makes robot\.length 0\.7 m"):
+        play(saved, "robot.length=2")
 
 
 def test_what_follows_the_scenario_still_does_after_a_resumption():

@@ -22,8 +22,9 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
+from maexp.agents.settings.words import as_list, check_names
 from maexp.agents.training.named import Player, check_planner, find_player, name_players
-from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
+from maexp.envs.scenarios import cut_last_fifth, find_scenario, split
 
 PLAN, FORMAT = "benchmark.json", "maexp-benchmark-1"
 OPEN = "left_open"
@@ -102,13 +103,6 @@ def own_maps(cfg: BenchmarkSettings, scenario: str) -> list[int | None]:
     return list(range(cfg.policy_per_map[scenario]))
 
 
-def as_list(value: Any) -> list:
-    """A setting of one value or several as a list."""
-    if value is None:
-        return []
-    return list(value) if OmegaConf.is_list(value) or isinstance(value, list | tuple) else [value]
-
-
 def policy_names(cfg: BenchmarkSettings) -> list[str]:
     """Algorithms and policies by their names in the tables, each once."""
     words = list(dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies)))
@@ -140,12 +134,10 @@ def policy_sources(cfg: BenchmarkSettings) -> dict[str, str]:
 
 def check_lists(cfg: DictConfig) -> None:
     """Raise UserError unless scenarios, policies, seeds and maps are lists of what there is."""
-    known = {"scenarios": [*SCENARIOS], "algorithms": [*ALGORITHMS, *POLICIES], "maps": [*SUITES]}
-    for name, choices in known.items():
-        for value in as_list(cfg[name]):
-            if value not in choices:
-                listed = [one for one in choices if one not in POLICIES]
-                raise UserError(f"{name}={value} is unknown: choose of {', '.join(listed)}.")
+    check_names(cfg)
+    for value in as_list(cfg.maps):
+        if value not in SUITES:
+            raise UserError(f"maps={value} is unknown: choose of {', '.join(SUITES)}.")
     for name in ("scenarios", "maps", "seeds"):
         if not as_list(cfg[name]):
             raise UserError(f"{name}=[] leaves nothing to do: give at least one.")

@@ -37,13 +37,10 @@ NOTE = "What is absent here each cell has from its scenario and its algorithm: s
 FAILED, STOPPED = 1, 130
 SHOWN = 2  # running cells in the line of progress
 LONG = 24.0  # hours that need confirm=true
-ALSO = {"scenario": "scenarios", "algorithm": "algorithms", "policy": "policies", "seed": "seeds"}
-"""Names that the other verbs have for one value."""
 
 
 def prepare(overrides: list[str]) -> Recipe:
     """For resume=FOLDER: that benchmark's overrides, then the new ones."""
-    overrides = [_rename(word) for word in overrides]
     place = find_override(overrides, "resume")
     if place is None:
         return Recipe(overrides)
@@ -52,14 +49,8 @@ def prepare(overrides: list[str]) -> Recipe:
     return Recipe(read_plan(place)["overrides"] + overrides)
 
 
-def _rename(word: str) -> str:
-    name, sign, value = word.partition("=")
-    return f"{ALSO.get(name, name)}{sign}{value}"
-
-
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     """The folder that is resumed, or a new one."""
-    overrides = [_rename(word) for word in overrides]
     place = find_override(overrides, "resume")
     if place is not None:
         check_writable(Path(place).absolute())

@@ -2,33 +2,46 @@
 
 from typing import TYPE_CHECKING, Any
 
-from maexp.agents.settings.compose import group_choices, groups
+from omegaconf import OmegaConf
+
+from maexp.agents.settings.compose import compose_config, group_choices, groups
 
 if TYPE_CHECKING:
     from maexp.agents.cli import Verb
 
 
 def verb_help(name: str, verb: "Verb") -> str:
-    """The help of a verb; the choices are the files of `conf/` with the comment on their first line."""
+    """The help of a verb: its settings and choices with what is taken without a word; the choices are the files of
+    `conf/` with the comment on their first line."""
     from maexp.agents.settings.schema import describe, schema
 
-    kind = schema(name)
+    kind, defaults = schema(name), compose_config(name, [], whole=False)
     lines = [f"maexp {name}: {verb.summary}", ""]
     lines += [f"  {example}" for example in verb.examples]
     lines += ["", "Settings (name=value)"]
-    lines += [f"  {_assign(setting, default):<26}{text}" for setting, default, text in describe(kind)]
+    for setting, _, text in describe(kind):
+        lines += _row(_assign(setting, OmegaConf.select(defaults, setting)), text)
     for group in groups():
         if group in kind.__dataclass_fields__:
-            one_value = "" if group == "preset" else f", and {group}.NAME=VALUE for one value of it"
+            one_value = f", and {group}.NAME=VALUE for one value of it" * OmegaConf.is_dict(defaults[group])
             lines += ["", f"{group}=CHOICE{one_value}"]
-            lines += [f"  {choice:<26}{text}" for choice, text in group_choices(group).items()]
+            chosen = defaults.hydra.runtime.choices.get(group)
+            for choice, text in group_choices(group).items():
+                lines += _row(choice + " (default)" * (choice == chosen), text)
     lines += ["", f"maexp {name} --cfg job ... prints all settings; hydra.run.dir=FOLDER moves the output."]
     if name == "train":
         lines += ["maexp train -m name=a,b runs a sweep: every combination, one after another."]
     return "\n".join(lines)
 
 
+def _row(name: str, text: str) -> list[str]:
+    """Two columns; below each other where the first is too wide."""
+    return [f"  {name:<25} {text}"] if len(name) <= 25 else [f"  {name}", f"{'':<28}{text}"]
+
+
 def _assign(name: str, default: Any) -> str:
     if isinstance(default, bool):
         default = str(default).lower()
+    if OmegaConf.is_list(default):
+        default = ",".join(map(str, default))
     return f"{name}={'' if default is None else default}"

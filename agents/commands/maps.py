@@ -16,6 +16,7 @@ from maexp.agents.settings.schema import MapsSettings, given
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.importing.bags import is_bag
+from maexp.envs.importing.options import make_options
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map
 from maexp.envs.scenarios import SCENARIOS, make_map
@@ -55,6 +56,8 @@ def check(cfg: MapsSettings) -> None:
         raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
     if _is_folder(cfg):
         check_folder(cfg)
+    with blame_input():
+        make_options(None, import_options(cfg))
 
 
 def _is_folder(cfg: MapsSettings) -> bool:
@@ -81,18 +84,19 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
     with blame_input():
         world, imported = read_map(cfg)
         story = "" if imported is None else imported.table()
-        report = check_map(world, num_robots=cfg.num_robots)
+        report = check_map(world, num_robots=cfg.num_robots, threshold=cfg.robot.radius)
         if cfg.repair and cfg.task == "check":
-            world, steps = repair_map(world)
+            world, steps = repair_map(world, threshold=cfg.robot.radius)
             story = "\n".join(f"repair: {step}" for step in steps or ["nothing to mend"])
-            report = check_map(world, num_robots=cfg.num_robots)
+            report = check_map(world, num_robots=cfg.num_robots, threshold=cfg.robot.radius)
         told = "\n".join(part for part in (story, report.table()) if part)
         print(told)
         written = write_files(cfg, where, world, imported)
     write_text(where / "report.txt", told + "\n")
     print(f"Written: {', '.join(str(one) for one in written)}")
     if report.ok and cfg.task in ("make", "import"):
-        print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}")
+        size = "" if cfg.robot.radius is None else f" robot.radius={cfg.robot.radius:g}"
+        print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}{size}")
     return 0 if report.ok else UNUSABLE
 
 

@@ -115,7 +115,7 @@ def _import(file: Path, folder: Path, where: Path, options: dict[str, Any]) -> R
         reason = str(error).replace(str(file), file.name)
         return Row(name, "refused", seconds=_since(begin), reason=reason)
     seconds = _since(begin)
-    verdict = check_map(world, num_robots=options["num_robots"])
+    verdict = check_map(world, num_robots=options["num_robots"], threshold=options.get("robot_radius"))
     target = where / name
     target.parent.mkdir(parents=True, exist_ok=True)
     world.save(target.with_name(f"{file.name}.npz"))

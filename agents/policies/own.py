@@ -24,16 +24,12 @@ from tensordict import TensorDictBase
 from maexp.agents.errors import UserError
 from maexp.agents.policies.foreign import as_policy, describe_error
 from maexp.agents.policies.guest import GROUP
+from maexp.agents.policies.names import plug_ins
 from maexp.envs import ExplorationEnv
 from maexp.kernels.types import REGIONS
 
 REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 WANTED = "give a function that takes the env and returns a policy on tensordicts, or a class with act"
-
-
-def plug_ins() -> dict[str, metadata.EntryPoint]:
-    """The policies that installed packages offer, by their names."""
-    return {one.name: one for one in metadata.entry_points(group=GROUP)}
 
 
 def is_reference(word: str) -> bool:

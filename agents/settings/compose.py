@@ -54,8 +54,11 @@ def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
     return cfg
 
 
-def compose_config(verb: str, overrides: list[str]) -> DictConfig:
+def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictConfig:
     """The composed settings of a verb, with Hydra's own under `hydra`.
+
+    Args:
+        whole: a setting that is left open is an error.
 
     Raises:
         UserError: an override that does not fit, or a seed that is none.
@@ -70,7 +73,7 @@ def compose_config(verb: str, overrides: list[str]) -> DictConfig:
             missing = sorted(OmegaConf.missing_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])))
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error, verb)) from error
-    if missing:
+    if missing and whole:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
     if cfg.get("seed") is not None:
         check_seed(cfg.seed)

@@ -17,17 +17,17 @@ PATHS = (
 )  # fmt: skip
 WORDS = (("suite", "policy"),)
 """Commands of other programs, taken as they stand."""
-POLICIES = {"evaluate": "policy", "benchmark": "policies policy", "train": "classical"}
+POLICIES = {"evaluate": ("policy",), "benchmark": ("policies",), "train": ("classical",)}
 """Settings that name several policies, by the verb: names, folders, module:function."""
+ALSO = {"scenario": "scenarios", "algorithm": "algorithms", "policy": "policies", "seed": "seeds"}
+"""Names that the other verbs have for one value of a list of `maexp benchmark`."""
 LISTS = {
     "train": ("num_robots", "classical"),
     "export": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
     "bench": ("num_robots", "axes"),
-    "benchmark": (
-        "scenarios", "algorithms", "policies", "seeds", "maps", "scenario", "algorithm", "policy", "seed",
-    ),
-}  # fmt: skip
+    "benchmark": ("scenarios", "algorithms", "policies", "seeds", "maps"),
+}
 
 
 def split_flags(words: list[str]) -> tuple[list[str], list[str]]:
@@ -66,6 +66,8 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
             if not names:
                 raise UserError(f"{word!r} is no setting of maexp {verb}: write name=value (see maexp {verb} --help).")
             name, value = names.pop(0), word
+        if verb == "benchmark":
+            name = ALSO.get(name, name)
         result.append(_make_override(verb, name, value, multirun))
     return result
 
@@ -79,7 +81,7 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
             value = ",".join(str(Path(one).expanduser().absolute()) for one in split_paths(value))
         return f"{name}={quote(value)}"
-    if not multirun and name in POLICIES.get(verb, "").split() and not OPERATOR.match(value):
+    if not multirun and name in POLICIES.get(verb, ()) and not OPERATOR.match(value):
         return f"{name}={quote_policies(value, verb == 'benchmark')}"
     if not multirun and name in LISTS.get(verb, ()) and "," in value and not value.startswith("["):
         return f"{name}=[{value}]"
@@ -108,7 +110,7 @@ def quote_policies(value: str, absolute: bool) -> str:
     words = [word.strip() for word in words]
     if absolute:  # a name of ours is one even where a folder is called the same
         words = [str(Path(word).absolute()) if os.sep in word and os.path.exists(word) else word for word in words]
-    quoted = [quote(word) if not re.fullmatch(r"[\w.]+", word) else word for word in words]
+    quoted = [quote(word) if not re.fullmatch(r"[A-Za-z_][\w.]*", word) else word for word in words]
     return f"[{','.join(quoted)}]" if listed else quoted[0]
 
 

@@ -13,6 +13,7 @@ from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, describe, given, schema
 from maexp.envs.config import (
+    BODY,
     CommConfig,
     LookaheadConfig,
     ObservationConfig,
@@ -21,9 +22,14 @@ from maexp.envs.config import (
     RewardConfig,
     RobotConfig,
     TargetsConfig,
+    check_comm,
+    check_lookahead,
+    check_reward,
+    check_targets,
     complete_planner,
     complete_radar,
     complete_robot,
+    supplied,
 )
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
@@ -69,11 +75,11 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
             )
         if known:
             settings["planner"] = _resolve_planner(cfg, row)
-        settings["reward"] = asdict(RewardConfig(**given(cfg.reward)))
+        settings["reward"] = asdict(check_reward(RewardConfig(**given(cfg.reward))))
         settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
-        settings["comm"] = asdict(CommConfig(**given(cfg.comm)))
-        settings["targets"] = asdict(TargetsConfig(**given(cfg.targets)))
-        settings["lookahead"] = asdict(LookaheadConfig(**given(cfg.lookahead)))
+        settings["comm"] = asdict(check_comm(CommConfig(**given(cfg.comm))))
+        settings["targets"] = asdict(check_targets(TargetsConfig(**given(cfg.targets))))
+        settings["lookahead"] = asdict(check_lookahead(LookaheadConfig(**given(cfg.lookahead))))
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -88,7 +94,7 @@ def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | No
     settings = {"local_steps": scenario.local_steps or row.local_steps}
     settings["macro_steps"] = scenario.macro_steps or row.macro_steps
     if find_scenario(scenario.name).build is None:
-        return settings | {"importing": asdict(ImportOptions(**given(scenario.importing)))}
+        return settings | {"importing": asdict(ImportOptions(**given(scenario.importing, "robot_radius")))}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
     settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
     return settings | {"importing": None}
@@ -109,13 +115,36 @@ def plain_value(value: Any) -> Any:
 
 def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
-    robot, radar = given(cfg.robot, "team"), given(cfg.radar)
-    team = []
+    radar, team = given(cfg.radar), []
     for entry in plain_value(cfg.robot.team) or []:
-        own = {name: value for name, value in entry.items() if name != "radar"}
         seen = complete_radar(RadarConfig(**(radar | entry.get("radar", {}))), row)
-        team.append(asdict(complete_robot(RobotConfig(**(robot | own)), row)) | {"radar": asdict(seen)})
-    return asdict(complete_robot(RobotConfig(**robot), row)) | {"team": team or None}
+        team.append(_without_null(asdict(complete_robot(robot_config(cfg, entry), row))) | {"radar": asdict(seen)})
+    return asdict(complete_robot(robot_config(cfg), row)) | {"team": team or None}
+
+
+def robot_config(cfg: CommonSettings, entry: dict[str, Any] | None = None) -> RobotConfig:
+    """The robot's settings, with those of an entry of `robot.team`; what a scenario says of bodies yields to a radius.
+
+    Args:
+        entry: may hold the radar's settings, too, which are left out.
+    """
+    own = {name: value for name, value in (entry or {}).items() if name != "radar"}
+    robot = given(cfg.robot, "team")
+    if (robot | own).get("radius") is not None:
+        robot = {name: value for name, value in robot.items() if name not in BODY or not _follows(cfg, "robot", name)}
+    return RobotConfig(**(robot | own))
+
+
+def describe_radius(cfg: DictConfig) -> str | None:
+    """A line of what `robot.radius` came to; None where no robot of an env is round."""
+    if "scenario" not in cfg or cfg.robot.radius is None:
+        return None
+    robot = complete_robot(robot_config(cfg), find_scenario(cfg.scenario.name))
+    told = (
+        f"robot.radius={robot.radius:g}: round, {robot.length:g} m across; collides with walls {robot.radius:g} m from "
+        "its centre"
+    )
+    return told + f"; maps are imported without gaps narrower than {robot.length:g} m"
 
 
 def planner_config(cfg: CommonSettings, row: Scenario) -> PlannerConfig:
@@ -145,7 +174,7 @@ def find_followers(cfg: DictConfig) -> list[str]:
     """Names of the settings that follow the scenario, as radar.range: null, or a reference to what it says."""
     names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
     for group, kind in FOLLOWERS.items():
-        names += [f"{group}.{one.name}" for one in fields(kind) if one.default is None]
+        names += [f"{group}.{name}" for name in supplied(kind)]
     found = [name for name in names if _follows(cfg, *name.split("."))]
     return found + ["robot.team"] * bool(cfg.robot.team)
 

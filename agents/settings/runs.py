@@ -28,7 +28,8 @@ PLAYED = (
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
 CALLED = {"radar.range": "radar_range", "robot.length": "body_length", "robot.width": "body_width"}
 """What the scenario calls them, where that is another name."""
-BODY = ("robot.length", "robot.width")
+BODY = ("robot.length", "robot.width", "robot.radius")
+ROUND = ("robot.length", "robot.width", "robot.collision_threshold")  # follow a radius
 HELD_OUT = ("scenario.held_out", "scenario.held_out_count")  # one of the two
 
 
@@ -106,6 +107,7 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers
     gone = [one for one in followers if f"scenario.{CALLED.get(one, one.partition('.')[2])}" in names]
+    gone += [one for one in ROUND if one in followers and "robot.radius" in names]
     gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*BODY, "robot.team"} & {*names}))
     if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode
         gone += ["scenario.macro_steps"] * ("scenario.macro_steps" in followers)

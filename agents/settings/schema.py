@@ -92,6 +92,11 @@ AlgorithmSettings = optional_settings(
 ImportSettings = optional_settings(ImportOptions)
 
 
+def import_settings() -> Any:
+    """A field with the settings of the import, for the robot whose radius `robot.radius` says."""
+    return field(default_factory=lambda: ImportSettings(robot_radius="${robot.radius}"))
+
+
 @dataclass
 class ScenarioSettings:
     """Where the team explores, and what robot, radar and planner take from there. Null: what the map says."""
@@ -117,7 +122,7 @@ class ScenarioSettings:
     max_steer: float | None = None
     success_coverage: float = 0.95  # share of the free points that ends an episode, in (0, 1]
     collision: str = "centre"  # or footprint
-    importing: ImportSettings = field(default_factory=ImportSettings)
+    importing: ImportSettings = import_settings()
 
 
 SUPPLIED = (
@@ -186,7 +191,7 @@ class TrainSettings(LearnerSettings):
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
     total_frames: int = setting(60_000, "macro steps of teams to train for")
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none")
-    classical: Any = setting(None, "policies played beside the trained team; default: three planners, good and cheap")
+    classical: Any = setting(None, "policies played beside the trained team")
     warm_start: str | None = setting(None, "policy to imitate first: a name, a folder, a run or module:function")
     warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated")
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
@@ -264,6 +269,13 @@ class PoliciesSettings:
 
 
 @dataclass
+class RoundSettings:
+    """Of the robots a map is for."""
+
+    radius: float | None = None  # [m]; null: the robot of the map's scenario
+
+
+@dataclass
 class MapsSettings:
     """`maexp maps`."""
 
@@ -273,7 +285,8 @@ class MapsSettings:
     out: str | None = setting(None, "file to write, .npz or for nav2 .yaml; default: in the run's folder")
     num_robots: int = setting(3, "the team that must find room")
     repair: bool = setting(False, "check: mend what can be mended and write the mended map")
-    importing: ImportSettings = field(default_factory=ImportSettings)
+    robot: RoundSettings = field(default_factory=RoundSettings)
+    importing: ImportSettings = import_settings()
 
 
 @dataclass
@@ -338,10 +351,10 @@ class BenchmarkSettings(LearnerSettings):
     seed: int = 0  # each cell has its own, from `seeds`
     preset: str = MISSING
     action: str = MISSING  # which file of conf/action
-    scenarios: Any = setting(None, "where: scenarios=maze,indoor_small; default: what the preset says")
-    algorithms: Any = setting(None, "trained and then evaluated; default: all six")
-    policies: Any = setting(None, "only evaluated: planners, trained ones, module:function; default: all planners")
-    seeds: Any = setting(None, "of training, starts and maps; default: what the preset says")
+    scenarios: Any = setting(None, "where they are compared")
+    algorithms: Any = setting(None, "trained and then evaluated")
+    policies: Any = setting(None, "only evaluated: planners, trained ones, module:function")
+    seeds: Any = setting(None, "of training, starts and maps")
     episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)")
     num_robots: int = setting(3, "robots in a team")
     total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for")

@@ -8,7 +8,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.hosted import HostedPolicy, greet
 from maexp.agents.policies.load import is_exported
-from maexp.agents.policies.own import plug_ins
+from maexp.agents.policies.names import plug_ins
 from maexp.agents.policies.process import APART, EXEC, command_of
 from maexp.agents.training.named import Player as Named
 from maexp.agents.training.named import find_player

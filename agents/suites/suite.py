@@ -210,8 +210,9 @@ def _configs() -> dict[str, type]:
 
 def _check_group(path: Path, name: str, values: Any, kind: type) -> None:
     """Every value that a scenario would else fill in must be given: the table of scenarios may change."""
-    known = [one.name for one in fields(kind)]
-    _check_keys(path, f"{name}.", values, [one.name for one in fields(kind) if one.default is None], known)
+    from maexp.envs.config import supplied
+
+    _check_keys(path, f"{name}.", values, supplied(kind), [one.name for one in fields(kind)])
 
 
 def _check_keys(path: Path, prefix: str, content: Any, needed, allowed=()) -> None:

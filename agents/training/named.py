@@ -17,8 +17,8 @@ from typing import Any, Literal
 from maexp.agents.errors import UserError
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
 from maexp.agents.policies.load import is_exported, load_policy_folder, open_policy
-from maexp.agents.policies.own import find_own, is_foreign, is_reference, make_own, plug_ins, source_of
-from maexp.agents.runtime.shipped import CONTRACT, advise, shipped_names
+from maexp.agents.policies.names import describe_unknown, plug_ins
+from maexp.agents.policies.own import find_own, is_foreign, is_reference, make_own, source_of
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import CommonSettings
@@ -105,7 +105,7 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
     if is_reference(word) and not os.path.exists(word):
         return _own(word, setting, name)
     if not is_exported(word):
-        raise UserError(_unknown(word, setting))
+        raise UserError(describe_unknown(word, setting))
     _, contract = open_policy(word, setting)
     return Player(
         name,
@@ -114,20 +114,6 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
         targets=contract.candidates,
         source=str(contract.content["sha256"]),
     )
-
-
-def _unknown(word: str, setting: str) -> str:
-    """What is wrong with a word that names no policy."""
-    if os.path.isdir(word):
-        return (
-            f"{setting}={word} is a folder without a policy: it holds neither the {CONTRACT} of maexp export nor the "
-            "checkpoints of maexp train."
-        )
-    if os.path.exists(word):
-        return f"{setting}={word} is a file and no checkpoint: give a run's folder, or that of an exported policy."
-    advice = advise(word[:100], [*POLICIES, *plug_ins(), *shipped_names()])
-    more = "" if advice.endswith("?") else ", a run, or module:function of your own."
-    return f"{setting}={word[:100]} is unknown: {advice}{more}"
 
 
 def _from_checkpoint(word: str, name: str) -> Player:

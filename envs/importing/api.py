@@ -8,7 +8,6 @@ from pathlib import Path
 
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.map import MapError, PointCloudMap, check_file
-from maexp.envs.scenarios import find_scenario
 
 from .arrays import read_npy_triple, read_npz_map
 from .bags import BAGS, bag_name, is_bag, read_bag
@@ -66,7 +65,7 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
         source, scenario = make_source(path, found, options, report)
         return finish_map(source, scenario, name, options, report)
     if options.topic is not None:
-        raise MapError(f"topic={options.topic!r} is for bags of ROS ({', '.join(BAGS)}); {path} has no topics")
+        raise MapError(f"importing.topic={options.topic!r} is for bags of ROS ({', '.join(BAGS)}), {path} has none")
     if suffix in GRIDS:
         return _finish_grid(read_occupancy(path, options, report), name, options, report)
     if suffix in CLOUDS:
@@ -81,19 +80,18 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
 
 
 def _finish_grid(grid: Grid, name: str, options: ImportOptions, report: ImportReport) -> PointCloudMap:
-    scenario = find_scenario("pointcloud" if options.scenario == "auto" else options.scenario)
-    return finish_map(GridSource(crop_grid(grid, options, report)), scenario, name, options, report)
+    return finish_map(GridSource(crop_grid(grid, options, report)), options.find_scenario(), name, options, report)
 
 
 def _check(world: PointCloudMap, options: ImportOptions, report: ImportReport) -> PointCloudMap:
     """The checker's verdict; what it finds is repaired once, and an unusable map is an error."""
-    verdict = check_map(world, num_robots=options.num_robots)
+    verdict = check_map(world, num_robots=options.num_robots, threshold=options.robot_radius)
     if not verdict.ok or verdict.warnings:
-        threshold = None if options.min_passage is None else options.min_passage / 2
+        threshold = options.robot_radius if options.min_passage is None else options.min_passage / 2
         world, steps = repair_map(world, threshold=threshold)
         for step in steps:
             report.add("repair", step)
-        verdict = check_map(world, num_robots=options.num_robots)
+        verdict = check_map(world, num_robots=options.num_robots, threshold=options.robot_radius)
     if not verdict.ok:
         raise MapError(f"{report.path} gives no usable map: {'; '.join(verdict.errors)}")
     report.warnings += verdict.warnings

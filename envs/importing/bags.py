@@ -84,7 +84,7 @@ def _choose_topic(path: Path, bag, options: ImportOptions):
     if options.topic is not None:
         wanted = usable.get(options.topic) or usable.get(f"/{options.topic}")
         if wanted is None:
-            raise MapError(f"topic={options.topic!r} of {path} holds no map; {_list(usable) or _list(held)}")
+            raise MapError(f"importing.topic={options.topic!r} of {path} holds no map; {_list(usable) or _list(held)}")
         return wanted
     grids = [one for one in usable.values() if one.msgtype == GRID]
     for kind in (grids, list(usable.values())):

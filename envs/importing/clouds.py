@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maexp.envs.map import MapError
-from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.scenarios import Scenario
 
 from .cloud_extras import read_las, read_mesh, read_octree
 from .cloud_files import Cloud, read_pcd, read_ply, read_xyz
@@ -39,7 +39,7 @@ def make_source(path: Path, cloud: Cloud, options: ImportOptions, report: Import
     points, up = _set_upright(points, cloud, options, report)
     outdoor = _is_outdoor(points, cloud, options)
     fallback = "outdoor" if outdoor else "pointcloud"
-    scenario = find_scenario(fallback if options.scenario == "auto" else options.scenario)
+    scenario = options.find_scenario(fallback)
     before = len(points)
     voxel = options.voxel or (0.0 if outdoor else scenario.resolution / 5)
     if voxel:
@@ -59,7 +59,7 @@ def _read(path: Path, options: ImportOptions) -> Cloud:
     elif suffix == ".bt":
         cloud = read_octree(path)
     if cloud is None:  # a mesh; its units are known before its points are
-        scenario = find_scenario("pointcloud" if options.scenario == "auto" else options.scenario)
+        scenario = options.find_scenario()
         spacing = options.sample_spacing or scenario.resolution / 5
         cloud = read_mesh(path, spacing / (options.metres_per_unit or 1.0))
     return cloud
@@ -145,7 +145,7 @@ def _read_floor(points, cloud: Cloud, up: str, scenario, options: ImportOptions,
         low = max(low, 2.1 * voxel)  # the voxels of a floor fill up to two layers
     high = options.robot_height or max(0.3, 1.6 * scenario.body_length)
     if high <= low:
-        raise MapError(f"robot_height={high:g} m must be greater than step_height={low:g} m")
+        raise MapError(f"importing.robot_height={high:g} m must be greater than importing.step_height={low:g} m")
     ground = points[np.abs(points[:, 2]) <= low]
     walls = points[(points[:, 2] > low) & (points[:, 2] <= high)]
     if not len(walls) and not len(ground):
@@ -188,7 +188,7 @@ def _read_terrain(points: np.ndarray, scenario, options: ImportOptions, report: 
     low = 1.0 if options.step_height is None else options.step_height
     high = options.robot_height or math.inf
     if high <= low:
-        raise MapError(f"robot_height={high:g} m must be greater than step_height={low:g} m")
+        raise MapError(f"importing.robot_height={high:g} m must be greater than importing.step_height={low:g} m")
     _, cells = np.unique(np.floor(points[:, :2] / 4.0), axis=0, return_counts=True)
     finest = max(0.2 * scenario.resolution, math.ceil(14 / math.sqrt(float(np.median(cells)) / 16)) / 10)
     holes = 2 if options.fill_holes is None else options.fill_holes
@@ -218,8 +218,8 @@ def _inside(points: np.ndarray, options: ImportOptions, report: ImportReport) ->
     if inside.sum() < LEAST_POINTS:
         (x0, y0), (x1, y1) = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
         raise MapError(
-            f"crop={options.crop} holds {inside.sum()} points; the cloud spans x {x0:.1f} to {x1:.1f} m, y {y0:.1f} to "
-            f"{y1:.1f} m"
+            f"importing.crop={options.crop} holds {inside.sum()} points; the cloud spans x {x0:.1f} to {x1:.1f} m, "
+            f"y {y0:.1f} to {y1:.1f} m"
         )
     return inside
 

@@ -33,6 +33,9 @@ def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOpt
         reason = "as set"
     else:
         cleaned, reason = _choose_resolution(source, scenario, options, report)
+    if (radius := options.robot_radius) is not None:
+        told = f"round, {2 * radius:g} m across, collides {radius:g} m and starts {START_CLEARANCE * radius:g} m"
+        report.add("robot", f"{told} from walls (robot.radius={radius:g})")
     _tell_of_density(cleaned.start.cell, source, scenario, report)
     _warn_of_coarse_cells(cleaned, scenario, options, report)
     report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
@@ -66,17 +69,24 @@ def _warn_of_coarse_cells(cleaned: _Cleaned, scenario: Scenario, options: Import
     if cell <= threshold * (1 + 1e-6):
         return
     if options.resolution is not None:
-        what, remedy = f"resolution={cell:g} m is", f"set {threshold:g} or less, or leave it out"
+        what, remedy = f"importing.resolution={cell:g} m is", f"set {threshold:g} or less, or leave it out"
     elif cleaned.start.labels.size * (cell / threshold) ** 2 > CLEANED_CELLS:
-        what, remedy = f"in a box of this size, of at most {CLEANED_CELLS:,} cells, those of {cell:g} m are", "crop"
+        what = f"in a box of this size, of at most {CLEANED_CELLS:,} cells, those of {cell:g} m are"
+        remedy = "set importing.crop"
     else:
         needed = math.ceil(1.1 * cleaned.area / threshold**2 / 1000) * 1000
-        what = f"with max_points={options.max_points} the cells of {cell:g} m are"
-        remedy = f"set max_points={needed}, or crop"
+        what = f"with importing.max_points={options.max_points} the cells of {cell:g} m are"
+        remedy = f"set importing.max_points={needed}, or importing.crop"
     report.warn(
-        f"{what} coarser than {threshold:g} m, the distance at which a robot of scenario={scenario.name} collides, "
-        f"so robots may be lost at ragged walls; {remedy}"
+        f"{what} coarser than {threshold:g} m, the distance at which {_whose(options, scenario)} collides, so "
+        f"robots may be lost at ragged walls; {remedy}"
     )
+
+
+def _whose(options: ImportOptions, scenario: Scenario) -> str:
+    """A robot of whose size the map is for."""
+    radius = options.robot_radius
+    return f"a robot of scenario={scenario.name}" if radius is None else f"a robot of robot.radius={radius:g}"
 
 
 def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
@@ -96,7 +106,7 @@ def crop_grid(grid: Grid, options: ImportOptions, report: ImportReport) -> Grid:
         grid = Grid(labels, grid.cell, grid.origin, grid.yaw, grid.height)
         report.add("crop", f"to x {xmin:g} to {xmax:g} m, y {ymin:g} to {ymax:g} m", before, grid.count(FREE))
     if not grid.count(FREE):
-        raise MapError(f"{report.path}: no free space is left inside crop={options.crop}; choose another box")
+        raise MapError(f"{report.path}: no free space is left inside importing.crop={options.crop}; choose another box")
     return grid.trim(4)
 
 
@@ -163,8 +173,9 @@ def _choose_resolution(
     if sizes[0] * POINTS_IN_RANGE > scenario.radar_range:
         raise MapError(
             f"{report.path}: {area:,.0f} m2 of free space need cells of {sizes[0]:g} m to stay below "
-            f"max_points={options.max_points}, too coarse for a radar of {scenario.radar_range:g} m: crop, check "
-            "units, raise max_points, or take the scenario of a larger robot"
+            f"importing.max_points={options.max_points}, too coarse for a radar of {scenario.radar_range:g} m: set "
+            "importing.crop, check importing.units, raise importing.max_points, or take an importing.scenario of "
+            "larger robots"
         )
     tried = {}
 
@@ -189,14 +200,17 @@ def _choose_resolution(
 def _require_room(cleaned: _Cleaned, options: ImportOptions, scenario: Scenario) -> None:
     if cleaned.room >= options.num_robots:
         return
-    small = find_scenario("indoor_small")
-    hint = "use a finer resolution, fewer robots, or check units, up and floor"
-    if scenario.body_length > small.body_length:
-        hint += f", or take the {small.body_length:g} x {small.body_width:g} m robot of scenario=indoor_small"
+    hint = "use a finer importing.resolution, fewer robots, or check importing.units, up and floor"
+    if options.robot_radius is not None:
+        size, hint = f"a robot of robot.radius={options.robot_radius:g}", f"say a smaller robot.radius, {hint}"
+    else:
+        size = f"a {scenario.body_length:g} x {scenario.body_width:g} m robot"
+        small = find_scenario("indoor_small").body_length
+        hint += f", or say how large your robots are, as robot.radius={small / 2:g}" * (scenario.body_length > small)
     raise MapError(
-        f"found {cleaned.area:,.1f} m2 of free space that a {scenario.body_length:g} x {scenario.body_width:g} m robot "
-        f"can use at {cleaned.start.cell:g} m, with room for {cleaned.room} of num_robots={options.num_robots} "
-        f"(starts {START_CLEARANCE * scenario.collision_threshold:g} m from walls and each other); {hint}"
+        f"found {cleaned.area:,.1f} m2 of free space that {size} can use at {cleaned.start.cell:g} m, with room for "
+        f"{cleaned.room} of num_robots={options.num_robots} (starts "
+        f"{START_CLEARANCE * scenario.collision_threshold:g} m from walls and each other); {hint}"
     )
 
 

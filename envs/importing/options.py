@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from maexp.envs.map import MapError
-from maexp.envs.scenarios import find_scenario
+from maexp.envs.scenarios import Scenario, find_scenario
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937, "in": 0.0254}
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -24,6 +24,7 @@ class ImportOptions:
         resolution: spacing of the map's points [m]; None: at most the robot's collision threshold.
         max_points: free points the automatic resolution may produce; it is coarser where they are not enough.
         num_robots: the team that must find room.
+        robot_radius: of round robots [m], which fit through gaps twice as wide; None: the scenario's robot.
 
     Grids (ROS map_server): `pixel_size` [m] when an image comes without its yaml; `free_threshold` and
         `occupied_threshold` (shares of black) overrule the yaml; `grey_walls`: pixels between the thresholds but
@@ -52,7 +53,7 @@ class ImportOptions:
         tile: side [m] of the square cut from a larger outdoor scan, where it has most free space.
         recentre: move the map to the origin; "auto": where coordinates are larger than 10 km.
         component: "largest", or (x, y) [m]: the free space around that place.
-        min_passage: gaps narrower than this [m] are closed; None: twice the collision threshold.
+        min_passage: gaps narrower than this [m] are closed; None: twice the collision threshold, or radius.
         wall_depth: obstacle points kept behind the boundary [cells].
     """
 
@@ -61,6 +62,7 @@ class ImportOptions:
     resolution: float | None = None
     max_points: int = 50_000
     num_robots: int = 3
+    robot_radius: float | None = None
     pixel_size: float | None = None
     free_threshold: float | None = None
     occupied_threshold: float | None = None
@@ -94,6 +96,9 @@ class ImportOptions:
         for name in ("resolution", "pixel_size", "voxel", "sample_spacing", "tile", "robot_height"):
             value = getattr(self, name)
             _require(value is None or _positive(value), name, value, "a number of metres greater than 0")
+        radius = self.robot_radius
+        if radius is not None and not _positive(radius):
+            raise MapError(f"robot.radius={radius!r} must be a number of metres greater than 0")
         for name in ("step_height", "min_passage"):
             value = getattr(self, name)
             _require(value is None or value == 0 or _positive(value), name, value, "a number of metres >= 0")
@@ -107,6 +112,10 @@ class ImportOptions:
         _require(named or len(self.component) == 2, "component", self.component, '"largest" or a place (x, y)')
         if self.scenario != "auto":
             find_scenario(self.scenario)
+
+    def find_scenario(self, automatic: str = "pointcloud") -> Scenario:
+        """The scenario whose robot and radar fit the map, its robot that of `robot_radius` where there is one."""
+        return find_scenario(automatic if self.scenario == "auto" else self.scenario).with_radius(self.robot_radius)
 
     @property
     def metres_per_unit(self) -> float | None:
@@ -132,4 +141,4 @@ def _positive(value) -> bool:
 
 def _require(good: bool, name: str, value, wanted: str) -> None:
     if not good:
-        raise MapError(f"{name}={value!r} must be {wanted}")
+        raise MapError(f"importing.{name}={value!r} must be {wanted}")

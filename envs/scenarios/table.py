@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral
 
@@ -38,6 +38,12 @@ class Scenario:
     num_steering: int = 25  # DWA candidates over the steering angle
     max_steer: float = math.pi / 3  # [rad]
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
+
+    def with_radius(self, radius: float | None) -> "Scenario":
+        """With a round robot of that radius [m], which collides where its body touches a wall; None: as it is."""
+        if radius is None:
+            return self
+        return replace(self, body_length=2 * radius, body_width=2 * radius, collision_threshold=radius)
 
 
 _CAR = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)

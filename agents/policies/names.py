@@ -1,0 +1,36 @@
+"""What a word that names a policy can be, told without the libraries that play one."""
+
+import os
+import re
+from importlib import metadata
+
+from maexp.agents.errors import UserError
+from maexp.agents.policies.guest import GROUP
+from maexp.agents.runtime.shipped import CONTRACT, advise, shipped_names
+from maexp.agents.settings.schema import NAMES
+
+
+def plug_ins() -> dict[str, metadata.EntryPoint]:
+    """The policies that installed packages offer, by their names."""
+    return {one.name: one for one in metadata.entry_points(group=GROUP)}
+
+
+def check_name(word: str, setting: str) -> None:
+    """Raise UserError for a plain name that is none of a policy; files and module:function are read later."""
+    known = word in NAMES or word in shipped_names() or word in plug_ins()
+    if not known and re.fullmatch(r"[\w-]*", word) and not os.path.exists(word[:250]):
+        raise UserError(describe_unknown(word, setting))
+
+
+def describe_unknown(word: str, setting: str) -> str:
+    """What is wrong with a word that names no policy."""
+    if os.path.isdir(word):
+        return (
+            f"{setting}={word} is a folder without a policy: it holds neither the {CONTRACT} of maexp export nor the "
+            "checkpoints of maexp train."
+        )
+    if os.path.exists(word):
+        return f"{setting}={word} is a file and no checkpoint: give a run's folder, or that of an exported policy."
+    advice = advise(word[:100], [*NAMES, *plug_ins(), *shipped_names()])
+    more = "" if advice.endswith("?") else ", a run, or module:function of your own."
+    return f"{setting}={word[:100]} is unknown: {advice}{more}"
