@@ -35,9 +35,20 @@ def run(cfg: PoliciesSettings, where: None, overrides: list[str]) -> int:
             return 0
         place = find_policy(cfg.name)
         read_contract(place)
-        print((place / CARD).read_text())
+        show((place / CARD).read_text())
         print(f"Folder: {place}")
     return 0
+
+
+def show(card: str) -> None:
+    """A card on the terminal, its tables as such; where it goes to a file or another program, as it is written."""
+    from rich.console import Console
+    from rich.markdown import Markdown
+
+    if Console().is_terminal:
+        Console().print(Markdown(card))
+    else:
+        print(card)
 
 
 def describe(name: str) -> str:
