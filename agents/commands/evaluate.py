@@ -29,7 +29,6 @@ from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
-from maexp.agents.settings.words import as_list
 from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
 from maexp.agents.training.named import Player, check_planner, find_players, suit_observation
 from maexp.agents.training.train import write_config
@@ -57,7 +56,7 @@ def check(cfg: EvaluateSettings) -> None:
     """Raise UserError for counts out of range and unknown policies."""
     check_counts(cfg, "num_envs", "episodes")
     team_sizes(cfg.num_robots)
-    check_planner(cfg.planner.name, find_players(as_list(cfg.policy)))
+    check_planner(cfg.planner.name, find_players(words_of(cfg.policy)))
     check_render(cfg)
 
 
@@ -69,7 +68,7 @@ def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
-        players = find_players(as_list(cfg.policy))
+        players = find_players(words_of(cfg.policy))
         if cfg.checkpoint is not None:
             players.insert(0, find_trained(cfg))
         suit_observation(cfg, players)

@@ -13,7 +13,6 @@ from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import TrainSettings
-from maexp.agents.settings.words import as_list
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger
@@ -69,7 +68,7 @@ def check(cfg: TrainSettings) -> None:
 
 def find_others(cfg: TrainSettings) -> list[Player]:
     """The policies played at the end beside the trained one."""
-    words = list(dict.fromkeys(["random", *as_list(cfg.classical)]))
+    words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
     others = find_players(words, "classical")
     return [one for one in others if one.direct] if cfg.planner.name == "direct" else others  # the rest pick goals
 
