@@ -145,7 +145,7 @@ def run_verb(name: str, words: list[str]) -> int:
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.settings.resolved import describe_radius, without_hydra
-    from maexp.agents.settings.words import check_sweep, check_words
+    from maexp.agents.words import check_sweep, check_words
 
     verb = VERBS[name]
     flags, rest = split_flags(words)

@@ -65,7 +65,8 @@ def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointClou
         source, scenario = make_source(path, found, options, report)
         return finish_map(source, scenario, name, options, report)
     if options.topic is not None:
-        raise MapError(f"importing.topic={options.topic!r} is for bags of ROS ({', '.join(BAGS)}), {path} has none")
+        bags = ", ".join(BAGS)
+        raise MapError(f"importing.topic={options.topic!r} is for bags of ROS ({bags}); {path} has no topics")
     if suffix in GRIDS:
         return _finish_grid(read_occupancy(path, options, report), name, options, report)
     if suffix in CLOUDS:
