@@ -124,7 +124,7 @@ def test_the_next_episode_has_a_new_process():
     ("hostile:Nobody", "AttributeError"), ("nowhere:Nobody", "ModuleNotFoundError"), ("exec:true", "it ended"),
     ("exec:/no/such/program", "cannot be started"), ("exec:", "names no command"), ("exec:'a", "No closing quotation"),
     ("exec:yes", "garbage"), ("exec:sleep 1000", "it gave no answer in 2 s"),
-    ("hostile:factory", "is no class with act"),
+    ("process:hostile:factory", "is no class with act"),
     ("process:nobody", "policy=nobody is unknown"), ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
 ])  # fmt: skip
 def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):

@@ -2,11 +2,15 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from small_suite import make_small_suite
 
 from maexp.agents.cli import main
+from maexp.agents.errors import UserError
+from maexp.agents.suites.players import Player
 from maexp.agents.training.checkpoint import load_checkpoint
 from maexp.agents.training.named import find_player
 
@@ -126,3 +130,48 @@ def test_what_stands_beside_a_training_may_be_ones_own(capsys):
     summary = json.loads(Path("beside_training/summary.json").read_text())
     assert list(summary)[:5] == ["trained", "random", "voronoi", "universal", "teachers.regions"]
     assert summary["voronoi"] == summary["teachers.regions"]
+
+
+PACKAGE = """
+import numpy as np
+
+class Stay:
+    def act(self, observation):
+        return np.full((len(observation["alive"]), 2), np.nan)
+
+def voronoi(env):
+    from maexp.agents.policies import POLICIES
+    return POLICIES["voronoi"](env)
+"""
+
+
+def install(site: Path) -> None:
+    """A package with two plug-ins, a class and a function of the env."""
+    (site / "swarm-1.0.dist-info").mkdir(parents=True)
+    (site / "swarm.py").write_text(PACKAGE)
+    (site / "swarm-1.0.dist-info/METADATA").write_text("Name: swarm\nVersion: 1.0\n")
+    points = "[maexp.policies]\nswarm_stay = swarm:Stay\nswarm_voronoi = swarm:voronoi\n"
+    (site / "swarm-1.0.dist-info/entry_points.txt").write_text(points)
+
+
+def test_a_suite_takes_what_policy_takes_elsewhere(tmp_path, monkeypatch, capsys):
+    install(tmp_path / "site")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    suite, found = make_small_suite(tmp_path / "small.yaml"), {}
+    for word in ("voronoi", "teachers:regions", "swarm_voronoi", "swarm_stay", "aims", "regions"):
+        where = tmp_path / word.replace(":", "_")
+        assert main(["suite", "run", str(suite), f"policy={word}", f"hydra.run.dir={where}"]) == 0
+        assert main(["suite", "verify", str(where), f"suite={suite}"]) == 0, word
+        found[word] = json.loads((where / "results.json").read_text())
+    assert found["teachers:regions"]["episodes"] == found["swarm_voronoi"]["episodes"] == found["voronoi"]["episodes"]
+    means = {word: one["score"]["mean"] for word, one in found.items()}
+    assert means["swarm_stay"] == min(means.values()) and len(set(means.values())) == 4
+    assert Player("swarm_stay").hosted and not Player("swarm_voronoi").hosted
+
+
+def test_a_suite_refuses_controls(monkeypatch):
+    found = find_player("aims")
+    monkeypatch.setattr("maexp.agents.suites.players.find_player", lambda *a, **k: replace(found, direct=True))
+    with pytest.raises(UserError, match="policy=aims gives controls"):
+        Player("aims")

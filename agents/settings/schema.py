@@ -318,7 +318,7 @@ class SuiteSettings:
 
     task: str = MISSING
     place: str | None = setting(None, "the suite, or the .yaml file of one; verify: the folder of a run")
-    policy: str | None = setting(None, "run: a name, a folder, module:Class, or exec:COMMAND, as docs/arena.md says")
+    policy: str | None = setting(None, "run: a name, run or folder, module:Class, exec:COMMAND: docs/arena.md says")
     suite: str | None = setting(None, "verify: the .yaml file of a suite that does not come with the package")
     seed: int | None = setting(None, "run: plays other maps and starts than the frozen ones, those of this seed")
     resume: str | None = setting(None, "run: folder of a run to go on with")

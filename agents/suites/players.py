@@ -20,13 +20,13 @@ class Player:
     """A policy by the word that names it.
 
     Args:
-        word: what `policy=` takes: a name or a folder; module:Class; `exec:COMMAND`, a program that speaks
-            `maexp.agents.policies.wire`; or `process:NAME`, one of ours as if it were a stranger's.
+        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks `maexp.agents.policies.wire`; or
+            `process:NAME`, one of ours as if it were a stranger's. A class with `act` always plays in processes.
         limit: processor time that a decision may take a policy in processes of its own [s].
         patience: how long an answer of such a one may take otherwise [s].
 
     Raises:
-        UserError: there is none of that name, it is damaged, or does not start.
+        UserError: there is none of that name, it is damaged, does not start, or gives controls.
     """
 
     def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0):
@@ -34,6 +34,8 @@ class Player:
         self.command = self._find_command()
         self.name = short_name(word)
         self.found: Named | None = None if self.hosted else find_player(word, name=self.name)
+        if self.found is not None and self.found.direct:
+            raise UserError(f"policy={word} gives controls (planner=direct), and the robots of a suite drive to goals.")
 
     def _find_command(self) -> list[str] | None:
         """Of a policy in processes of its own; None: it plays in this one."""
@@ -43,9 +45,11 @@ class Player:
             command = command_of(self.word)
         except ValueError as error:
             raise UserError(f"policy={self.word} cannot be started: {error}.") from error
-        if not greet(command, self.word):
+        if greet(command, self.word):
+            return command
+        if self.word.startswith(APART):
             raise UserError(f"policy={self.word} is no class with act(observation): see docs/arena.md.")
-        return command
+        return None
 
     @property
     def hosted(self) -> bool:
