@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
-from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.algorithms.table import TRAININGS, find_algorithm
 from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy
@@ -254,7 +254,7 @@ class Learner:
 
 def make_learner(cfg: LearnerSettings, env: ExplorationEnv) -> Learner:
     """Policy, critic and updater of the settings, for the specs of `env`."""
-    row = find_algorithm(cfg.algorithm.name)
+    row = find_algorithm(cfg.algorithm.name, TRAININGS)
     settings, model = algorithm_settings(cfg), model_settings(cfg)
     policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
     return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))

@@ -1,9 +1,10 @@
-"""The six algorithms: for each its loss, critic and updater; their settings stand in `settings/algorithms.py`."""
+"""The algorithms: for each its loss, critic and updater; their settings stand in `settings/algorithms.py`."""
 
 from dataclasses import dataclass, replace
 
 from torchrl.modules import PopArtValueNorm
 
+from maexp.agents.algorithms.expert import ExpertUpdater
 from maexp.agents.algorithms.losses import ActorCriticLoss, ClippedLoss, TrustRegionLoss
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.networks.critics import build_critic
@@ -77,17 +78,25 @@ ALGORITHMS = {
         Algorithm("vda2c", "mixed", ActorCriticLoss, GradientUpdater, TUNINGS["vda2c"]),
     )
 }
+"""The actor-critic algorithms: they learn from Collector batches alone."""
+
+TRAININGS = ALGORITHMS | {
+    "expert_iteration": Algorithm(
+        "expert_iteration", "local", ActorCriticLoss, ExpertUpdater, TUNINGS["expert_iteration"]
+    )  # its loss only holds the networks: it learns from branches
+}
+"""All that `maexp train` can train with."""
 
 
-def find_algorithm(name: str) -> Algorithm:
+def find_algorithm(name: str, among: dict[str, Algorithm] = ALGORITHMS) -> Algorithm:
     """The row of the table.
 
     Raises:
         ValueError: unknown name.
     """
-    if name not in ALGORITHMS:
-        raise ValueError(f"algorithm={name!r} is unknown; choose one of {', '.join(ALGORITHMS)}.")
-    return ALGORITHMS[name]
+    if name not in among:
+        raise ValueError(f"algorithm={name!r} is unknown; choose one of {', '.join(among)}.")
+    return among[name]
 
 
 def make_critic(algorithm: str, env, model: "str | ModelConfig" = "small", **settings):

@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from maexp.agents.algorithms.table import ALGORITHMS
+from maexp.agents.algorithms.table import TRAININGS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES
@@ -70,7 +70,7 @@ class Cell:
     @property
     def trains(self) -> bool:
         """Whether the policy has to be trained."""
-        return self.policy in ALGORITHMS
+        return self.policy in TRAININGS
 
 
 def is_learned(policy: str) -> bool:
@@ -86,7 +86,7 @@ def training_cell(cfg: BenchmarkSettings, cell: Cell) -> Cell:
 def list_cells(cfg: BenchmarkSettings) -> list[Cell]:
     """All cells in the order they are run: seed by seed, scenario by scenario, classical policies first."""
     names = policy_names(cfg)
-    ordered = [one for one in names if one not in ALGORITHMS] + [one for one in names if one in ALGORITHMS]
+    ordered = [one for one in names if one not in TRAININGS] + [one for one in names if one in TRAININGS]
     return [
         Cell(scenario, policy, seed, index)
         for seed in as_list(cfg.seeds)
@@ -113,7 +113,7 @@ def policy_names(cfg: BenchmarkSettings) -> list[str]:
 def word_names(cfg: BenchmarkSettings) -> dict[str, str]:
     """The words that name policies, and what the tables call these."""
     words = [str(word) for word in dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies))]
-    return name_players([word for word in words if word not in ALGORITHMS], "policies", ALGORITHMS)
+    return name_players([word for word in words if word not in TRAININGS], "policies", TRAININGS)
 
 
 def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> Player:

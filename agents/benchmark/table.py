@@ -10,7 +10,7 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from maexp.agents.algorithms.table import ALGORITHMS
+from maexp.agents.algorithms.table import TRAININGS
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence
 from maexp.envs.metrics import in_reach, label_copies, resample_weights, summarise
@@ -142,7 +142,7 @@ def weigh(
         maps: the map of each episode, for each cell
         copies: of `label_copies`, of all cells
     """
-    trainings = [np.repeat(seeds, counts)] if policy in ALGORITHMS else []
+    trainings = [np.repeat(seeds, counts)] if policy in TRAININGS else []
     return resample_weights(np.concatenate(maps), *trainings, copies=copies)
 
 

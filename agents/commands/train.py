@@ -17,7 +17,14 @@ from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger
 from maexp.agents.training.named import Player, find_players, suit_observation
-from maexp.agents.training.train import TrainingRun, check_collector, describe_workers, train, write_config
+from maexp.agents.training.train import (
+    TrainingRun,
+    check_collector,
+    check_expert,
+    describe_workers,
+    train,
+    write_config,
+)
 
 STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
@@ -60,6 +67,7 @@ def check(cfg: TrainSettings) -> None:
     check_counts(cfg, "episodes", "evaluate_every", least=0)
     team_sizes(cfg.num_robots)
     check_collector(cfg.collector)
+    check_expert(cfg)
     check_logger(cfg.logger)
     if not cfg.resume:
         check_warm_start(cfg)

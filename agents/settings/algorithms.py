@@ -1,4 +1,4 @@
-"""Settings of the six algorithms: types, ranges, defaults and those of the original platform."""
+"""Settings of the seven algorithms: types, ranges, defaults and those of the original platform."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -135,6 +135,29 @@ class ActorCriticSettings(Settings):
     mixer: str = choice("qmix", "vdn")
 
 
+@dataclass(frozen=True)
+class ExpertSettings(Settings):
+    """Settings of expert iteration. It has neither returns nor a critic: of those above only `lr`, `final_lr_share`,
+    `minibatch_size` (decisions of teams) and `max_grad_norm` do anything.
+
+    Attributes:
+        candidates: targets that a robot tries where it is branched at, its own choice among them
+        branch_horizon: decisions that are played in a branch; `lookahead` says what they are worth
+        branch_share: share of the teams' decisions that are branched at
+        epochs: how often a branched decision is learned from, on average; few: what is to be learned is small beside
+            what chance adds
+        memory: decisions kept to learn from, of every team size
+        weight_decay: of the weights, as in AdamW
+    """
+
+    candidates: int = whole(5, 2, 24)
+    branch_horizon: int = whole(4, 1, 100)
+    branch_share: float = number(0.5, 0.01, 1.0)
+    epochs: int = whole(2)
+    memory: int = whole(20_000)
+    weight_decay: float = number(0.1)
+
+
 def _reference(settings: Settings, **others) -> Settings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
     shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
@@ -188,6 +211,7 @@ TUNINGS = {
         _tunings("matrpo", TrustRegionSettings(), **_TRUST),
         _tunings("vdppo", MixedClippedSettings(), **_CLIPPED),
         _tunings("vda2c", ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
+        Tunings("expert_iteration", ExpertSettings(), ExpertSettings()),  # the original has none
     )
 }
 

@@ -13,23 +13,27 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import step_mdp
 
+from maexp.agents.algorithms.expert import ADVANTAGE, TRIED
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
-from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
+from maexp.agents.networks.actor import PREFERENCE, TARGETS, TARGETS_MASK
 from maexp.agents.networks.distributions import ACTION
 from maexp.agents.policies.lookahead import list_candidates
 from maexp.agents.policies.rollouts import Rollouts, pick_places
+from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.ranges import check_ranges, number, whole
-from maexp.envs import ExplorationEnv, LookaheadConfig, ObservationConfig, PlannerConfig, make_map
+from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 from maexp.envs.target_view import FEATURES
 
@@ -75,21 +79,25 @@ class BranchPlayer:
     Args:
         env: of the teams; shows targets.
         candidates, horizon: as in `BranchingConfig`.
-        seed: of what is tried.
+        seed: of what is tried; None: torch's own generator draws.
     """
 
-    def __init__(self, env: ExplorationEnv, candidates: int, horizon: int, seed: int = 0):
+    def __init__(self, env: ExplorationEnv, candidates: int, horizon: int, seed: int | None = None):
         self.env, self.view = env, env.target_view
-        config = LookaheadConfig(candidates=candidates, horizon=horizon)
+        config = replace(env.lookahead_config, candidates=candidates, horizon=horizon)
         self.rollouts = Rollouts(env, config, self.view.tracker, true_world=True)
-        self.draw = torch.Generator().manual_seed(seed)
+        self.draw = None if seed is None else torch.Generator().manual_seed(seed)
 
-    def try_candidates(self, features: torch.Tensor, preference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def try_candidates(
+        self, features: torch.Tensor, preference: torch.Tensor, among: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """What candidates of every team are worth beside the choice by `preference`.
 
         Args:
             features: float32 [E, N, M, F], what the teams see now.
             preference: float32 [E, N, M], as for `TargetView.take`.
+
+            among: bool [E], teams that try; None: all.
 
         Returns:
             int64 [E, N, K], the candidates tried, the own choice first, -1 = none; float32 [E, N, K], how much more
@@ -103,6 +111,7 @@ class BranchPlayer:
         block = torch.where(there, s["block"].gather(2, place), -1)
         region, offset = self.rollouts.goals(block, s["cell"].gather(2, place), pick_places(s["toward"], place), waits)
         active = self.env.simulation.tensors["active"] != 0
+        active = active if among is None else active & among
         there = there & active.view(-1, 1, 1)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & there[..., :1]
         mine = {"region": region, "offset": offset, "block": block, "wanted": there}
@@ -129,6 +138,31 @@ class BranchPlayer:
             kept = self.rollouts.keep(kept, worth, wanted, chosen[:, robot])
             found.append(torch.where(wanted, worth, torch.nan))
         return torch.stack(found, 1)
+
+
+class BranchingActor(TensorDictModuleBase):
+    """A policy whose choices are tried in branches while it acts: it writes `TRIED` and `ADVANTAGE` too.
+
+    Args:
+        policy: chooses among targets; its likeliest choice is the own one that others are compared with.
+        env: in which it acts.
+        settings: how it is branched.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, env: ExplorationEnv, settings: ExpertSettings):
+        super().__init__()
+        self.policy, self.share = policy, settings.branch_share
+        self.player = BranchPlayer(env, settings.candidates, settings.branch_horizon)
+        self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = self.policy(tensordict)
+        features = tensordict[TARGETS]
+        among = torch.rand(len(features), device=features.device) < self.share
+        tried, worth = self.player.try_candidates(features, tensordict[PREFERENCE], among)
+        tensordict[TRIED], tensordict[ADVANTAGE] = tried.to(torch.int8), worth
+        return tensordict
 
 
 @torch.no_grad()

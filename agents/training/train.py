@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
 
 from maexp.agents.build import (
     Learner,
@@ -29,9 +30,10 @@ from maexp.agents.files import write_text
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
+from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.resolved import find_followers, resolve, to_yaml
+from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import (
@@ -46,7 +48,7 @@ from maexp.agents.training.collect import Experience, WorkerLost, batch_statisti
 from maexp.agents.training.logs import MetricsLog
 from maexp.agents.training.validation import COLUMNS, ENDS, Validation
 from maexp.agents.versions import find_commit
-from maexp.envs import PointCloudMap
+from maexp.envs import ExplorationEnv, PointCloudMap
 
 CONFIG = "config.yaml"
 BACKENDS = ("single", "processes", "ray")
@@ -328,11 +330,35 @@ def make_both(
     like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
     learner = make_learner(cfg, like)
     if alone:
-        pairs = zip(envs, steps, strict=True)
-        return learner, Experience([make_collector(env, learner.policy, length, there) for env, length in pairs])
+        actors = [make_actor(cfg, learner.policy, env) for env in envs]
+        pairs = zip(envs, actors, steps, strict=True)
+        return learner, Experience([make_collector(env, actor, length, there) for env, actor, length in pairs])
     from maexp.agents.training.workers import make_workers  # here: most runs have none
 
     return learner, make_workers(cfg, maps, teams, learner.policy)
+
+
+def make_actor(cfg: TrainSettings, policy: TensorDictModuleBase, env: ExplorationEnv) -> TensorDictModuleBase:
+    """What acts in the training episodes of an env: the policy, with what the algorithm does besides."""
+    settings = algorithm_settings(cfg)
+    if not isinstance(settings, ExpertSettings):
+        return policy
+    from maexp.agents.training.branching import BranchingActor  # builds on the planners
+
+    return BranchingActor(policy, env, settings)
+
+
+def check_expert(cfg: TrainSettings) -> None:
+    """Raise UserError for settings that expert iteration cannot work with."""
+    if cfg.algorithm.name != "expert_iteration":
+        return
+    if model_settings(cfg).action != "targets" or cfg.planner.name == "direct":
+        raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
+    if cfg.collector.backend != "single":
+        raise UserError(
+            f"algorithm=expert_iteration plays its branches where it acts: it needs collector=single, not "
+            f"collector={cfg.collector.backend}."
+        )
 
 
 def check_collector(settings: DictConfig) -> None:

@@ -1,0 +1,141 @@
+"""Expert iteration: learns what branches say, from all of them, and goes on bit for bit where it was stopped."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_train import TINY, assert_same_runs, resume, run, somewhere  # noqa: F401: `somewhere` is a fixture
+from worlds import room
+
+from maexp.agents import ALGORITHMS, make_policy
+from maexp.agents.algorithms.expert import ADVANTAGE, TRIED
+from maexp.agents.algorithms.table import TRAININGS
+from maexp.agents.cli import main
+from maexp.agents.networks.actor import ALIVE, COMM, PREFERENCE, TARGETS, TARGETS_MASK
+from maexp.agents.policies import POLICIES
+from maexp.agents.settings.model import model_config
+from maexp.agents.training.branching import BranchingActor
+from maexp.envs import ExplorationEnv, ObservationConfig
+from maexp.envs.target_view import FEATURES
+
+WORDS = ("algorithm=expert_iteration", "action=targets", "algorithm.branch_horizon=1", "algorithm.candidates=3")
+ROW = TRAININGS["expert_iteration"]
+
+
+def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
+    return ExplorationEnv(
+        [room(45, 36, "rotated"), room(41, 44)], num_envs=envs, num_robots=robots, seed=2, local_steps=8, macro_steps=6,
+        observation=ObservationConfig(pictures=False, targets=8), **others,
+    )  # fmt: skip
+
+
+def build(env: ExplorationEnv, **settings):
+    model = replace(model_config("small"), action="targets")
+    settings = ROW.configure(candidates=3, branch_horizon=1, **settings)
+    policy, critic = make_policy(env, model), ROW.make_critic(env, model, settings)
+    return policy, ROW.make_updater(ROW.make_loss(policy, critic, settings), settings), settings
+
+
+def batch(decisions: int, robots: int = 2, seed: int = 0) -> TensorDict:
+    """A batch [decisions, 1] in which the second candidate tried is worth its feature "size" over the own choice."""
+    draw = torch.Generator().manual_seed(seed)
+    features = torch.randn(decisions, 1, robots, 8, len(FEATURES), generator=draw)
+    features[..., FEATURES.index("score")] = 0.0
+    tried = torch.tensor([0, 3, 5], dtype=torch.int8).expand(decisions, 1, robots, 3).clone()
+    size = features[..., FEATURES.index("size")]
+    advantage = size[..., [0, 3, 5]] - size[..., :1]
+    advantage[..., 2] = torch.nan  # was not played
+    tried[::7], advantage[::7] = -1, torch.nan  # were not branched at
+    return TensorDict(
+        {
+            TARGETS: features, TARGETS_MASK: torch.ones(decisions, 1, robots, 8, dtype=torch.bool),
+            COMM: torch.ones(decisions, 1, robots, robots, dtype=torch.bool), TRIED: tried, ADVANTAGE: advantage,
+        },
+        (decisions, 1),
+    )  # fmt: skip
+
+
+def test_it_learns_what_branches_say():
+    """A planted worth is found; what was not tried counts nothing, not even as a NaN."""
+    torch.manual_seed(0)
+    policy, updater, _ = build(make_env(), lr=0.01, epochs=8, minibatch_size=32)
+    told = [updater.update(batch(140, seed=k)) for k in range(6)]
+    assert [one["branched"] for one in told] == [120 * (k + 1) for k in range(6)]
+    assert told[-1]["advantage_error"] < 0.3 * told[0]["advantage_error"]
+    fresh = batch(100, seed=9)[:, 0]
+    with torch.no_grad():
+        chosen = policy(fresh.select(TARGETS, TARGETS_MASK, COMM))[PREFERENCE].argmax(-1, keepdim=True)
+    size = fresh[TARGETS][..., FEATURES.index("size")]
+    assert size.gather(-1, chosen).mean() > 0.7 * size.amax(-1).mean(), "what it chooses is what is worth most"
+
+
+def test_memory_and_headroom():
+    policy, updater, _ = build(make_env(), memory=50)
+    told = updater.update(batch(40), batch(80, robots=3))
+    assert told["branched"] == 34 + 50
+    best = torch.cat([one[ADVANTAGE][..., 1].flatten() for one in (batch(40), batch(80, robots=3))])
+    assert told["headroom"] == pytest.approx(best[best.isfinite()].clamp_min(0).mean().item(), abs=1e-6)
+    nothing = updater.update(batch(1))  # its one decision was not branched at
+    assert nothing["branched"] == 84 and "advantage_error" not in nothing
+
+
+def test_untrained_it_acts_as_cost_utility_and_tries_without_touching_the_episode():
+    """The same episodes with and without branches, and those of the planner that it starts from."""
+    env = make_env()
+    policy, _, settings = build(env)
+    actor = BranchingActor(policy, env, replace(settings, branch_share=1.0))
+    with torch.no_grad():
+        env.set_seed(3)
+        branched = env.rollout(6, actor, break_when_any_done=False)
+        env.set_seed(3)
+        alone = env.rollout(6, policy, break_when_any_done=False)
+        env.set_seed(3)
+        planner = env.rollout(6, POLICIES["cost_utility"](env), break_when_any_done=False)
+    key = ("next", "info", "coverage")
+    assert torch.equal(branched[key], alone[key]) and torch.equal(alone[key], planner[key])
+    tried, worth = branched[TRIED], branched[ADVANTAGE]
+    assert (tried[..., 1:] >= 0).any() and torch.equal(worth.isfinite(), tried >= 0)
+    own = worth[..., 0][tried[..., 0] >= 0]
+    assert (own == 0).all() and (worth.nan_to_num().abs() > 0).any()
+    assert not (tried >= 0)[~branched[ALIVE]].any()
+
+
+def test_the_share_that_is_branched_at():
+    env = make_env(envs=16)
+    policy, _, settings = build(env)
+    torch.manual_seed(1)
+    actor = BranchingActor(policy, env, replace(settings, branch_share=0.3))
+    with torch.no_grad():
+        seen = env.rollout(4, actor, break_when_any_done=False)
+    tried = (seen[TRIED][..., 0] >= 0).any(-1)
+    assert 0.15 < tried.float().mean() < 0.45
+
+
+def test_resumed_is_uninterrupted(somewhere):  # noqa: F811
+    words = (*WORDS, "algorithm.final_lr_share=1")  # which else would fall sooner in the shorter run
+    whole = run("whole", 4, *words)
+    parts = resume(run("parts", 2, *words), 4)
+    assert_same_runs(whole, parts)
+    rows = (whole / "metrics.csv").read_text().splitlines()
+    assert {"branched", "headroom", "advantage_error"} <= set(rows[0].split(","))
+
+
+def test_several_team_sizes_and_scenarios(somewhere):  # noqa: F811
+    words = [*TINY, *WORDS, "num_envs=4", "num_robots=1,2", "scenario.also=[indoor_small]", "episodes=2", "classical=[]"]
+    assert main(["train", *words, "total_frames=8", "hydra.run.dir=run"]) == 0
+
+
+@pytest.mark.parametrize("words, sentence", [
+    (("action=regions",), "needs action=targets"), (("planner=direct",), "needs action=targets"),
+    (("collector=processes",), "needs collector=single"), (("algorithm.candidates=1",), "from 2 to 24"),
+])  # fmt: skip
+def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):  # noqa: F811
+    assert main(["train", "algorithm=expert_iteration", *words]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error and "Traceback" not in error
+
+
+def test_the_six_stay_six():
+    """Those that learn from Collector batches alone: user code loops over them."""
+    assert len(ALGORITHMS) == 6 and "expert_iteration" not in ALGORITHMS
