@@ -106,6 +106,9 @@ def test_the_share_that_is_branched_at():
     policy, _, settings = build(env)
     torch.manual_seed(1)
     actor = BranchingActor(policy, env, replace(settings, branch_share=0.3))
+    none = BranchingActor(policy, env, replace(settings, branch_share=0.01, branch_horizon=2))
+    with torch.no_grad():
+        assert not (env.rollout(1, none)[TRIED] >= 0).any(), "decisions at which no team is branched are played too"
     with torch.no_grad():
         seen = env.rollout(4, actor, break_when_any_done=False)
     tried = (seen[TRIED][..., 0] >= 0).any(-1)

@@ -42,7 +42,7 @@ class LookaheadPlanner(FrontierPlanner):
         offers = self._offer(scene, preference, own, waits)
         chosen = torch.zeros_like(own)
         teams = (self.env.simulation.tensors["active"] != 0).nonzero().squeeze(-1)
-        for some in teams.split(self.rollouts.teams):
+        for some in teams.split(self.rollouts.teams) if len(teams) else ():
             chosen[some] = self._search(some, {name: one[some] for name, one in offers.items()})
         if not bool(chosen.any()):
             return own, waits

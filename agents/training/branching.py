@@ -116,7 +116,8 @@ class BranchPlayer:
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & there[..., :1]
         mine = {"region": region, "offset": offset, "block": block, "wanted": there}
         worth = torch.full(index.shape, torch.nan)
-        for some in active.nonzero().squeeze(-1).split(self.rollouts.teams):
+        teams = active.nonzero().squeeze(-1)
+        for some in teams.split(self.rollouts.teams) if len(teams) else ():
             worth[some] = self._weigh(some, {name: one[some] for name, one in mine.items()})
         return torch.where(there, index, -1), worth - worth[..., :1]
 
