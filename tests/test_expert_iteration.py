@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from test_train import TINY, assert_same_runs, resume, run, somewhere  # noqa: F401: `somewhere` is a fixture
+from test_train import TINY, assert_same_runs, resume, run
 from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy
@@ -21,6 +21,14 @@ from maexp.envs.target_view import FEATURES
 
 WORDS = ("algorithm=expert_iteration", "action=targets", "algorithm.branch_horizon=1", "algorithm.candidates=3")
 ROW = TRAININGS["expert_iteration"]
+
+
+@pytest.fixture
+def somewhere(tmp_path, monkeypatch):
+    """A folder of its own, and no pictures: these have tests of their own."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("draw_rollout", "draw_curves"):
+        monkeypatch.setattr(f"maexp.agents.commands.train.{name}", lambda *args: None)
 
 
 def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
@@ -115,7 +123,7 @@ def test_the_share_that_is_branched_at():
     assert 0.15 < tried.float().mean() < 0.45
 
 
-def test_resumed_is_uninterrupted(somewhere):  # noqa: F811
+def test_resumed_is_uninterrupted(somewhere):
     words = (*WORDS, "algorithm.final_lr_share=1")  # which else would fall sooner in the shorter run
     whole = run("whole", 4, *words)
     parts = resume(run("parts", 2, *words), 4)
@@ -124,16 +132,16 @@ def test_resumed_is_uninterrupted(somewhere):  # noqa: F811
     assert {"branched", "headroom", "advantage_error"} <= set(rows[0].split(","))
 
 
-def test_several_team_sizes_and_scenarios(somewhere):  # noqa: F811
-    words = [*TINY, *WORDS, "num_envs=4", "num_robots=1,2", "scenario.also=[indoor_small]", "episodes=2", "classical=[]"]
-    assert main(["train", *words, "total_frames=8", "hydra.run.dir=run"]) == 0
+def test_several_team_sizes_and_scenarios(somewhere):
+    teams = ["num_envs=4", "num_robots=1,2", "scenario.also=[indoor_small]"]
+    assert main(["train", *TINY, *WORDS, *teams, "total_frames=8", "episodes=2", "classical=[]"]) == 0
 
 
 @pytest.mark.parametrize("words, sentence", [
     (("action=regions",), "needs action=targets"), (("planner=direct",), "needs action=targets"),
     (("collector=processes",), "needs collector=single"), (("algorithm.candidates=1",), "from 2 to 24"),
 ])  # fmt: skip
-def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):  # noqa: F811
+def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):
     assert main(["train", "algorithm=expert_iteration", *words]) == 2
     error = capsys.readouterr().err
     assert sentence in error and "Traceback" not in error
