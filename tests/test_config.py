@@ -4,7 +4,7 @@ from dataclasses import asdict, fields
 
 import pytest
 
-from maexp.agents.algorithms import ALGORITHMS
+from maexp.agents.algorithms.table import TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups
@@ -45,7 +45,7 @@ def test_every_choice_composes_and_is_described(group):
 
 def test_choices_match_the_tables_of_the_code():
     assert set(group_choices("scenario")) == set(SCENARIOS)
-    assert set(group_choices("algorithm")) == set(ALGORITHMS)
+    assert set(group_choices("algorithm")) == set(TRAININGS)
     assert set(group_choices("model")) == set(SIZES)
 
 
@@ -54,9 +54,9 @@ REGIONS = ["action=regions"]  # action=targets brings settings of its own
 # conf/ holds the values, the dataclasses those of Python users: a default that changes, changes in both
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", TRAININGS)
 def test_conf_algorithm_holds_the_defaults(algorithm):
-    row, cfg = ALGORITHMS[algorithm], compose_config("train", [*REGIONS, f"algorithm={algorithm}"])
+    row, cfg = TRAININGS[algorithm], compose_config("train", [*REGIONS, f"algorithm={algorithm}"])
     assert given(cfg.algorithm, "name") == asdict(row.settings), f"conf/algorithm/{algorithm}.yaml"
     tuned = compose_config("train", [f"algorithm={algorithm}", "action=targets", "tuning=reference"])
     assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
