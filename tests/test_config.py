@@ -4,7 +4,7 @@ from dataclasses import asdict, fields
 
 import pytest
 
-from maexp.agents.algorithms.table import TRAININGS
+from maexp.agents.algorithms.table import ALGORITHMS, TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups
@@ -58,6 +58,11 @@ REGIONS = ["action=regions"]  # action=targets brings settings of its own
 def test_conf_algorithm_holds_the_defaults(algorithm):
     row, cfg = TRAININGS[algorithm], compose_config("train", [*REGIONS, f"algorithm={algorithm}"])
     assert given(cfg.algorithm, "name") == asdict(row.settings), f"conf/algorithm/{algorithm}.yaml"
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_conf_reference_holds_the_originals(algorithm):
+    row = ALGORITHMS[algorithm]
     tuned = compose_config("train", [f"algorithm={algorithm}", "action=targets", "tuning=reference"])
     assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
 

@@ -140,6 +140,7 @@ def test_several_team_sizes_and_scenarios(somewhere):
 @pytest.mark.parametrize("words, sentence", [
     (("action=regions",), "needs action=targets"), (("planner=direct",), "needs action=targets"),
     (("collector=processes",), "needs collector=single"), (("algorithm.candidates=1",), "from 2 to 24"),
+    (("tuning=reference",), "Leave tuning out"),
 ])  # fmt: skip
 def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):
     assert main(["train", "algorithm=expert_iteration", *words]) == 2

@@ -354,6 +354,8 @@ def check_expert(cfg: TrainSettings) -> None:
         return
     if model_settings(cfg).action != "targets" or cfg.planner.name == "direct":
         raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
+    if cfg.tuning == "reference":
+        raise UserError("tuning=reference: the original platform has no algorithm=expert_iteration. Leave tuning out.")
     if cfg.collector.backend != "single":
         raise UserError(
             f"algorithm=expert_iteration plays its branches where it acts: it needs collector=single, not "
