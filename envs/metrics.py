@@ -152,6 +152,11 @@ def summarise(values: np.ndarray, weights: np.ndarray | None = None, copies: np.
     return {"mean": float(kept.mean()), "std": float(kept.std()), "ci95": ends, "n": len(kept)}
 
 
+def has_interval(found: dict) -> bool:
+    """Whether a mean {mean, ci95, n} has an interval."""
+    return all(end is not None and end == end for end in found.get("ci95", [None]))
+
+
 def _interval(values: np.ndarray, weights: np.ndarray | None) -> list[float]:
     if np.ptp(values) == 0.0:
         return [float(values.mean())] * 2

@@ -21,6 +21,7 @@ from maexp.agents.benchmark.cell import read_result, write_result
 from maexp.agents.benchmark.plan import Cell, cell_folder
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.evidence import Evidence
 from maexp.agents.evaluation.results import FORMAT, write_results
 from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.training.logs import MetricsLog
@@ -46,6 +47,7 @@ class Results:
     """Stands in for an evaluation with a long summary."""
 
     policy, num_robots, place, learned = "one", 3, None, False
+    evidence = Evidence("one", episodes=9, distinct=9, maps=9)
 
     def __init__(self, count: int = 1):
         self.count = count

@@ -102,7 +102,8 @@ def evaluated(folder: str, *words: str) -> dict:
 
 
 def test_ones_own_policies_stand_in_the_table_beside_the_others(capsys):
-    found = evaluated("out", "policy=my_robots:make,my_robots:Corner,my_robots:Stay,universal,nearest_frontier")
+    named = "policy=my_robots:make,my_robots:Corner,my_robots:Stay,universal,nearest_frontier"
+    found = evaluated("out", named, "episodes=8")
     assert list(found)[:5] == ["my_robots.make", "my_robots.Corner", "my_robots.Stay", "universal", "nearest_frontier"]
     assert found["my_robots.make"] == found["nearest_frontier"]
     assert found["my_robots.Stay"]["path_length"]["mean"] == 0.0 < found["my_robots.Corner"]["path_length"]["mean"]

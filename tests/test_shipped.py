@@ -122,7 +122,7 @@ def test_trained_and_classical_policies_play_the_same_episodes(tmp_path, monkeyp
     assert set(results["difference"]["universal"]) == {"mine", "nearest_frontier"}
     told = "\n".join(describe_results(tmp_path / "all" / "results.json"))
     assert "`maze_small`, 16 held-out maps, 2 episodes, teams of 2" in told
-    assert f"| universal | {results['universal']['exploration_ratio']['mean']:.3g} (" in told
+    assert f"| universal | {results['universal']['exploration_ratio']['mean']:.3g} |" in told  # no interval from two
     assert "mine less nearest_frontier, the best classical planner on the validation maps" in told
     (tmp_path / "all" / "results.json").write_text("{}")
     with pytest.raises(UserError, match="is not the results of an evaluation"):

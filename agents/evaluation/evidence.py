@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from maexp.envs.metrics import LEAST_DISTINCT
+from maexp.envs.metrics import LEAST_DISTINCT, has_interval
 
 FEW_MAPS = 5
 """Fewer maps than these are named: an interval that resamples them is too narrow for others."""
@@ -46,11 +46,6 @@ def _describe_episodes(episodes: int, distinct: int, names: list[str]) -> list[s
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
-
-
-def has_interval(found: dict) -> bool:
-    """Whether a mean {mean, ci95, n} has an interval."""
-    return all(end is not None and end == end for end in found.get("ci95", [None]))
 
 
 def brackets(found: dict, write: Callable[[float], str]) -> str:

@@ -9,9 +9,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from maexp.agents.evaluation.evidence import has_interval
 from maexp.agents.evaluation.figures import COLOURS, LOOK, MARKERS, STYLES, finish, panels, reach, save
-from maexp.envs.metrics import LEAST_DISTINCT, in_reach, label_copies, resample_weights, resampled_means
+from maexp.envs.metrics import LEAST_DISTINCT, has_interval, in_reach, label_copies, resample_weights, resampled_means
 
 # title, unit, scale factor, [(column, label)]: a panel shows the columns that exist
 CURVES = (

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.evidence import has_interval
+from maexp.envs.metrics import has_interval
 
 SHOWN = {
     "exploration_ratio": "coverage",
