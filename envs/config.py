@@ -130,7 +130,8 @@ class LookaheadConfig:
     Each robot tries ``candidates`` targets, its own choice among them, in a simulated future of ``horizon``
     decisions, the first among them, in which ``rollout_policy`` plays on. A branch is worth what it covers, on average
     over that time, and ``rest`` times what it has covered at its end; less ``loss`` for every robot lost; and ``prior``
-    times what the target is worth to `cost_utility`. All of it counts in radar discs. The best branch is taken if it is
+    times what the target is worth to `cost_utility`, or to ``rollout_policy`` where that is a trained policy (by its
+    name or folder; then `cost_utility` plays on). All of it counts in radar discs. The best branch is taken if it is
     worth ``margin`` more than the own choice. ``unknown`` says what is taken to stand where nobody has looked: ``free``
     ground, what the ``nearest`` known cell holds, or what the map predictor says (``predicted``).
     """

@@ -53,13 +53,14 @@ class TargetView:
     Args:
         env: only read.
         count: M.
+        tracker: of the env's targets, if others look with it too.
 
     Attributes:
         state: tensors that later decisions depend on, besides those of the tracker.
     """
 
-    def __init__(self, env: ExplorationEnv, count: int):
-        self.env, self.count, self.tracker = env, count, TargetTracker(env)
+    def __init__(self, env: ExplorationEnv, count: int, tracker: TargetTracker | None = None):
+        self.env, self.count, self.tracker = env, count, tracker or TargetTracker(env)
         shape, device = (env.num_envs, env.num_robots), env.device
         self.state = {
             "last": torch.zeros((*shape, 2), device=device),  # where each robot's latest target was [m]
@@ -91,7 +92,11 @@ class TargetView:
 
     def _look(self) -> dict[str, torch.Tensor]:
         """`observe` of the envs that `Navigation.only` leaves."""
-        scene = self.tracker.look()
+        return self.show(self.tracker.look())[0]
+
+    def show(self, scene: Scene) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """`observe` of what the tracker has just seen; and which of the scene's targets the candidates are, int64
+        [E, N, M]."""
         nav = scene.nav
         s = {name: nav.pick(value) for name, value in self.state.items()}
         s["has_last"] = s["has_last"] & (nav.state["macro_step"] != 0).unsqueeze(-1)
@@ -108,7 +113,12 @@ class TargetView:
         near = _Near(self, s, scene, best, some, travel)
         columns = near.plan() | near.way() | near.worth() | near.bearings() | near.team()
         features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
-        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": first_if_none(some)}
+        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": first_if_none(some)}, best
+
+    def note(self, chosen: torch.Tensor, where: torch.Tensor) -> None:
+        """Remember where robots go: what they chose, int64 [E, N], -1 = nothing, and where that is, float32 [E, N, 2]
+        [m]."""
+        self.state["has_last"], self.state["last"] = chosen >= 0, where
 
     def take(
         self, index: torch.Tensor, preference: torch.Tensor | None = None
@@ -136,7 +146,7 @@ class TargetView:
         preference = torch.where(there, preference, -torch.inf)
         chosen, waits = self.tracker.share(preference, s["way"], s["point"])
         index = chosen.clamp_min(0).unsqueeze(-1)
-        s["has_last"], s["last"] = chosen >= 0, _pick(s["point"], index).squeeze(2)
+        self.note(chosen, _pick(s["point"], index).squeeze(2))
         block = torch.where(chosen >= 0, s["block"].gather(2, index).squeeze(-1), -1)
         cell = s["cell"].gather(2, index).squeeze(-1)
         return self.tracker.take(block, cell, _pick(s["toward"], index).squeeze(2), waits)

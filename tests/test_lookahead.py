@@ -10,12 +10,14 @@ from worlds import room
 from maexp.agents.cli import main
 from maexp.agents.evaluation.evaluate import evaluate
 from maexp.agents.policies import POLICIES
+from maexp.agents.policies.load import load_policy_folder
 from maexp.agents.policies.lookahead import LookaheadPlanner, list_candidates
 from maexp.agents.policies.rollouts import pick_tried
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
     LookaheadConfig,
+    ObservationConfig,
     PlannerConfig,
     PointCloudMap,
     RobotConfig,
@@ -112,6 +114,25 @@ def test_a_single_candidate_is_the_rollout_policy():
     for step in range(3):
         assert torch.equal(found[2 * step], td["agents", "action", "region"][:, step])
         assert torch.equal(found[2 * step + 1], td["agents", "action", "offset"][:, step])
+
+
+@pytest.mark.parametrize("comm", [None, CommConfig(range=6.0)])
+def test_a_trained_policy_is_a_base_too(comm):
+    """With a single candidate the search drives as the policy does; with more it departs."""
+    def play(policy, targets, **lookahead):
+        env = ExplorationEnv(
+            make_map("indoor_medium", 1), num_envs=2, num_robots=3, seed=0, comm=comm,
+            lookahead=LookaheadConfig(**lookahead),
+            observation=ObservationConfig(pictures=False, targets=targets),
+        )  # fmt: skip
+        with torch.no_grad():
+            return env.rollout(4, policy(env), break_when_any_done=False)["next", "agents", "observation", "pose"]
+
+    alone = play(lambda env: load_policy_folder("universal", env), 24)
+    assert torch.equal(play(POLICIES["lookahead"], 0, rollout_policy="universal", candidates=1), alone)
+    searched = play(POLICIES["lookahead"], 0, rollout_policy="universal", candidates=4)
+    assert not torch.equal(searched, alone)
+    assert not torch.equal(searched, play(POLICIES["lookahead"], 0, candidates=4)), "its base changes nothing"
 
 
 @pytest.mark.parametrize("settings", [

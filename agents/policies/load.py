@@ -4,10 +4,12 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.networks.weights import mismatched
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.export import find_chooser
@@ -46,24 +48,40 @@ def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") 
     Raises:
         UserError: it is unknown, damaged, or of another kind.
     """
+    config, weights = _read_network(*open_policy(word, setting))
+    policy = make_policy(env, config)
+    find_chooser(policy).load_state_dict(weights)
+    return policy.to(env.device)
+
+
+def load_chooser(word: str, setting: str = "policy") -> tuple[TargetChooser, int]:
+    """The network of a trained policy, on the CPU, and how many candidates it is shown.
+
+    Raises:
+        UserError: it is unknown, damaged, or of another kind.
+    """
+    folder, contract = open_policy(word, setting)
+    config, weights = _read_network(folder, contract)
+    chooser = TargetChooser(config).eval()
+    chooser.load_state_dict(weights)
+    return chooser, contract.candidates
+
+
+def _read_network(folder: Path, contract: Contract) -> tuple[ModelConfig, dict[str, Tensor]]:
+    """Settings and weights of a policy's network; UserError where they do not fit each other."""
     from safetensors import SafetensorError
     from safetensors.torch import load
 
-    folder, contract = open_policy(word, setting)
     try:
         config = ModelConfig(action="targets", **contract.content["model"])
         weights = load(read_checked(folder, contract.content, WEIGHTS))
     except (KeyError, TypeError, ValueError, SafetensorError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{folder} holds no network that its contract tells of ({reason}): {AGAIN}.") from error
-    policy = make_policy(env, config)
-    chooser = find_chooser(policy)
-    wrong = mismatched(chooser.state_dict(), weights)
+    wrong = mismatched(TargetChooser(config).state_dict(), weights)
     if wrong:
         raise UserError(
             f"{folder / WEIGHTS} holds another network than its contract tells of ({len(wrong)} tensors differ, first "
             f"{wrong[0]}): {AGAIN}."
         )
-    chooser.load_state_dict(weights)
-    return policy.to(env.device)
-
+    return config, weights

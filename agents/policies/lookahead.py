@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import torch
 
-from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
-from maexp.agents.policies.rollouts import Rollouts, check_rollout_policy, pick_places
+from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner, rank_by_utility
+from maexp.agents.policies.rollouts import ROLLOUT_POLICY, Rollouts, check_rollout_policy, pick_places
+from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.targets import Scene, plan_in_turn, value_targets
 
@@ -31,13 +32,23 @@ class LookaheadPlanner(FrontierPlanner):
     def __init__(self, env: ExplorationEnv, config: LookaheadConfig | None = None, true_world: bool = False):
         config = env.lookahead_config if config is None else config
         check_rollout_policy(config)
-        super().__init__(env, CLASSICAL[config.rollout_policy])
+        super().__init__(env, CLASSICAL.get(config.rollout_policy, rank_by_utility))
+        self.trained = config.rollout_policy not in CLASSICAL
+        if self.trained:
+            self.rank = TrainedRank(config.rollout_policy, env, self.tracker, ROLLOUT_POLICY)
         self.env, self.config = env, config
         self.rollouts = Rollouts(env, config, self.tracker, true_world)
 
     def choose(self, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
         """The target of each robot, and which robots wait: as the rollout policy says, but where a branch is better."""
         preference = self.rank(scene)
+        chosen, waits = self._improve(scene, preference)
+        if self.trained:
+            self.rank.note(scene, chosen)
+        return chosen, waits
+
+    def _improve(self, scene: Scene, preference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As of `choose`, where robots think so of targets, float32 [E, N, T]."""
         own, waits = self.tracker.share(preference, scene.travel, scene.points)
         offers = self._offer(scene, preference, own, waits)
         chosen = torch.zeros_like(own)
@@ -67,7 +78,7 @@ class LookaheadPlanner(FrontierPlanner):
         toward, point = (pick_places(one, place) for one in (scene.middle, scene.points))
         block = torch.where(index >= 0, block, -1)
         region, offset = self.rollouts.goals(block, cell, toward, waits)
-        value = _value(scene).gather(2, place)
+        value = (preference if self.trained else _value(scene)).gather(2, place)
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & (own >= 0).unsqueeze(-1)
         return {

@@ -8,12 +8,15 @@ from __future__ import annotations
 import torch
 
 from maexp.agents.networks.map_predictor import predict
-from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
+from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner, rank_by_utility
+from maexp.agents.policies.load import is_exported
+from maexp.agents.runtime.shipped import shipped_names
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.belief import Beliefs, Guess, guess_nearest
 from maexp.envs.branches import Branches
 from maexp.envs.targets import TargetTracker
 
+ROLLOUT_POLICY = "lookahead.rollout_policy"
 BRANCHES = 256  # teams' branches that are played at once, at most
 
 
@@ -47,7 +50,7 @@ class Rollouts:
         )  # fmt: skip
         self.follower = None
         if config.horizon > 1:
-            self.follower = FrontierPlanner(self.branches.env, CLASSICAL[config.rollout_policy])
+            self.follower = FrontierPlanner(self.branches.env, CLASSICAL.get(config.rollout_policy, rank_by_utility))
             self.branches.attach(self.follower.tracker)
 
     def goals(
@@ -178,7 +181,9 @@ def pick_places(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
 
 def check_rollout_policy(config: LookaheadConfig) -> None:
     """Raise ValueError where the rollout policy is none."""
-    if config.rollout_policy not in CLASSICAL:
+    word = config.rollout_policy
+    if word not in CLASSICAL and not is_exported(word):
         raise ValueError(
-            f"lookahead.rollout_policy={config.rollout_policy!r} is unknown: choose one of {', '.join(CLASSICAL)}"
+            f"{ROLLOUT_POLICY}={word!r} is unknown: choose one of {', '.join(CLASSICAL)}, or a trained policy: "
+            f"{', '.join(shipped_names())}, or a folder that maexp export wrote"
         )
