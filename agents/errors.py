@@ -34,4 +34,12 @@ def describe_disk_error(error: OSError) -> str | None:
     if error.errno not in DISK_ERRORS:
         return None
     where = f" of {error.filename}" if error.filename else ""
-    return f"Writing{where} failed ({error.strerror}): free some space; files that were there before are whole."
+    advice = advise_on_disk(error.errno)
+    return f"Writing{where} failed ({error.strerror}): {advice}; files that were there before are whole."
+
+
+def advise_on_disk(number: int) -> str:
+    """What to do about an error while writing."""
+    if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free some space"
+    return "check that the disk works" if number == errno.EIO else "check that the folder is there and can be written"

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -34,6 +35,11 @@ def short(path: Path) -> str:
     """The path as one would type it here."""
     here = Path.cwd()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+
+
+def command(verb: str, *words: str) -> str:
+    """A command of ours as one types it in a shell, whatever is in the words."""
+    return shlex.join(["maexp", verb, *words])
 
 
 def _without_nan(value: Any) -> Any:

@@ -1,6 +1,5 @@
 """The benchmark: its cells, and one from end to end."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -24,6 +23,7 @@ from maexp.agents.benchmark.plan import (
 )
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
+from maexp.agents.locking import lock
 from maexp.agents.training.logs import read_metrics
 
 # Cells
@@ -155,11 +155,9 @@ def test_other_settings_are_refused_by_name(run_copy, capsys):
 
 
 def test_two_at_once_are_refused(run_copy, capsys):
-    handle = os.open(run_copy, os.O_RDONLY)
-    fcntl.flock(handle, fcntl.LOCK_EX)
-    assert main(["benchmark", f"resume={run_copy}"]) == 2
-    os.close(handle)
-    assert "Another maexp benchmark is running" in capsys.readouterr().err
+    with lock(run_copy, "maexp benchmark"):
+        assert main(["benchmark", f"resume={run_copy}"]) == 2
+    assert f"is in use by maexp benchmark, process {os.getpid()} on " in capsys.readouterr().err
 
 
 BAD = {

@@ -21,6 +21,7 @@ from maexp.agents.benchmark.cell import read_result, write_result
 from maexp.agents.benchmark.plan import Cell, cell_folder
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation import results
 from maexp.agents.evaluation.evidence import Evidence
 from maexp.agents.evaluation.results import FORMAT, write_results
 from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
@@ -133,10 +134,27 @@ def full_disk(size: int):
 
 def test_a_full_disk_keeps_the_old_checkpoint(tmp_path):
     save_checkpoint(tmp_path / "checkpoints", state(1), 1, keep=3)
-    with full_disk(50_000), pytest.raises(UserError, match="iteration_000002.pt could not be written .*resume="):
+    told = "iteration_000002.pt could not be written .*free some space, then go on with maexp train resume=.* are whole"
+    with full_disk(50_000), pytest.raises(UserError, match=told):
         save_checkpoint(tmp_path / "checkpoints", state(2), 2, keep=3)
     assert find_checkpoint(tmp_path)[1]["iteration"] == 1
     assert len(list((tmp_path / "checkpoints").iterdir())) == 1
+
+
+def test_a_disk_that_is_full_at_the_first_checkpoint_speaks_of_no_others(tmp_path):
+    told = r"iteration_000000.pt could not .*: free some space, then start again: there is no checkpoint yet\.$"
+    with full_disk(50_000), pytest.raises(UserError, match=told):
+        save_checkpoint(tmp_path / "checkpoints", state(0), 0, keep=3)
+
+
+def test_a_folder_that_is_gone_is_no_full_disk(tmp_path, monkeypatch):
+    """As where another process has removed what was being written."""
+    save_checkpoint(tmp_path / "my run/checkpoints", state(1), 1, keep=3)
+    monkeypatch.setattr(torch, "save", lambda *_: (_ for _ in ()).throw(FileNotFoundError(2, "No such file")))
+    with pytest.raises(UserError) as told:
+        save_checkpoint(tmp_path / "my run/checkpoints", state(2), 2, keep=3)
+    assert "space" not in str(told.value) and "check that the folder is there" in str(told.value)
+    assert "maexp train 'resume=my run';" in str(told.value)  # as a shell takes it
 
 
 def test_a_full_disk_keeps_the_old_map(tmp_path):
@@ -160,7 +178,7 @@ def test_a_full_disk_during_a_run_is_one_sentence(place, monkeypatch, capsys):
     home, name, size = {
         "checkpoint": (torch, "save", 5_000),
         "metrics": (MetricsLog, "write", 10),
-        "summary": (json, "dumps", 100),
+        "summary": (results, "write_json", 100),
     }[place]
     old, calls = getattr(home, name), []
 

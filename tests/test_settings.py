@@ -1,5 +1,6 @@
 """A run says what it ran: resolved values, how a checkpoint's settings meet new words."""
 
+import shlex
 import warnings
 from dataclasses import asdict
 from pathlib import Path
@@ -214,8 +215,13 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     played = OmegaConf.load("played/config.yaml")
     assert (played.reward.explore, played.robot.max_speed, played.scenario.macro_steps) == (0.0, 1.0, 3)
     torch.save(saved | {"maps": saved["maps"] | {"maze_small_0": "0123"}}, path)  # as if it had been another then
+    assert main(["train", "resume=run", "total_frames=12"]) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "maze_small_0 has changed since the run was started, so that it cannot go on" in told
+    anew = shlex.split(told.partition("has learned: ")[2])
+    assert anew[-1] == "warm_start=run" and main([*anew[1:], "hydra.run.dir=anew", "warm_start_frames=12"]) == 0
+    torch.save(saved, path)
     assert main(["train", "resume=run", "total_frames=12"]) == 0
-    assert "maze_small_0 has changed since the run was started" in capsys.readouterr().err
     assert find_checkpoint("run")[1]["settings"]["reward"]["explore"] == 0.0
     assert find_checkpoint("run")[1]["followers"] == saved["followers"]
 

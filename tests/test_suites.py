@@ -12,6 +12,7 @@ from small_suite import make_small_suite
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.locking import lock
 from maexp.agents.suites import folder, score
 from maexp.agents.suites.frozen import check_maps, read_frozen, sums
 from maexp.agents.suites.play import build_env, build_maps, play_batch
@@ -310,11 +311,9 @@ def test_a_full_disk_is_one_sentence(copy, monkeypatch, capsys):
 
 
 def test_two_runs_cannot_hold_one_folder_and_resume_keeps_what_was_played(copy, capsys):
-    from maexp.agents.benchmark.plan import lock
-
-    with lock(copy):
+    with lock(copy, "maexp suite"):
         assert main(["suite", "run", f"resume={copy}"]) == 2
-    assert "Another maexp suite is running" in capsys.readouterr().err
+    assert "is in use by maexp suite, process " in capsys.readouterr().err
     assert main(["suite", "run", f"resume={copy}", "policy=random"]) == 2
     assert "leave policy out" in capsys.readouterr().err
 

@@ -16,7 +16,6 @@ from maexp.agents.benchmark.plan import (
     cell_config,
     cell_folder,
     find_cell_player,
-    lock,
     training_cell,
     word_names,
 )
@@ -25,7 +24,8 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.comparison import CHOOSING
 from maexp.agents.evaluation.evaluate import evaluate
 from maexp.agents.evaluation.results import FORMAT, describe_run
-from maexp.agents.files import short, write_file, write_json
+from maexp.agents.files import command, short, write_file, write_json
+from maexp.agents.locking import lock
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import resolve
@@ -108,7 +108,7 @@ def train_cell(cfg: BenchmarkSettings, where: Path, cell: Cell) -> dict | None:
     """
     folder = cell_folder(where, cell)
     folder.mkdir(parents=True, exist_ok=True)
-    with lock(folder, wait=True):
+    with lock(folder, "maexp benchmark", wait=True):
         if not (folder / TRAINED).is_file():
             settings, words = cell_config(cfg, cell)
             saved = find_checkpoint(folder)[1] if list_checkpoints(folder / "checkpoints") else None
@@ -215,6 +215,6 @@ def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
             f"{short(folder / suite)}.json and .npz cannot be read ({type(error).__name__}): remove the .json, and "
-            f"maexp benchmark resume={short(where)} plays {cell.name} again."
+            f"{command('benchmark', f'resume={short(where)}')} plays {cell.name} again."
         ) from error
     return CellResult(episodes, seconds, coverage, run, maps)

@@ -1,11 +1,7 @@
 """What a benchmark is made of: cells, the settings of each, the folder they live in and what may change there."""
 
-import fcntl
 import json
 import math
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -332,24 +328,3 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
             "(where a default has changed since, give its old value; NAME=null for what was left open), or start a "
             "benchmark of its own."
         )
-
-
-@contextmanager
-def lock(where: Path, who: str = "maexp benchmark", wait: bool = False) -> Iterator[None]:
-    """Hold the folder; the lock ends with this process, however it ends.
-
-    Args:
-        who: holds it, for the message
-        wait: until a process that is at it has ended
-
-    Raises:
-        UserError: another process is at it.
-    """
-    handle = os.open(where, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        yield
-    except BlockingIOError as error:
-        raise UserError(f"Another {who} is running in {where}: wait for it or stop it.") from error
-    finally:
-        os.close(handle)

@@ -15,7 +15,6 @@ from maexp.agents.benchmark.plan import (
     check_lists,
     check_unchanged,
     list_cells,
-    lock,
     read_plan,
     write_plan,
 )
@@ -24,7 +23,8 @@ from maexp.agents.benchmark.report import SMOKE, Report
 from maexp.agents.build import pick_device
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
-from maexp.agents.files import short
+from maexp.agents.files import command, short
+from maexp.agents.locking import lock
 from maexp.agents.progress import Progress, duration
 from maexp.agents.settings.checks import check_counts, check_steps
 from maexp.agents.settings.overrides import find_override, without
@@ -60,7 +60,8 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
     except UserError as error:
         chosen = find_override(overrides, "hydra.run.dir")
         if chosen and (Path(chosen) / PLAN).is_file():
-            raise UserError(f"{chosen} holds a benchmark already: go on with it by resume={chosen}.") from error
+            again = command("benchmark", f"resume={chosen}")
+            raise UserError(f"{chosen} holds a benchmark already: go on with it by {again}.") from error
         raise
 
 
@@ -76,7 +77,7 @@ def check(cfg: BenchmarkSettings) -> None:
 
 def run(cfg: BenchmarkSettings, where: Path, overrides: list[str]) -> int:
     """Run the cells that are not done, then write the tables and pictures."""
-    with lock(where):
+    with lock(where, "maexp benchmark"):
         return run_locked(cfg, where, overrides)
 
 
@@ -150,7 +151,8 @@ def conclude(report: Report, outcome: Outcome, where: Path, left: int) -> int:
         for cell, reason in outcome.failed.items():
             print(f"{cell.name} failed: {reason}\n  its output: {short(cell_folder(where, cell) / 'log.txt')}")
         if left:
-            print(f"{left} cells are not done. Go on with: maexp benchmark resume={short(where)}", flush=True)
+            again = command("benchmark", f"resume={short(where)}")
+            print(f"{left} cells are not done. Go on with: {again}", flush=True)
     if outcome.interrupted:
         return STOPPED
     return FAILED if outcome.failed else 0

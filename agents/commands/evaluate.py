@@ -22,7 +22,8 @@ from maexp.agents.evaluation.comparison import choose_best, describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
-from maexp.agents.files import short, write_json
+from maexp.agents.files import command, short, write_json
+from maexp.agents.locking import lock
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
@@ -62,6 +63,12 @@ def check(cfg: EvaluateSettings) -> None:
 
 def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
+    with lock(where, "maexp evaluate"):
+        return run_locked(cfg, where, overrides)
+
+
+def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
+    """The same, while no one else is at the folder."""
     with blame_input():
         baseline = None if cfg.baseline is None else load_baseline(cfg.baseline)
         suite = load_maps(cfg.scenario, train=False)
@@ -97,7 +104,7 @@ def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         written += [film.name for film in films] + [f"{EPISODES}/"]
     print(f"Written to {short(where)}: {', '.join(written)}")
     if cfg.render:
-        print(f"Next: maexp view {short(where)} browser=true")
+        print(f"Next: {command('view', short(where), 'browser=true')}")
     return 0
 
 

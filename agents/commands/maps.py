@@ -8,7 +8,7 @@ from typing import Any
 from maexp.agents.commands.maps_folder import find_files
 from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import write_text
+from maexp.agents.files import command, write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
@@ -95,8 +95,8 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
     write_text(where / "report.txt", told + "\n")
     print(f"Written: {', '.join(str(one) for one in written)}")
     if report.ok and cfg.task in ("make", "import"):
-        size = "" if cfg.robot.radius is None else f" robot.radius={cfg.robot.radius:g}"
-        print(f"Next: maexp train scenario=pointcloud scenario.path={written[0]}{size}")
+        size = [] if cfg.robot.radius is None else [f"robot.radius={cfg.robot.radius:g}"]
+        print(f"Next: {command('train', 'scenario=pointcloud', f'scenario.path={written[0]}', *size)}")
     return 0 if report.ok else UNUSABLE
 
 

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import short, write_text
+from maexp.agents.files import command, short, write_text
+from maexp.agents.locking import lock
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
@@ -86,7 +87,6 @@ def _show(cfg: SuiteSettings, where: None) -> int:
 
 
 def _run(cfg: SuiteSettings, where: Path) -> int:
-    from maexp.agents.benchmark.plan import lock
     from maexp.agents.build import pick_device
     from maexp.agents.suites import folder as files
     from maexp.agents.suites import report
@@ -116,14 +116,15 @@ def _run(cfg: SuiteSettings, where: Path) -> int:
                 )
                 results = playing.play()
         except KeyboardInterrupt:
-            print(f"maexp: stopped. Go on with: maexp suite run resume={short(where)}", file=sys.stderr)
+            again = command("suite", "run", f"resume={short(where)}")
+            print(f"maexp: stopped. Go on with: {again}", file=sys.stderr)
             return STOPPED
         report.print_table(suite, results)
         for sentence in report.describe_results(suite, results):
             print(sentence)
         report.draw_profiles(suite, results, where / "profile.png")
     print(f"Written to {short(where)}: {files.RESULTS}, {files.ACTIONS}/, profile.png, {files.RUN}")
-    print(f"Next: maexp suite verify {short(where)}")
+    print(f"Next: {command('suite', 'verify', short(where))}")
     return 0
 
 

@@ -8,7 +8,8 @@ from maexp.agents.build import choose_device, make_env, model_settings
 from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
-from maexp.agents.files import short
+from maexp.agents.files import command, short
+from maexp.agents.locking import lock
 from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -83,6 +84,12 @@ def find_others(cfg: TrainSettings) -> list[Player]:
 
 def run(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
     """Train, evaluate, draw; says where everything is."""
+    with lock(where, "maexp train"):
+        return run_locked(cfg, where, overrides)
+
+
+def run_locked(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
+    """The same, while no one else is at the folder."""
     saved = _resumable(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(training.settings, where, "train", overrides, map_checksums=training.checksums)
@@ -92,10 +99,19 @@ def run(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
         warm_start(training)
     train(training)
     if training.stopped:
-        print(f"Stopped after {training.frames:,} macro steps. Go on with: maexp train resume={short(where)}")
+        print(f"Stopped after {training.frames:,} macro steps. Go on with: {go_on(where)}")
         return STOPPED
-    finish(training)
+    try:
+        finish(training)
+    except KeyboardInterrupt:
+        print(f"The training is done, its evaluation was stopped. Finish it with: {go_on(where)}")
+        return STOPPED
     return 0
+
+
+def go_on(where: Path) -> str:
+    """The command that goes on with a run."""
+    return command("train", f"resume={short(where)}")
 
 
 def _list(sizes: list[int]) -> str:
@@ -131,7 +147,8 @@ def finish(done: TrainingRun) -> None:
     draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
     written.append("rollout.gif")
     print(f"Written to {short(where)}: {', '.join(written)}")
-    print(f"Next: maexp evaluate checkpoint={short(where)} num_robots=1,2,6,8, or maexp view {short(where)}")
+    evaluate = command("evaluate", f"checkpoint={short(where)}", "num_robots=1,2,6,8")
+    print(f"Next: {evaluate}, or {command('view', short(where))}")
 
 
 def trained_player(done: TrainingRun) -> Player:

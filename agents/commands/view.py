@@ -12,7 +12,7 @@ from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.films import EPISODES, MOST_TEAMS, play_teams
-from maexp.agents.files import short
+from maexp.agents.files import command, short
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -245,7 +245,7 @@ def show_scene(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap 
     show.write_picture(picture, out, snapshot)
     print(f"Written: {short(out.absolute())} ({how})")
     if episodes:
-        print(f"Next: maexp view {' '.join(see_again(cfg, where))} browser=true")
+        print(f"Next: {command('view', *see_again(cfg, where), 'browser=true')}")
     return 0
 
 

@@ -1,5 +1,6 @@
 """Checkpoints: written whole or not at all, the newest few and the best kept, loaded without unpickling."""
 
+import errno
 import os
 import random
 import re
@@ -12,8 +13,8 @@ import numpy as np
 import torch
 from torchrl.modules import ProbabilisticActor
 
-from maexp.agents.errors import UserError
-from maexp.agents.files import write_file
+from maexp.agents.errors import UserError, advise_on_disk
+from maexp.agents.files import command, short, write_file
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.settings.model import SIZES, ModelConfig
@@ -53,10 +54,13 @@ def _write_atomically(path: Path, state: dict) -> None:
         write_file(path, lambda file: torch.save(state, file))
     except (OSError, RuntimeError) as error:  # torch raises the latter when a write fails
         reason = getattr(error, "strerror", None) or "the disk is full or the file too large"
-        raise UserError(
-            f"The checkpoint {path} could not be written ({reason}): the ones before are whole; free some space and go "
-            f"on with maexp train resume={path.parent.parent}."
-        ) from error
+        advice = advise_on_disk(getattr(error, "errno", None) or errno.ENOSPC)
+        if list_checkpoints(path.parent):
+            again = command("train", f"resume={short(path.parent.parent)}")
+            after = f"go on with {again}; the checkpoints before this one are whole"
+        else:
+            after = "start again: there is no checkpoint yet"
+        raise UserError(f"The checkpoint {path} could not be written ({reason}): {advice}, then {after}.") from error
 
 
 def list_checkpoints(folder: Path) -> list[Path]:

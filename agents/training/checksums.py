@@ -19,14 +19,15 @@ def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
     return {one.name: checksum(one) for one in maps}
 
 
-def warn_of_changed_maps(saved: dict, maps: list[PointCloudMap]) -> None:
-    """Say which of `maps` are not what they were when the checkpoint `saved` was written."""
+def changed_maps(saved: dict, maps: list[PointCloudMap]) -> str:
+    """Which of `maps` are not what they were when the checkpoint `saved` was written: "a and b have", "" for none."""
     before = saved["maps"]
     changed = [name for name, one in checksums(maps).items() if before.get(name, one) != one]
-    if changed:
-        more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-        verb = "has" if len(changed) == 1 else "have"
-        warnings.warn(
-            f"{', '.join(changed[:3])}{more} {verb} changed since the run was started: its results are of other maps",
-            stacklevel=2,
-        )
+    more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+    return f"{', '.join(changed[:3])}{more} {'has' if len(changed) == 1 else 'have'}" if changed else ""
+
+
+def warn_of_changed_maps(saved: dict, maps: list[PointCloudMap]) -> None:
+    """Warn of those."""
+    if changed := changed_maps(saved, maps):
+        warnings.warn(f"{changed} changed since the run was started: its results are of other maps", stacklevel=2)

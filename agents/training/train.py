@@ -26,13 +26,14 @@ from maexp.agents.build import (
 )
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.evidence import brackets
-from maexp.agents.files import write_text
+from maexp.agents.files import command, short, write_text
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
 from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.overrides import without
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.schema import TrainSettings
@@ -43,7 +44,7 @@ from maexp.agents.training.checkpoint import (
     seed_everything,
     set_random_state,
 )
-from maexp.agents.training.checksums import checksums, warn_of_changed_maps
+from maexp.agents.training.checksums import changed_maps, checksums
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
 from maexp.agents.training.validation import COLUMNS, ENDS, Validation
@@ -203,7 +204,7 @@ class TrainingRun:
     def restore(self, saved: dict) -> None:
         """Go on where `save` was called."""
         check_action(saved, self.cfg)
-        warn_of_changed_maps(saved, self.suite.train)
+        self.check_maps(saved)
         load_matching(self.learner.policy, saved["policy"])
         self.learner.updater.load_state_dict(saved["updater"])
         self.restore_experience(saved)
@@ -220,6 +221,16 @@ class TrainingRun:
         alike = all(saved["settings"].get(name) == self.settings.get(name) for name in names)
         if alike and saved["maps"] == self.checksums:
             self.validation.load_state_dict(saved.get("validation", {}))
+
+    def check_maps(self, saved: dict) -> None:
+        """Raise UserError where a map of the training is not what it was: what is known of it fits no more."""
+        if changed := changed_maps(saved, self.suite.train):
+            words = without(self.overrides, "warm_start", "resume")
+            anew = command("train", *words, f"warm_start={short(self.folder)}")
+            raise UserError(
+                f"{changed} changed since the run was started, so that it cannot go on: put back what was there, or "
+                f"begin a new run with what it has learned: {anew}"
+            )
 
     def restore_experience(self, saved: dict) -> None:
         """Go on with the episodes of `saved`, or with new ones where other workers ran them."""
