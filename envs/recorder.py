@@ -45,6 +45,14 @@ class CoverageRecorder:
         batch["coverage"].append((state["covered"] / totals[state["map_id"].long()]).cpu().numpy())
         batch["explored"] = state["unscaled"][:, :, 0].cpu().numpy().copy()
 
+    def batch(self) -> dict[str, np.ndarray]:
+        """What was recorded of the last batch of episodes, to keep and `add`."""
+        return {name: np.array(values) for name, values in self._batches[-1].items()}
+
+    def add(self, batch: dict[str, np.ndarray]) -> None:
+        """Take over a batch that was recorded before, in place of playing it."""
+        self._batches.append(batch)
+
     def curves(self, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Times [s], shape (records,), and coverage (episodes, records) of the first ``episodes`` episodes.
 

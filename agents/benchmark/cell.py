@@ -1,6 +1,7 @@
 """One cell of a benchmark: train where there is something to train, play the episodes, keep all their numbers."""
 
 import json
+import shutil
 import time
 import zipfile
 import zlib
@@ -22,7 +23,8 @@ from maexp.agents.benchmark.plan import (
 from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.comparison import CHOOSING
-from maexp.agents.evaluation.evaluate import evaluate
+from maexp.agents.evaluation.evaluate import evaluate_recorded
+from maexp.agents.evaluation.kept import FOLDER, Kept, identify
 from maexp.agents.evaluation.results import FORMAT, describe_run
 from maexp.agents.files import command, short, write_file, write_json
 from maexp.agents.locking import lock
@@ -34,9 +36,7 @@ from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.training.named import Player, suit_observation
 from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config
-from maexp.envs.recorder import CoverageRecorder
 
-RECORD_EVERY = 10  # local steps between two points of a coverage curve
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
 CURVE = ("curve_seconds", "curve_coverage")
 TRAINED = "training.json"
@@ -148,12 +148,13 @@ def play_suite(
         policy = restore_policy(env, model_settings(settings), team) if player is None else player.make(env)
         if suite != VALIDATION and not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
             write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
+    source = "" if player is None else player.source
+    kept = Kept(folder / FOLDER / suite, identify(settings, env, episodes, policy, cell.policy, source))
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:
-        with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
-            result = evaluate(policy, env, episodes, name=cell.policy, seed=cell.seed, advance=progress.advance)
-    seconds, coverage = recorder.curves(episodes)
-    arrays = dict(zip(CURVE, (seconds, coverage.astype(np.float32)), strict=True)) | result.episodes
+        how = {"name": cell.policy, "seed": cell.seed, "advance": progress.advance, "kept": kept}
+        result = evaluate_recorded(policy, env, episodes, **how)
+    arrays = dict(zip(CURVE, (result.times, result.coverage.astype(np.float32)), strict=True)) | result.episodes
     arrays["maps"] = result.maps
     described = describe_run(settings, maps, time.perf_counter() - begin)
     described |= {} if team is None else {"training_seconds": team["training_seconds"]}
@@ -163,6 +164,7 @@ def play_suite(
     described |= {"num_robots": env.num_robots, "device": str(env.device)}
     described |= {"limit": env.local_steps * env.macro_steps}
     write_result(folder, suite, arrays, {cell.policy: result.summary(), "run": described})
+    shutil.rmtree(folder / FOLDER)
 
 
 def show_what_it_looks_at(settings: TrainSettings, player: Player, maps: list) -> None:

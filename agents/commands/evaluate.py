@@ -1,5 +1,7 @@
 """`maexp evaluate`: held-out episodes with a trained team or classical policies, for one team size or several."""
 
+import copy
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +11,7 @@ from typing import Any
 import torch
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
+from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.baseline import (
     CHANGES_FILE,
@@ -18,9 +21,11 @@ from maexp.agents.evaluation.baseline import (
     load_baseline,
     write_episodes,
 )
+from maexp.agents.evaluation.begun import begin, continue_evaluation, is_begun
 from maexp.agents.evaluation.comparison import choose_best, describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
+from maexp.agents.evaluation.kept import FOLDER, Kept, identify
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
 from maexp.agents.files import command, short, write_json
 from maexp.agents.locking import lock
@@ -36,10 +41,14 @@ from maexp.agents.training.train import write_config
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 PICTURES = 4
+STOPPED = 130
 
 
 def prepare(overrides: list[str]) -> Recipe:
-    """For checkpoint=RUN: the run's settings as far as they matter here, then the new ones."""
+    """For checkpoint=RUN: the run's settings as far as they matter here, then the new ones. For resume=FOLDER: those of
+    an evaluation that was stopped."""
+    if find_override(overrides, "resume") is not None:
+        return continue_evaluation(find_override(overrides, "resume"), overrides)
     place = find_override(overrides, "checkpoint")
     if place is None and find_override(overrides, "policy") is None:
         raise UserError("Nothing to evaluate: give checkpoint=RUN, policy=nearest_frontier, or both.")
@@ -49,8 +58,12 @@ def prepare(overrides: list[str]) -> Recipe:
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
-    """Every evaluation has a new folder of its own."""
-    return claim()
+    """Every evaluation has a new folder of its own; one that goes on stays in its."""
+    place = find_override(overrides, "resume")
+    if place is None:
+        return claim()
+    check_writable(Path(place).absolute())
+    return Path(place).absolute()
 
 
 def check(cfg: EvaluateSettings) -> None:
@@ -64,11 +77,18 @@ def check(cfg: EvaluateSettings) -> None:
 def run(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     """Evaluate, print the table, write results.json, a picture and the films that are asked for."""
     with lock(where, "maexp evaluate"):
-        return run_locked(cfg, where, overrides)
+        try:
+            return run_locked(cfg, where, overrides)
+        except KeyboardInterrupt:
+            if not is_begun(where):
+                raise
+            print(f"Stopped. Go on with: {command('evaluate', f'resume={short(where)}')}")
+            return STOPPED
 
 
 def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     """The same, while no one else is at the folder."""
+    asked = copy.deepcopy(cfg)
     with blame_input():
         baseline = None if cfg.baseline is None else load_baseline(cfg.baseline)
         suite = load_maps(cfg.scenario, train=False)
@@ -92,7 +112,8 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         if any(one.learned for one in players):
             best = {size: choose_best(cfg, suite, names, size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
-    results = [one for team in envs for one in evaluate_places(cfg, team, players)]
+    begin(where, asked, overrides)
+    results = [one for team in envs for one in evaluate_places(cfg, team, players, where / FOLDER)]
     report(cfg, results, suite, best, where / "results.json", steps=steps)
     write_episodes(where / EPISODES_FILE, results)
     draw_ends(cfg, maps, players[0], where / "picture.png")
@@ -102,6 +123,7 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     if cfg.render:
         films = [film for team in envs for film in film_all(cfg, team[0], maps, players, where)]
         written += [film.name for film in films] + [f"{EPISODES}/"]
+    shutil.rmtree(where / FOLDER)
     print(f"Written to {short(where)}: {', '.join(written)}")
     if cfg.render:
         print(f"Next: {command('view', short(where), 'browser=true')}")
@@ -118,20 +140,25 @@ def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> Playe
     return Player("trained", lambda env: restore_policy(env, model, saved), **kind)
 
 
-def evaluate_all(cfg: EpisodeSettings, env: ExplorationEnv, players: list[Player]) -> list[EvaluationResult]:
-    """Each policy on the same episodes."""
+def evaluate_all(
+    cfg: EpisodeSettings, env: ExplorationEnv, players: list[Player], where: Path
+) -> list[EvaluationResult]:
+    """Each policy on the same episodes; those that were played before are taken from `where`, and more left there."""
     results = []
     for player in players:
+        policy = player.make(env)
+        identity = identify(cfg, env, cfg.episodes, policy, player.name, player.source)
+        kept = Kept(where / f"{player.name}_N{env.num_robots}", identity)
         with Progress(f"{player.name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
-            settings = {"name": player.name, "seed": cfg.seed, "advance": progress.advance}
-            played = evaluate_recorded(player.make(env), env, cfg.episodes, **settings)
+            settings = {"name": player.name, "seed": cfg.seed, "advance": progress.advance, "kept": kept}
+            played = evaluate_recorded(policy, env, cfg.episodes, **settings)
             results.append(replace(played, learned=player.learned))
     return results
 
 
-def evaluate_places(cfg: EvaluateSettings, envs: list, players: list[Player]) -> list[EvaluationResult]:
+def evaluate_places(cfg: EvaluateSettings, envs: list, players: list[Player], where: Path) -> list[EvaluationResult]:
     """Each policy on the same episodes in each of several places, and in all of them together."""
-    parts = [evaluate_all(cfg, env, players) for env in envs]
+    parts = [evaluate_all(cfg, env, players, where / str(number)) for number, env in enumerate(envs)]
     if len(envs) == 1:
         return parts[0]
     results = [pool(list(those)) for those in zip(*parts, strict=True)]

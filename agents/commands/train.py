@@ -1,6 +1,7 @@
 """`maexp train`: settings, a new or a resumed run, then the evaluation and the pictures."""
 
 import copy
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from maexp.agents.build import choose_device, make_env, model_settings
 from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.kept import FOLDER
 from maexp.agents.files import command, short
 from maexp.agents.locking import lock
 from maexp.agents.settings.checks import check_counts, team_sizes, words_of
@@ -139,13 +141,15 @@ def finish(done: TrainingRun) -> None:
         others = find_others(cfg)
         best = done.validation.best
         shown = copy.deepcopy(cfg)
-        suit_observation(shown, [trained_player(done), *others])
+        players = [trained_player(done), *others]
+        suit_observation(shown, players)
         envs = (make_env(shown, done.suite.held_out, size, device=device) for size in done.sizes)
-        results = [one for env in envs for one in evaluate_all(cfg, env, [trained_player(done), *others])]
+        results = [one for env in envs for one in evaluate_all(cfg, env, players, where / FOLDER)]
         report(cfg, results, done.suite, best, where / "summary.json", training_seconds=round(done.seconds, 2))
         written += ["summary.json", *draw_results(results, where)]
     draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
     written.append("rollout.gif")
+    shutil.rmtree(where / FOLDER, ignore_errors=True)
     print(f"Written to {short(where)}: {', '.join(written)}")
     evaluate = command("evaluate", f"checkpoint={short(where)}", "num_robots=1,2,6,8")
     print(f"Next: {evaluate}, or {command('view', short(where))}")

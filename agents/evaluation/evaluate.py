@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.evaluation.evidence import Evidence
+from maexp.agents.evaluation.kept import Kept, go_on_with_random_numbers, random_numbers
 from maexp.envs.metrics import episode_metrics, label_copies, resample_weights, summarise
 from maexp.envs.recorder import CoverageRecorder
 
@@ -98,7 +99,7 @@ def pool(parts: list[EvaluationResult]) -> EvaluationResult:
 def evaluate_recorded(policy: Callable, env, episodes: int, **settings) -> EvaluationResult:
     """`evaluate`, with the coverage over time and the share of each robot."""
     with CoverageRecorder(env, every=min(RECORD_EVERY, env.local_steps)) as recorder:
-        result = evaluate(policy, env, episodes, **settings)
+        result = evaluate(policy, env, episodes, recorder=recorder, **settings)
     times, coverage = recorder.curves(episodes)
     return replace(result, times=times, coverage=coverage, shares=recorder.contributions(episodes))
 
@@ -112,11 +113,19 @@ def evaluate(
     name: str = "trained",
     seed: int = 0,
     advance: Callable[[int], None] = lambda count: None,
+    recorder: CoverageRecorder | None = None,
+    kept: Kept | None = None,
 ) -> EvaluationResult:
     """Play episodes 0 .. `episodes` - 1, each to its end, `env.num_envs` at once.
 
     Torch's random numbers are the same in every call with the same seed, and go on afterwards as if nothing
-    had happened. `advance(count)` is called as episodes end.
+    had happened.
+
+    Args:
+        advance: called with a count as episodes end
+        recorder: of the env, if there is one
+        kept: batches that were played before are taken from there, and the others left there; the result has the same
+            bits, unless the policy draws from other random numbers than torch's or remembers earlier episodes
     """
     begin = time.perf_counter()
     finals, maps = [], []
@@ -124,14 +133,40 @@ def evaluate(
     with torch.random.fork_rng(devices):
         torch.manual_seed(seed)
         for first in range(0, episodes, env.num_envs):
-            numbers = torch.arange(first, first + env.num_envs, device=env.device)
+            numbers = torch.arange(first, first + env.num_envs, device=env.device).clamp(max=episodes - 1)
             count = min(env.num_envs, episodes - first)
-            finals.append(play(policy, env, numbers.clamp(max=episodes - 1))[:count])
-            maps += [env.maps[index].name for index in env.simulation.tensors["map_id"][:count].tolist()]
+            final, map_id = _play_or_read(policy, env, numbers, recorder, kept)
+            finals.append(final[:count])
+            maps += [env.maps[index].name for index in map_id[:count]]
             advance(count)
     metrics = episode_metrics(torch.cat(finals), env.local_steps * env.macro_steps, env.success_coverage)
     seconds, goal = time.perf_counter() - begin, env.success_coverage
     return EvaluationResult(name, env.num_robots, metrics, seconds, np.array(maps), success_coverage=goal)
+
+
+def _play_or_read(
+    policy: Callable, env, numbers: torch.Tensor, recorder: CoverageRecorder | None, kept: Kept | None
+) -> tuple[TensorDict, list[int]]:
+    """The last step's info of a batch of episodes and the numbers of their maps, from `kept` where it is there."""
+    first = int(numbers[0])
+    arrays = None if kept is None else kept.read(first)
+    if arrays is None:
+        final = play(policy, env, numbers)
+        map_id = env.simulation.tensors["map_id"].cpu().numpy()
+        if kept is not None:
+            arrays = {f"info_{name}": value.cpu().numpy() for name, value in final.items()} | {"map_id": map_id}
+            arrays |= {f"recorded_{name}": one for name, one in (recorder.batch() if recorder else {}).items()}
+            kept.write(first, arrays | random_numbers(env.device))
+        return final, map_id.tolist()
+    go_on_with_random_numbers(arrays, env.device)
+    if recorder is not None:
+        recorder.add(_part(arrays, "recorded_"))
+    info = {name: torch.from_numpy(one).to(env.device) for name, one in _part(arrays, "info_").items()}
+    return TensorDict(info, batch_size=numbers.shape), arrays["map_id"].tolist()
+
+
+def _part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): one for name, one in arrays.items() if name.startswith(prefix)}
 
 
 @torch.no_grad()

@@ -109,9 +109,14 @@ def quote_policies(value: str, absolute: bool) -> str:
     words = value.removeprefix("[").removesuffix("]").split(",") if listed else [value]
     words = [word.strip() for word in words]
     if absolute:  # a name of ours is one even where a folder is called the same
-        words = [str(Path(word).absolute()) if os.sep in word and os.path.exists(word) else word for word in words]
+        words = [from_root(word) for word in words]
     quoted = [quote(word) if not re.fullmatch(r"[A-Za-z_][\w.]*", word) else word for word in words]
     return f"[{','.join(quoted)}]" if listed else quoted[0]
+
+
+def from_root(word: str) -> str:
+    """The word for a policy, a folder as such from the root."""
+    return str(Path(word).absolute()) if os.sep in word and os.path.exists(word) else word
 
 
 def split_paths(text: str) -> list[str]:
@@ -142,6 +147,11 @@ def find_override(overrides: list[str], name: str) -> str | None:
     parsed = OverridesParser.create().parse_overrides(overrides)
     values = [one.value() for one in parsed if one.key_or_group == name and not one.is_delete()]
     return None if not values or values[-1] is None else str(values[-1])
+
+
+def set_names(overrides: list[str]) -> list[str]:
+    """Full names of the settings and groups that the words set."""
+    return [one.key_or_group for one in OverridesParser.create().parse_overrides(overrides)]
 
 
 def without(overrides: list[str], *names: str) -> list[str]:

@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-
 from maexp.agents.errors import UserError
-from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.overrides import find_override, set_names, without
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import schema
 
@@ -69,7 +67,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     chosen = _chosen_anew(values, new)
     leave_out += ("preset", "tuning") * (verb != "train")
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
-    left_out += HELD_OUT if {*HELD_OUT} & {*_names(new)} else ()
+    left_out += HELD_OUT if {*HELD_OUT} & {*set_names(new)} else ()
     kept, defaults = without(saved["overrides"], *left_out), []
     followed = "planner.clearance_factor" in saved["followers"] and values["planner.name"] == "dwa"
     if followed and "planner" not in chosen:  # the paper's DWA: of a new scenario, too, that scenario's clearance
@@ -85,24 +83,19 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     return Recipe([*kept, *new], defaults, held, str(path))
 
 
-def _names(words: list[str]) -> list[str]:
-    """Full names of what the words set."""
-    return [one.key_or_group for one in OverridesParser.create().parse_overrides(words)]
-
-
 def _is_set(name: str, words: list[str]) -> bool:
-    return any(name == one or name.startswith(f"{one}.") for one in _names(words) if one not in GROUPS)
+    return any(name == one or name.startswith(f"{one}.") for one in set_names(words) if one not in GROUPS)
 
 
 def _chosen_anew(values: dict[str, Any], new: list[str]) -> list[str]:
     """The groups that the new words choose; a scenario or planner that the run had already is no new choice."""
     had = {name: values.get(f"{name}.name") for name in ("scenario", "planner")}
-    return [one for one in _names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
+    return [one for one in set_names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
 
 
 def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str], verb: str) -> list[str]:
     """The run's values that followed what the new words change."""
-    followers, names = saved["followers"], _names(new)
+    followers, names = saved["followers"], set_names(new)
     place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers

@@ -212,6 +212,7 @@ class EvaluateSettings(LearnerSettings):
     num_robots: Any = setting(3, "robots in a team; several as num_robots=1,2,6,8")
     policy: Any = setting(None, f"{', '.join(NAMES)}, {OTHERS}; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
+    resume: str | None = setting(None, "folder of an evaluation to go on with (its settings are kept)")
     episodes: int = setting(256, "episodes of each policy and team size")
     baseline: str | None = setting(None, "an earlier evaluation of the same episodes, to compare with: its folder")
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")

@@ -1,0 +1,100 @@
+"""Episodes that were played, batch by batch: an evaluation that was stopped goes on with the first that is missing."""
+
+import hashlib
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from maexp.agents.files import write_file
+from maexp.agents.settings.resolved import resolve
+from maexp.agents.settings.runs import PLAYED
+from maexp.agents.settings.schema import CommonSettings
+from maexp.agents.training.checksums import checksums
+from maexp.agents.versions import find_commit
+from maexp.envs import ExplorationEnv
+from maexp.envs.map import MapError, read_npz
+
+FOLDER = "batches"
+"""Of a run; gone when its results are written."""
+
+
+class Kept:
+    """The batches of one policy in one env.
+
+    Args:
+        folder: their own
+        identity: what their bits follow from (`identify`); those of another are removed, with a warning
+    """
+
+    def __init__(self, folder: Path, identity: dict[str, Any]):
+        digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        self.folder = folder / digest
+        for other in folder.glob("*"):
+            if other != self.folder:
+                told = f"what {folder.name} was played with has changed since: its episodes are played again"
+                warnings.warn(told, stacklevel=2)
+                shutil.rmtree(other)
+
+    def read(self, first: int) -> dict[str, np.ndarray] | None:
+        """The batch that begins with an episode; None where it is missing or damaged."""
+        try:
+            return read_npz(self._file(first)) if self._file(first).is_file() else None
+        except MapError:
+            return None
+
+    def write(self, first: int, arrays: dict[str, np.ndarray]) -> None:
+        """Keep a batch; it is whole or not there, wherever this process ends."""
+        write_file(self._file(first), lambda file: np.savez(file, **arrays))
+
+    def _file(self, first: int) -> Path:
+        return self.folder / f"{first:06d}.npz"
+
+
+def identify(
+    cfg: CommonSettings, env: ExplorationEnv, episodes: int, policy: Callable, name: str, source: str = ""
+) -> dict[str, Any]:
+    """What the bits of a policy's episodes follow from.
+
+    Args:
+        cfg: the settings of the env
+        policy: as it plays; name, source: what it is called, and text that changes with it
+    """
+    settings = resolve(cfg, env.maps)
+    return {
+        "settings": {one: settings[one] for one in PLAYED if one in settings and one != "num_threads"},
+        "maps": checksums(env.maps),
+        "teams": [env.num_envs, env.num_robots, str(env.device)],
+        "episodes": episodes,
+        "policy": [name, source, digest_weights(policy)],
+        "code": [metadata.version("maexp"), find_commit()],
+    }
+
+
+def digest_weights(policy: Callable) -> str:
+    """Changes with the weights of a network; "" for what has none."""
+    digest = hashlib.sha256()
+    weights = policy.state_dict() if isinstance(policy, torch.nn.Module) else {}
+    for name, one in weights.items():
+        digest.update(name.encode() + (one.cpu().numpy().tobytes() if torch.is_tensor(one) else repr(one).encode()))
+    return digest.hexdigest()[:16] if weights else ""
+
+
+def random_numbers(device: torch.device) -> dict[str, np.ndarray]:
+    """Where torch's random numbers are."""
+    found = {"cpu": torch.get_rng_state()}
+    found |= {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {}
+    return {f"random_{name}": state.numpy() for name, state in found.items()}
+
+
+def go_on_with_random_numbers(arrays: dict[str, np.ndarray], device: torch.device) -> None:
+    """Go on from `random_numbers`."""
+    torch.set_rng_state(torch.from_numpy(arrays["random_cpu"]))
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(torch.from_numpy(arrays["random_cuda"]), device)
