@@ -1,5 +1,6 @@
 """`maexp train -m`: every combination of the listed values, through Hydra's sweeper and launchers."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -14,29 +15,72 @@ from omegaconf.errors import OmegaConfBaseException
 from maexp.agents.commands import train
 from maexp.agents.commands.run_folder import claim_folder
 from maexp.agents.errors import UserError
+from maexp.agents.files import command, short, write_json
+from maexp.agents.locking import lock
 from maexp.agents.settings.checks import check_seed
-from maexp.agents.settings.compose import compose_config, explain
-from maexp.agents.settings.overrides import find_override, without
+from maexp.agents.settings.compose import compose_config, compose_recipe, explain
+from maexp.agents.settings.overrides import find_override, quote, set_names, without
+from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.schema import TrainSettings, register_schema
+from maexp.agents.training.checkpoint import list_checkpoints
+
+SWEEP, FORMAT = "sweep.json", "maexp-sweep-1"
+DONE = "done"
+"""In the folder of a run that has come to its end."""
+STOPPED = 130
 
 
 def run_sweep(verb: str, overrides: list[str]) -> int:
-    """Run all jobs, each in its own folder under one new folder; a job that fails ends the sweep after its batch."""
-    if find_override(overrides, "resume") is not None:
-        raise UserError("resume continues one run: leave out -m.")
+    """Run all jobs, each in its own folder under one new folder, or those that `resume` finds undone in an old one; a
+    job that fails ends the sweep after its batch."""
+    place = find_override(overrides, "resume")
+    if place is not None:
+        folder, words = Path(place).expanduser().absolute(), read_words(place, overrides)
+    else:
+        chosen = find_override(overrides, "hydra.sweep.dir")
+        folder = claim_folder(chosen or _default_folder(verb), chosen is not None)
+        words = without(overrides, "hydra.sweep.dir")
+    with lock(folder, f"maexp {verb} -m"):
+        write_json(folder / SWEEP, {"format": FORMAT, "words": words})
+        try:
+            _run_jobs(verb, [*words, f"hydra.sweep.dir={quote(str(folder))}"])
+        except (KeyboardInterrupt, UserError) as error:
+            again = command(verb, "-m", f"resume={short(folder)}")
+            print(f"Runs that are done stay. Go on with: {again}", file=sys.stderr)
+            if isinstance(error, UserError):
+                raise
+            return STOPPED
+        combine_curves(folder)
+    print(f"All runs are in {folder}, their curves together in curves.png")
+    return 0
+
+
+def read_words(place: str, overrides: list[str]) -> list[str]:
+    """The words of the sweep in a folder.
+
+    Raises:
+        UserError: there is none, or something else is set beside it.
+    """
+    if others := [name for name in set_names(overrides) if name != "resume"]:
+        raise UserError(f"resume={place} with -m keeps all settings of a sweep: leave {others[0]} out.")
+    try:
+        content = json.loads((Path(place).expanduser() / SWEEP).read_text())
+        if content["format"] != FORMAT:
+            raise ValueError(content["format"])
+        return [str(word) for word in content["words"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        told = f"resume={place} with -m: there is no {SWEEP} of a sweep that could be read ({type(error).__name__})"
+        raise UserError(f"{told}. For a single run leave out -m.") from error
+
+
+def _run_jobs(verb: str, words: list[str]) -> None:
     register_schema(verb)
-    chosen = find_override(overrides, "hydra.sweep.dir")
-    folder = claim_folder(chosen or _default_folder(verb), chosen is not None)
-    words = [*without(overrides, "hydra.sweep.dir"), f"hydra.sweep.dir='{folder}'"]
     job = hydra.main(version_base="1.3", config_path="pkg://maexp.conf", config_name=verb)(_run_job)
     with mock.patch.object(sys, "argv", [f"maexp {verb}", "-m", *words]), _raise_errors():
         try:
             job()
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(explain(error, verb)) from error
-    combine_curves(folder)
-    print(f"All runs are in {folder}, their curves together in curves.png")
-    return 0
 
 
 def combine_curves(folder: Path) -> None:
@@ -63,11 +107,19 @@ def _default_folder(verb: str) -> str:
 
 
 def _run_job(cfg: TrainSettings) -> None:
+    """Train from the start, go on with what was stopped, or pass over what is done."""
     settings = HydraConfig.get()
-    overrides = list(settings.overrides.task)
-    print(f"Run {settings.job.num}: {' '.join(overrides)}")
+    overrides, where = list(settings.overrides.task), Path(settings.runtime.output_dir)
+    title = f"Run {settings.job.num}: {' '.join(overrides)}"
+    if (where / DONE).is_file():
+        print(f"{title} (done before)")
+        return
+    print(title)
+    if list_checkpoints(where / "checkpoints"):
+        recipe = train.prepare([f"resume={quote(str(where))}"])
+        cfg, overrides = without_hydra(compose_recipe("train", recipe)), without(recipe.words, "hydra", "resume")
     check_seed(cfg.seed)  # Hydra composed these settings, not compose_config
     train.check(cfg)
-    status = train.run(cfg, Path(settings.runtime.output_dir), overrides)
-    if status:
+    if train.run(cfg, where, overrides):
         raise KeyboardInterrupt
+    (where / DONE).touch()
