@@ -4,6 +4,7 @@ import importlib.util
 import re
 import shlex
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from small_suite import make_small_suite
 from worlds import room
 
 from maexp.agents.cli import VERBS, main
+from maexp.agents.files import write_json
+from maexp.agents.progress import Progress
 from maexp.envs.importing.export import export_ros_map
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
@@ -56,7 +59,7 @@ ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
 WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
 NOT_OURS = (
     "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.", "MAEXP_",
-    "python -m maexp.agents.runtime",
+    "python -m maexp.agents.runtime", "python -m build",
 )  # fmt: skip
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""
 
@@ -100,6 +103,8 @@ def small(line: str) -> list[str]:
         line = line.replace("FOLDER", "outputs/mine")
         given = "verify" not in line or "suite=" in line
         return [*shlex.split(line)[1:], *([] if given else ["suite=small.yaml"])]
+    if "resume=FOLDER" in line:  # one that was stopped (`set_stage`)
+        line = line.replace("FOLDER", f"outputs/stopped_{'sweep' if ' -m ' in line else 'evaluation'}")
     for name, meaning in MEANT.items():
         line = re.sub(rf"(?<![A-Za-z_]){re.escape(name)}(?![A-Za-z_])", meaning, line)
     words = [word for word in shlex.split(line)[1:] if not word.startswith(ELSEWHERE)]
@@ -130,6 +135,15 @@ def set_stage(words: list[str]) -> None:
             place.unlink(missing_ok=True)
         elif name == "checkpoint" and not place.exists():
             shutil.copytree("outputs/run", place)
+        elif name == "resume" and place.name == "stopped_evaluation":
+            shutil.rmtree(place, ignore_errors=True)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(Progress, "advance", lambda *_: signal.raise_signal(signal.SIGINT))
+                evaluate = ["evaluate", *SMALLER["evaluate"], *OWN_MAPS, "policy=random"]
+                assert main([*evaluate, f"hydra.run.dir={place}"]) == 130
+        elif name == "resume" and place.name == "stopped_sweep":
+            words_of_it = [*SMALLER["train"], *OWN_MAPS, "seed=0,1", "episodes=0"]
+            write_json(place / "sweep.json", {"format": "maexp-sweep-1", "words": words_of_it})
         elif name == "resume" and words[0] == "benchmark" and not place.exists():
             assert main(["benchmark", *SMALLER["benchmark"], *OWN_MAPS, f"hydra.run.dir={place}"]) == 0
     if words[0] == "view" and words[1].startswith("outputs/") and not Path(words[1]).exists():
