@@ -11,13 +11,13 @@ from omegaconf import OmegaConf
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.build import make_env, make_learner, model_settings
+from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, compose_recipe
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, flatten, resolve, to_yaml
 from maexp.agents.settings.runs import continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
-from maexp.agents.training.checksums import checksums, warn_of_changed_maps
 from maexp.envs import make_map
 from maexp.envs.scenarios import SCENARIOS
 

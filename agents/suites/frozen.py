@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import yaml
 
+from maexp.agents.checksums import checksum
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import write_text
@@ -14,7 +15,6 @@ from maexp.agents.policies.classical import POLICIES
 from maexp.agents.suites.play import build_env, build_maps, play_batch
 from maexp.agents.suites.score import RANDOM, Results, mean_of
 from maexp.agents.suites.suite import Part, Suite, load_suite, sha256
-from maexp.agents.training.checksums import checksum
 from maexp.envs import ObservationConfig, PointCloudMap
 
 MARK = "\n# Frozen by `maexp suite freeze`: not to be edited.\n"

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from maexp.agents.checksums import warn_of_changed_maps
 from maexp.agents.errors import UserError
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
 from maexp.agents.policies.load import is_exported, load_policy_folder, open_policy
@@ -23,7 +24,6 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import CommonSettings
 from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, model_of, restore_policy
-from maexp.agents.training.checksums import warn_of_changed_maps
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 Kind = Literal["classical", "exported", "checkpoint", "own"]

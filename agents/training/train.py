@@ -24,6 +24,7 @@ from maexp.agents.build import (
     other_scenarios,
     set_steps,
 )
+from maexp.agents.checksums import changed_maps, checksums
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import command, short, write_text
@@ -44,7 +45,6 @@ from maexp.agents.training.checkpoint import (
     seed_everything,
     set_random_state,
 )
-from maexp.agents.training.checksums import changed_maps, checksums
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
 from maexp.agents.training.validation import COLUMNS, ENDS, Validation
