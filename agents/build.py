@@ -165,6 +165,7 @@ def make_env(
         macro_steps=scenario.macro_steps,
         collision=scenario.collision,
         success_coverage=scenario.success_coverage,
+        done=scenario.done,
         **settings,
     )
 

@@ -179,7 +179,7 @@ class Beliefs(Branches):
             nothing is known.
     """
 
-    _own = (*OF_POINTS, "hears", "comm")
+    _own = (*OF_POINTS, "hears", "comm", "known_weight")
 
     def __init__(self, env: ExplorationEnv, teams: int, copies: int, nav: Navigation, unknown: Guess | None = None):
         self.nav, self.unknown = nav, unknown

@@ -23,7 +23,7 @@ OF_POINTS = ("seen_free", "seen_boundary", "viewers_free", "viewers_boundary", "
 """State about the points of maps: another world has its own."""
 NOT_COPIED = (
     "track", "starts", "seed", "map_id", "milestone_step", "milestone_overlap", "milestone_path", "path_length",
-    "terms", "unscaled", "episode_reward",
+    "terms", "unscaled", "episode_reward", "base_sum", "worst_sum", "told_step", "connected",
 )  # fmt: skip
 """State that no branch needs, for nobody asks it for metrics, or that is its own."""
 

@@ -11,6 +11,7 @@ STARTS = ("drawn", "together", "fixed")
 """Where robots start, besides poses that are given: drawn at every reset, each by itself or all beside each other, or
 drawn once for each map and kept."""
 
+
 @dataclass(frozen=True)
 class RobotConfig:
     """One robot. Lengths in metres, speeds in m/s, angles in radians; None takes the scenario's value.
@@ -100,14 +101,40 @@ class ObservationConfig:
 
 @dataclass(frozen=True)
 class CommConfig:
-    """Who hears whom: robots within ``range`` [m], and in line of sight if asked. Infinite: everyone (the paper)."""
+    """Who hears whom (docs/conditions.md).
+
+    Robots within ``range`` [m], in line of sight if asked, and with ``signal`` those whose signal arrives with more
+    than ``threshold`` [dBm] of the ``power`` [dBm] it is sent with (`maexp.kernels.radio`). ``cell`` is the edge of
+    the cells that the signal's model counts [m], "auto" an 80th of the greatest radar range, as in IR2, where a sensor
+    reaches 80 cells. ``noise`` [dB] is how much each part of the loss fades at most, drawn for every pair and moment.
+
+    ``base_station`` is a radio with a map of its own: True stands where robot 0 starts, or it is a place (x, y) [m].
+    """
 
     range: float = math.inf
     line_of_sight: bool = False
+    signal: bool = False
+    power: float = -20.0
+    threshold: float = -70.0
+    cell: float | Literal["auto"] = "auto"
+    noise: float = 0.0
+    base_station: bool | tuple[float, float] = False
 
     @property
     def limited(self) -> bool:
-        return self.line_of_sight or math.isfinite(self.range)
+        """Whether robots may know different things."""
+        return self.line_of_sight or math.isfinite(self.range) or self.signal or self.has_base
+
+    @property
+    def has_base(self) -> bool:
+        """Whether there is a base station."""
+        return self.base_station is not False
+
+
+DONE = ("union", "base", "everyone")
+"""Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
+station knows, or what every robot knows that has not collided."""
+CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
 
 @dataclass(frozen=True)
@@ -150,6 +177,7 @@ MOST_CANDIDATES = 64
 MOST_HORIZON = 100
 MOST_TARGETS = 256  # that a robot is shown
 CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
+SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
 ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
 BODY = {"length": "body_length", "width": "body_width", "collision_threshold": "collision_threshold"}
 """What a radius decides: settings of a robot, and what a scenario calls them."""
@@ -256,10 +284,44 @@ def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None
 
 
 def check_comm(config: CommConfig) -> CommConfig:
-    """The range may be infinite but not negative."""
-    if not config.range >= 0.0:
-        raise ValueError(f"comm.range={config.range} must be 0 or more metres (inf: everyone hears everyone)")
-    return config
+    """Check every value, and make a place a tuple."""
+    everyone = "0 or more metres (inf: everyone hears everyone)"
+    _check_number("comm.range", config.range, everyone, least=0.0, finite=False)
+    for name in ("line_of_sight", "signal"):
+        if not isinstance(getattr(config, name), bool):
+            raise ValueError(f"comm.{name}={getattr(config, name)!r} must be true or false")
+    _check_number("comm.power", config.power, "a finite number of dBm")
+    _check_number("comm.threshold", config.threshold, "a finite number of dBm")
+    _check_number("comm.noise", config.noise, "a finite number of dB, 0 or more", least=0.0)
+    if config.signal and config.threshold >= config.power - SIGNAL_LOSS:
+        raise ValueError(
+            f"comm.threshold={config.threshold:g} dBm is out of reach: of comm.power={config.power:g} dBm "
+            f"{config.power - SIGNAL_LOSS:g} arrive at best, and nobody would ever hear anybody; lower the threshold, "
+            "or use comm.range=0 if that is meant"
+        )
+    cell = config.cell
+    number = isinstance(cell, int | float) and not isinstance(cell, bool)
+    if cell != "auto" and not (number and 0.0 < cell < math.inf):
+        raise ValueError(f'comm.cell={cell!r} must be "auto" or a number of metres above 0')
+    return replace(config, base_station=_check_base(config.base_station))
+
+
+def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:
+    if isinstance(base, bool):
+        return base
+    place = list(base) if isinstance(base, Sequence) and not isinstance(base, str) else []
+    if len(place) != 2 or not all(isinstance(x, int | float) and math.isfinite(x) for x in place):
+        where = "true (where robot 0 starts), false or a place [x, y] in metres"
+        raise ValueError(f"comm.base_station={base!r} must be {where}")
+    return float(place[0]), float(place[1])
+
+
+def check_done(done: str, comm: CommConfig) -> str:
+    """Whose coverage ends an episode must be known, and there."""
+    _check_choice("done", done, DONE)
+    if done == "base" and not comm.has_base:
+        raise ValueError("done='base' needs a base station: add comm.base_station=true")
+    return done
 
 
 def check_targets(config: TargetsConfig) -> TargetsConfig:
@@ -301,6 +363,12 @@ def one_config(what: str, config, kind: type):
     if config is not None and not isinstance(config, kind):
         raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
     return config or kind()
+
+
+def _check_number(name: str, value, what: str, least: float = -math.inf, finite: bool = True) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and value >= least and (math.isfinite(value) or (not finite and value == math.inf))):
+        raise ValueError(f"{name}={value!r} must be {what}")
 
 
 def _check_choice(name: str, value, choices: tuple[str, ...]) -> None:

@@ -25,7 +25,7 @@ from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.settings import EnvSettings, complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
-from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS, action_spec, done_spec, observation_spec, reward_spec
+from maexp.envs.specs import REWARD_TERMS, action_spec, done_spec, info_shapes, observation_spec, reward_spec
 from maexp.envs.starts import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
 from maexp.envs.target_view import TargetView, draw_targets
 from maexp.kernels.observe import picture_shapes
@@ -60,6 +60,8 @@ class ExplorationEnv(EnvBase):
         macro_steps: ``env.step`` calls in an episode before it is truncated.
         collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
         success_coverage: coverage that ends an episode as a success.
+        done: whose coverage that is: "union", what the team has seen together; "base", what the base station knows;
+            "everyone", what every robot knows that has not collided.
         num_threads: CPU threads of the simulation; results do not depend on it.
         first_env: number of the first env in the random keys, where several processes share one batch of envs.
         starts: "drawn" anew at every reset; "together": a place for the team is drawn at every reset, in which robots
@@ -79,6 +81,7 @@ class ExplorationEnv(EnvBase):
     local_steps = _setting("local_steps", "Control steps of 0.1 s in a macro step.")
     macro_steps = _setting("macro_steps", "Macro steps of an episode.")
     collision = _setting("collision", '"centre" or "footprint".')
+    done_by = _setting("done", "Whose coverage ends an episode.")
     success_coverage = _setting("success_coverage", "Coverage that ends an episode.")
     robot_configs = _setting("robots", "One `RobotConfig` per robot.")
     radar_configs = _setting("radars", "One `RadarConfig` per robot.")
@@ -109,6 +112,7 @@ class ExplorationEnv(EnvBase):
         macro_steps: int | None = None,
         collision: str = "centre",
         success_coverage: float = 0.95,
+        done: str = "union",
         num_threads: int | None = None,
         first_env: int = 0,
         starts: str | np.ndarray | torch.Tensor = "drawn",
@@ -117,8 +121,8 @@ class ExplorationEnv(EnvBase):
         settings = complete_settings(
             maps, num_envs, num_robots, device, seed, robot=robot, radar=radar, planner=planner, reward=reward,
             observation=observation, comm=comm, targets=targets, lookahead=lookahead, local_steps=local_steps,
-            macro_steps=macro_steps, collision=collision, success_coverage=success_coverage, num_threads=num_threads,
-            first_env=first_env,
+            macro_steps=macro_steps, collision=collision, success_coverage=success_coverage, done=done,
+            num_threads=num_threads, first_env=first_env,
         )  # fmt: skip
         for m in maps:
             check_room(m, [r.collision_threshold for r in settings.robots])
@@ -146,7 +150,8 @@ class ExplorationEnv(EnvBase):
         if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
             self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
-        self.observation_spec = observation_spec(e, n, self.device, settings.observation.pictures, shown)
+        info, pictures = info_shapes(settings.comm, settings.done), settings.observation.pictures
+        self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown)
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
@@ -166,9 +171,9 @@ class ExplorationEnv(EnvBase):
         done = self._done()
         out = self.observe(mask)  # TorchRL takes the other envs' observation from what it had
         info = out["info"]
-        for name in INFO_ENV | INFO_ROBOT:  # info tells of the step just made; a new episode has made none
+        for name in info.keys():  # info tells of the step just made; a new episode has made none
             keep = mask.reshape(-1, 1) == 0
-            blank = -1 if name.startswith("coverage_step") else 0
+            blank = -1 if "_step_" in name else 0
             info[name] = torch.where(keep, info[name], torch.full_like(info[name], blank))
         return out.update(done)
 
@@ -288,6 +293,25 @@ class ExplorationEnv(EnvBase):
             info[f"path_length_{mark}"] = s["milestone_path"][:, :, k].clone()
         for k, term in enumerate(REWARD_TERMS):
             info[f"reward_{term}"] = s["terms"][:, :, k].clone()
+        return info | (self._radio_info(total) if self.comm_config.limited else {})
+
+    def _radio_info(self, total: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Who knows how much; ``total`` is the weight of each team's map, int32 [E]."""
+        s, robots = self.simulation.tensors, self.num_robots
+        length, steps = self.settings.episode_steps, s["local_step"]
+
+        def tell(name: str, weight: torch.Tensor, sums: torch.Tensor) -> dict[str, torch.Tensor]:
+            area = sums + (length - steps) * weight.long()
+            mean = (area.double() / (length * total)).float()
+            return {name: (weight / total).unsqueeze(-1), f"{name}_auc": mean.unsqueeze(-1)}
+
+        info = tell("worst_coverage", s["known_weight"][:, :robots].amin(1), s["worst_sum"])
+        info["told_step_95"] = s["told_step"].unsqueeze(-1).clone()
+        info["connected"] = s["connected"] / steps.clamp_min(1).unsqueeze(-1)
+        if self.comm_config.has_base:
+            info |= tell("base_coverage", s["known_weight"][:, robots], s["base_sum"])
+        if self.settings.done != "union":
+            info["counted_coverage"] = (s["counted"] / total).unsqueeze(-1)
         return info
 
     def _raise_errors(self) -> None:

@@ -10,6 +10,8 @@ from tensordict import TensorDictBase
 
 from maexp.kernels.reward import MARKS
 
+RADIO = ("base_coverage", "base_coverage_auc", "worst_coverage", "worst_coverage_auc")
+"""What the base station knows, and the robot that knows least."""
 RESAMPLES = 5000
 GROUPED_RESAMPLES = 2000  # of maps, seeds and episodes: each takes a weight for every episode
 LEAST_DISTINCT = 5
@@ -17,8 +19,9 @@ LEAST_DISTINCT = 5
 the true mean in half or three quarters of all cases."""
 
 
-def succeeded(coverage: torch.Tensor, success_coverage: float) -> torch.Tensor:
-    """Whether episodes that ended with `coverage`, float32, are successes: rounded as in the kernels."""
+def succeeded(info: TensorDictBase, success_coverage: float) -> torch.Tensor:
+    """Whether episodes that ended with `info` are successes, bool [..., 1]: rounded as in the kernels."""
+    coverage = info["counted_coverage" if "counted_coverage" in info.keys() else "coverage"]
     return coverage >= coverage.new_tensor(success_coverage)
 
 
@@ -37,7 +40,8 @@ def episode_metrics(
         float64 [episodes] per metric; NaN where an episode has no value (a coverage it never reached).
         ``reward_variance`` is the population standard deviation over robots of the episode's reward without
         the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m],
-        ``longest_path`` the way of the robot that drove farthest. Which marks an episode can reach: `in_reach`.
+        ``longest_path`` the way of the robot that drove farthest. Where communication is limited: `RADIO`,
+        ``connected`` and ``told_step_95``. Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
     metrics = {
@@ -45,11 +49,18 @@ def episode_metrics(
         "coverage_auc": info["coverage_auc"][:, 0],
         "reward_variance": info["episode_reward_unscaled"].std(axis=1),
         "reward_variance_scaled": info["episode_reward"].std(axis=1),
-        "success_rate": succeeded(final["coverage"][:, 0], success_coverage).double().cpu().numpy(),
+        "success_rate": succeeded(final, success_coverage)[:, 0].double().cpu().numpy(),
         "collisions": info["collided"].sum(axis=1),
         "path_length": info["path_length"].mean(axis=1),
         "longest_path": info["path_length"].max(axis=1),
     }
+    metrics |= {name: info[name][:, 0] for name in RADIO if name in info}
+    if "connected" in info:
+        metrics["connected"] = info["connected"].mean(axis=1)
+        steps = info["told_step_95"][:, 0]
+        metrics["told_step_95"] = np.where(steps >= 0, steps, np.nan)
+        if limit is not None:
+            metrics["told_step_95_censored"] = np.where(steps >= 0, steps, float(limit))
     for mark in MARKS:
         steps = info[f"coverage_step_{mark}"][:, 0]
         reached = steps >= 0

@@ -88,6 +88,14 @@ def open_cells(grid: NavGrid) -> np.ndarray:
     return free[grid.stand_in] & (grid.stand_in >= 0)
 
 
+def stands_free(map: PointCloudMap, place: tuple[float, float]) -> bool:
+    """Whether a place [m] lies on free ground."""
+    grid = build_nav_grid(map)
+    x, y = np.floor((np.array(place) - grid.origin) / grid.cell).astype(np.int64)
+    inside = 0 <= x < grid.width and 0 <= y < grid.height
+    return bool(inside and open_cells(grid)[y * grid.width + x])
+
+
 def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids, int]:
     """Device arrays over several maps, and the cells of the largest (points in the order of `Maps`)."""
     begin = np.cumsum([0] + [len(g.stand_in) for g in grids])

@@ -17,6 +17,7 @@ from maexp.envs.config import (
     RobotConfig,
     TargetsConfig,
     check_comm,
+    check_done,
     check_lookahead,
     check_observation,
     check_reward,
@@ -28,6 +29,7 @@ from maexp.envs.config import (
     per_robot,
 )
 from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.nav_grid import stands_free
 from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
 
 
@@ -46,6 +48,7 @@ class EnvSettings:
     macro_steps: int  # of an episode
     collision: str  # "centre" or "footprint"
     success_coverage: float  # share that ends an episode
+    done: str  # whose: "union", "base" or "everyone"
     robots: tuple[RobotConfig, ...]  # one per robot
     radars: tuple[RadarConfig, ...]  # one per robot
     planner: PlannerConfig
@@ -80,6 +83,7 @@ def complete_settings(
     macro_steps: int | None,
     collision: str,
     success_coverage: float,
+    done: str,
     num_threads: int | None,
     first_env: int,
 ) -> EnvSettings:
@@ -124,6 +128,7 @@ def complete_settings(
     observation = one_config("observation", observation, ObservationConfig)
     check_observation(observation, planner)
     comm = check_comm(one_config("comm", comm, CommConfig))
+    check_base(maps, comm)
     targets = check_targets(one_config("targets", targets, TargetsConfig))
     lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))
     threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
@@ -139,6 +144,7 @@ def complete_settings(
         macro_steps=macro_steps,
         collision=collision,
         success_coverage=float(success_coverage),
+        done=check_done(done, comm),
         robots=robots,
         radars=radars,
         planner=planner,
@@ -162,6 +168,20 @@ def check_bodies(maps: Sequence[PointCloudMap], robots: Sequence[RobotConfig]) -
                     f"robot.{name}={getattr(robot, name):g} m does not fit on map {m.name} of {sides[0]:.4g} x "
                     f"{sides[1]:.4g} m: give metres, as robot.{name}=0.5"
                 )
+
+
+def check_base(maps: Sequence[PointCloudMap], comm: CommConfig) -> None:
+    """Raise ValueError if the place of the base station is no free ground of one of the maps."""
+    if isinstance(comm.base_station, bool):
+        return
+    for m in maps:
+        if not stands_free(m, comm.base_station):
+            (left, low), (right, high) = m.extent
+            raise ValueError(
+                f"comm.base_station={list(comm.base_station)} is no free ground of map {m.name}, which reaches from "
+                f"[{left:.4g}, {low:.4g}] to [{right:.4g}, {high:.4g}] m: choose another place, or true for where "
+                "robot 0 starts"
+            )
 
 
 def positive_count(name: str, value: int) -> int:

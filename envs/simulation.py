@@ -7,11 +7,12 @@ import numpy as np
 import torch
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import TIME_ON
-from maexp.envs.nav_grid import bank_nav_grids, grid_shape
+from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON
+from maexp.envs.nav_grid import bank_nav_grids, build_nav_grid, grid_shape, open_cells
 from maexp.envs.settings import EnvSettings
 from maexp.kernels.blocks import block_memory_per_env, block_sides
 from maexp.kernels.known_grid import news_capacity
+from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
@@ -29,17 +30,20 @@ TRACK_LENGTH = 625
 
 def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = False) -> Simulation:
     """The simulation of an env with these settings on these maps; ``together``: teams start in one place."""
+    need_grids = settings.planner.name == "wavefront" or settings.comm.signal
     simulation = Simulation(
         maps=bank.tensors(settings.device),
         num_maps=len(bank.maps),
         robots=robot_tensors(settings),
         weights=reward_weights(settings),
+        radio=radio_struct(settings),
         settings=step_settings(settings, together),
         sizes=sizes(settings, bank),
         device=settings.device,
         seed=settings.seed,
         num_shards=settings.num_threads,
-        nav=bank_nav_grids(bank, settings.device) if settings.planner.name == "wavefront" else None,
+        nav=bank_nav_grids(bank, settings.device) if need_grids else None,
+        open_cells=open_ground(bank).to(settings.device) if settings.comm.signal else None,
     )
     simulation.tensors["env_id"] += settings.first_env
     return simulation
@@ -86,9 +90,24 @@ def reward_weights(settings: EnvSettings) -> RewardWeights:
     return weights
 
 
+def radio_struct(settings: EnvSettings) -> Radio:
+    """The radios as the kernels read them."""
+    comm, radio = settings.comm, Radio()
+    radio.power, radio.threshold, radio.noise = comm.power, comm.threshold, comm.noise
+    reach = max(one.range for one in settings.radars)
+    radio.cell = reach / CELLS_OF_RADAR if comm.cell == "auto" else comm.cell
+    return radio
+
+
+def open_ground(bank: MapBank) -> torch.Tensor:
+    """Cells of the navigation grids of all maps, one after the other, uint8: 1 on free ground."""
+    return torch.from_numpy(np.concatenate([open_cells(build_nav_grid(one)) for one in bank.maps]).astype(np.uint8))
+
+
 def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
     """What a local step does."""
     planner, comm = settings.planner, settings.comm
+    base = (math.inf, math.inf) if isinstance(comm.base_station, bool) else comm.base_station
     return Settings(
         planner=planner.name,
         num_accel=planner.num_accel,
@@ -100,6 +119,10 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         limited=comm.limited,
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
+        signal=comm.signal,
+        base_x=base[0],
+        base_y=base[1],
+        done=DONE.index(settings.done) if comm.limited else 0,  # else all know the same
         draw_known=settings.observation.map == "known",
         success_coverage=settings.success_coverage,
         together=together,
@@ -123,6 +146,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         nearby=bank.boundary_in_range,
         track=min(settings.episode_steps + 1, TRACK_LENGTH),
         limited=settings.comm.limited,
+        base_station=settings.comm.has_base,
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robots),
     )
 

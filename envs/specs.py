@@ -3,6 +3,7 @@
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
+from maexp.envs.config import CommConfig
 from maexp.envs.target_view import FEATURES
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS
@@ -32,10 +33,38 @@ INFO_ROBOT = {
 """Entries of ``info`` of shape [E, N]; ``episode_reward_unscaled`` is the sum of terms before scaling by w and v."""
 
 
+INFO_RADIO = {
+    "worst_coverage": torch.float32,
+    "worst_coverage_auc": torch.float32,
+    "told_step_95": torch.int32,
+}
+"""Entries of shape [E, 1] where communication is limited: of the robot that knows least at each moment, and the local
+step after which all radios knew 95 %."""
+INFO_BASE = {"base_coverage": torch.float32, "base_coverage_auc": torch.float32}
+"""The same where there is a base station."""
+INFO_COUNTED = {"counted_coverage": torch.float32}
+"""The same where not what the team has seen ends an episode: what does."""
+OF_TEAM = INFO_ENV | INFO_RADIO | INFO_BASE | INFO_COUNTED
+
+
+def info_shapes(comm: CommConfig, done: str = "union") -> tuple[dict[str, torch.dtype], dict[str, torch.dtype]]:
+    """Entries of ``info`` of shape [E, 1] and [E, N]."""
+    team, robot = dict(INFO_ENV), dict(INFO_ROBOT)
+    if comm.limited:
+        team |= INFO_RADIO | (INFO_BASE if comm.has_base else {}) | (INFO_COUNTED if done != "union" else {})
+        robot["connected"] = torch.float32
+    return team, robot
+
+
 def observation_spec(
-    envs: int, robots: int, device: torch.device, pictures: bool = True, targets: int = 0
+    envs: int,
+    robots: int,
+    device: torch.device,
+    info: tuple[dict[str, torch.dtype], dict[str, torch.dtype]],
+    pictures: bool = True,
+    targets: int = 0,
 ) -> Composite:
-    """Observation of every robot, with so many frontier targets to choose from, the team's map, and info."""
+    """Observation of every robot, with so many frontier targets to choose from, the team's map, and `info_shapes`."""
     (pictured, merged), regions = picture_shapes(envs, robots), REGIONS
 
     def picture(shape):
@@ -61,12 +90,12 @@ def observation_spec(
         observation["targets"] = real(envs, robots, targets, len(FEATURES))
         mask = (envs, robots, targets)
         observation["targets_mask"] = Binary(targets, shape=mask, dtype=torch.bool, device=device)
-    info = {name: _value((envs, 1), dtype, device) for name, dtype in INFO_ENV.items()}
-    info |= {name: _value((envs, robots), dtype, device) for name, dtype in INFO_ROBOT.items()}
+    told = {name: _value((envs, 1), dtype, device) for name, dtype in info[0].items()}
+    told |= {name: _value((envs, robots), dtype, device) for name, dtype in info[1].items()}
     return Composite(
         agents=Composite(observation=observation, shape=(envs, robots), device=device),
         **team,
-        info=Composite(info, shape=(envs,), device=device),
+        info=Composite(told, shape=(envs,), device=device),
         shape=(envs,),
         device=device,
     )

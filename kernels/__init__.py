@@ -8,8 +8,10 @@ from maexp.kernels.startup import start_warp
 
 start_warp()
 
-from maexp.kernels.api import merge_maps, unpack_flags, visible_points
+from maexp.kernels.api import merge_maps, received_power, unpack_flags, visible_points
 from maexp.kernels.frontier import frontier_cells
 from maexp.kernels.geodesic import geodesic_distance
 
-__all__ = ["frontier_cells", "geodesic_distance", "merge_maps", "unpack_flags", "visible_points"]
+__all__ = [
+    "frontier_cells", "geodesic_distance", "merge_maps", "received_power", "unpack_flags", "visible_points"
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Single kernels as functions of torch tensors: the radar and map merging."""
+"""Single kernels as functions of torch tensors: the radar, map merging and radios."""
 
 import math
 
@@ -6,7 +6,9 @@ import torch
 import warp as wp
 
 from maexp.kernels import merge, visibility
-from maexp.kernels.launches import lanes_on, launch_named, launch_on
+from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.launches import finish_filling, lanes_on, launch_named, launch_on
+from maexp.kernels.radio import Radio, _measure_signals
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, Robots
 
@@ -165,9 +167,60 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     words, told = wp.from_torch(flags), wp.from_torch(torch.zeros_like(flags))
     lanes = lanes_on(words.device, 1024)
     values = {"active": wp.from_torch(active), "hears": wp.from_torch(hears), "seen": words, "told": told}
-    values |= {"known": wp.from_torch(known), "lanes": lanes}
-    launch_named(launch_on(words.device), merge._share_points, (seen.shape[0], lanes), "known told", values)
+    values |= {"known": wp.from_torch(known), "lanes": lanes, "maps": Maps(), "map_id": values["active"]}
+    values |= {"weighed": 0, "known_weight": wp.from_torch(torch.zeros_like(active).view(-1, 1))}
+    written, dim = "known known_weight told", (seen.shape[0], lanes)
+    launch_named(launch_on(words.device), merge._share_points, dim, written, values)
     return unpack_flags(known, robots)
+
+
+def received_power(
+    free: torch.Tensor,
+    senders: torch.Tensor,
+    receivers: torch.Tensor,
+    edge: float = 1.0,
+    cell: float = 1.0,
+    power: float = -20.0,
+) -> torch.Tensor:
+    """Power that arrives of signals, without fading (`maexp.kernels.radio`).
+
+    A robot that predicts a link gives what it knows to be free: the unknown blocks.
+
+    Args:
+        free: bool [H, W], free ground; entry [y, x] is the cell from (x, y) to (x + 1, y + 1) times ``edge``.
+        senders, receivers: where the radios of each pair are [m], shape [K, 2].
+        edge: of the grid's cells [m].
+        cell: edge of the cells that the model counts [m].
+        power: sent [dBm].
+
+    Returns:
+        float32 [K] on the device of ``free`` [dBm].
+
+    Raises:
+        ValueError: a shape does not fit, or a length is not positive.
+    """
+    if free.dim() != 2 or not free.numel():
+        raise ValueError(f"free has shape {tuple(free.shape)}: give a grid [H, W] with cells")
+    ends = [torch.as_tensor(one, dtype=torch.float32, device=free.device).contiguous() for one in (senders, receivers)]
+    if any(one.dim() != 2 or one.shape[1] != 2 for one in ends) or len(ends[0]) != len(ends[1]):
+        raise ValueError(f"senders {tuple(ends[0].shape)} and receivers {tuple(ends[1].shape)} must both be [K, 2]")
+    for name, value in (("edge", edge), ("cell", cell)):
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"{name}={value} must be a positive number of metres")
+    grids, radio = NavGrids(), Radio()
+    radio.power, radio.cell = power, cell
+    device = wp.device_from_torch(free.device)
+    numbers = {"cell": (edge, wp.float32), "width": (free.shape[1], wp.int32), "height": (free.shape[0], wp.int32)}
+    for name, (value, kind) in (numbers | {"origin": ((0.0, 0.0), wp.vec2), "cell_begin": (0, wp.int32)}).items():
+        setattr(grids, name, wp.array([value], dtype=kind, device=device))
+    finish_filling(device)
+    arrived = torch.empty(len(ends[0]), device=free.device)
+    values = {"senders": wp.from_torch(ends[0], dtype=wp.vec2), "receivers": wp.from_torch(ends[1], dtype=wp.vec2)}
+    values |= {"grids": grids, "open": wp.from_torch(free.flatten().to(torch.uint8)), "radio": radio}
+    values["power"] = wp.from_torch(arrived)
+    if len(arrived):
+        launch_named(launch_on(free.device), _measure_signals, len(arrived), "power", values)
+    return arrived
 
 
 def _pack(flags: torch.Tensor, axis: int) -> torch.Tensor:

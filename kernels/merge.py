@@ -1,9 +1,9 @@
 """Maps of the robots and of the team: counting what is new, overlap, merging, sharing.
 
-Flags live in words of 32 robots, ``[env, word, point]``: ``seen`` holds everything a robot has scanned itself,
-``known`` what it also heard from others. How many robots have ever seen a point is counted beside (``viewers``, and in
-its upper half how many see it in this local step), so that no kernel goes through the words of a large team.
-All sums are integers: weights are spacing squared in the map's unit, 1 on maps of even density.
+Flags live in words of 32 radios, ``[env, word, point]``: ``seen`` holds everything a robot has scanned itself,
+``known`` what it, or the base station, also heard from others. How many robots have ever seen a point is counted beside
+(``viewers``, and in its upper half how many see it in this local step), so that no kernel goes through the words of a
+large team. All sums are integers: weights are spacing squared in the map's unit, 1 on maps of even density.
 """
 
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ import warp as wp
 
 from maexp.kernels.geometry import segment_distance
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.radio import radio_at, receive_signals
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, floor_within
 
@@ -138,27 +139,32 @@ def _hear_robots(
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    base: wp.array(dtype=wp.vec3),  # [env]
     # State out:
     comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
-    hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
+    hears: wp.array3d(dtype=wp.int32),  # [env, radio, word]
 ):
-    """Decide whom robot (e, i) hears: itself, and robots in range (and in sight, if asked)."""
+    """Decide whom radio (e, i) hears: itself, and radios in range (and in sight, if asked)."""
     e, i = wp.tid()
     if active[e] == 0:
         return
     m = map_id[e]
     for w in range(hears.shape[2]):
         hears[e, i, w] = 0
-    for other in range(center.shape[1]):
-        heard = wp.length(center[e, i] - center[e, other]) <= comm_range
+    robots = center.shape[1]
+    for other in range(hears.shape[1]):
+        a = radio_at(e, wp.min(i, other), center, base)
+        b = radio_at(e, wp.max(i, other), center, base)
+        heard = wp.length(a - b) <= comm_range
         if heard and line_of_sight != 0 and other != i:
             # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
             width = 0.70710678 * maps.resolution[m]
             # one direction for both, lest rounding let only one hear the other
-            heard = not is_blocked(maps, m, center[e, wp.min(i, other)], center[e, wp.max(i, other)], width)
+            heard = not is_blocked(maps, m, a, b, width)
         if other == i:
             heard = True
-        comm[e, i, other] = heard
+        if i < robots and other < robots:
+            comm[e, i, other] = heard
         if heard:
             w = other / ROBOTS_PER_WORD
             hears[e, i, w] = hears[e, i, w] | (1 << (other % ROBOTS_PER_WORD))
@@ -166,20 +172,26 @@ def _hear_robots(
 
 @wp.kernel
 def _share_points(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     lanes: int,
+    weighed: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
-    hears: wp.array3d(dtype=wp.int32),  # [env, robot, word]
+    hears: wp.array3d(dtype=wp.int32),  # [env, radio, word]
     seen: wp.array3d(dtype=wp.int32),  # [env, word, point]
     # State in and out:
     known: wp.array3d(dtype=wp.int32),  # [env, word, point]
+    known_weight: wp.array2d(dtype=wp.int32),  # [env, radio]
     # Scratch out:
     told: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
-    """Robot i knows a point if it or a robot it hears has seen it or had been told of it.
+    """Radio i knows a point if it or a radio it hears has seen it or had been told of it.
 
-    ``told`` holds what each tells, so that news travels one hop a step whatever the order of robots.
+    ``told`` holds what each tells, so that news travels one hop a step whatever the order of radios. Free points,
+    which are ``weighed``, count in what a radio knows.
     """
     e, lane = wp.tid()
     if active[e] == 0:
@@ -210,7 +222,13 @@ def _share_points(
                         if (hears[e, w * ROBOTS_PER_WORD + bit, v] & tells[v, j]) != 0:
                             result = result | (1 << bit)
                     missing = missing & below
+                news = wp.uint32(result & ~knows[w, j])
                 knows[w, j] = result
+                while weighed != 0 and news != wp.uint32(0):
+                    below = news - wp.uint32(1)
+                    radio = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~news))
+                    wp.atomic_add(known_weight, e, radio, maps.free_weight[maps.free_begin[map_id[e]] + j])
+                    news = news & below
 
 
 def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
@@ -220,11 +238,14 @@ def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
 
 
 def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
-    """Let robots hear from others, where communication is limited and ``running`` [env] is set."""
+    """Let radios hear from others, where communication is limited and ``running`` [env] is set."""
     if not shard.settings.limited:
         return
-    shard.call(launch, _hear_robots, "comm hears", active=running)
+    shard.call(launch, _hear_robots, "comm hears", shard.radios, active=running)
+    receive_signals(launch, shard, running)
     for what in ("free", "boundary"):
         seen, known, told = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "known", "told"))
         given = {"seen": seen, "known": known, "told": told, "lanes": lanes_on(shard.device, 1024)}
-        shard.call(launch, _share_points, "known told", (shard.shape[0], given["lanes"]), active=running, **given)
+        given["weighed"] = int(what == "free")
+        dim = (shard.shape[0], given["lanes"])
+        shard.call(launch, _share_points, "known known_weight told", dim, active=running, **given)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch
+from maexp.kernels.radio import UNION
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Maps
 
@@ -135,11 +136,14 @@ def _close_step(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     success_coverage: float,
+    done: int,
     # State in:
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
     covered: wp.array(dtype=wp.int32),  # [env]
     shared: wp.array(dtype=wp.int32),  # [env]
     path_length: wp.array2d(dtype=wp.float32),  # [env, robot]
+    # Scratch in:
+    counted: wp.array(dtype=wp.int32),  # [env]
     # State in and out:
     active: wp.array(dtype=wp.int32),  # [env]
     covered_sum: wp.array(dtype=wp.int64),  # [env]
@@ -152,7 +156,7 @@ def _close_step(
     terminated: wp.array(dtype=wp.int32),  # [env]
 ):
     """Count the local step, sum up the coverage, note which of `MARKS` are reached, end the episode on success or when
-    all collided."""
+    all collided. Not what the team has seen but what is ``counted`` makes a success, where ``done`` says so."""
     e = wp.tid()
     if active[e] == 0:
         return
@@ -171,6 +175,8 @@ def _close_step(
     for i in range(collided.shape[1]):
         if collided[e, i] == 0:
             alive += 1
+    if done != UNION:
+        coverage = float(counted[e]) / float(maps.total_weight[map_id[e]])
     if coverage >= success_coverage or alive == 0:
         terminated[e] = 1
         active[e] = 0

@@ -38,6 +38,7 @@ class Shard:
         view: Warp arrays of state and scratch, by name.
         robots: their parameters.
         shape: envs and robots of a team.
+        radios: envs and radios of a team.
         lanes: threads that share the work of a robot.
     """
 
@@ -48,6 +49,7 @@ class Shard:
         self.view = warp_views(sim.tensors, first, last)
         self.robots = robots_struct(sim.robot_tensors, first, last)
         self.shape = (last - first, sim.sizes["N"])
+        self.radios = (last - first, sim.sizes["U"])
         self.lanes = lanes_on(self.device, 32)
         numbers = {name: int(one) if isinstance(one, bool) else one for name, one in vars(sim.settings).items()}
         self._values = numbers | vars(self.view) | {

@@ -10,6 +10,7 @@ from maexp.kernels.dwa import list_curvatures
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.planner import set_goals
+from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.shards import Threads, blocks_per_thread, split
 from maexp.kernels.state import SCRATCH, STATE, allocate
@@ -31,6 +32,10 @@ class Settings:
     limited: bool  # whether communication is
     comm_range: float  # [m]
     line_of_sight: bool  # whether walls block communication
+    signal: bool  # whether radios hear what arrives of a signal
+    base_x: float  # where the base station is [m]; inf: where robot 0 starts
+    base_y: float
+    done: int  # whose coverage ends an episode (`radio.UNION`)
     draw_known: bool  # pictures show what robots know, not what they have seen
     success_coverage: float  # share at which an episode ends
     together: bool  # teams start in one place
@@ -45,12 +50,14 @@ class Simulation:
         num_maps: how many maps those are.
         robots: one [E, N] tensor per field of `Robots`.
         weights: reward coefficients.
+        radio: parameters of the radios.
         settings: what a step does.
         sizes: lengths of the axes (`kernels.state.axis_sizes`).
         device: where it runs.
         seed: key of the random numbers.
         num_shards: runs of envs, each with a thread of its own on the CPU.
-        nav: navigation grids of the maps and the cells of the largest; the `wavefront` planner needs them.
+        nav: navigation grids of the maps and the cells of the largest; the `wavefront` planner and signals need them.
+        open_cells: uint8, cells of all navigation grids, 1 where the ground is free; signals need them.
     """
 
     def __init__(
@@ -59,12 +66,14 @@ class Simulation:
         num_maps: int,
         robots: dict[str, torch.Tensor],
         weights: RewardWeights,
+        radio: Radio,
         settings: Settings,
         sizes: dict[str, int],
         device: torch.device,
         seed: int,
         num_shards: int = 1,
         nav: tuple[NavGrids, int] | None = None,
+        open_cells: torch.Tensor | None = None,
     ):
         self.map_tensors, self.num_maps = maps, num_maps
         self.robot_tensors = robots | {"curvature": list_curvatures(robots, settings.num_steering)}
@@ -72,6 +81,8 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
+        self.radio = radio
+        self.open_cells = None if open_cells is None else wp.from_torch(open_cells)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["starts"].fill_(torch.inf)
         self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, device=self.device)

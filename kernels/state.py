@@ -18,7 +18,8 @@ from maexp.kernels.types import ROBOTS_PER_WORD, Robots
 AXES = {
     "E": ("env", "teams of the batch"),
     "N": ("robot", "robots of a team"),
-    "W": ("word", "words of 32 robots; robot i owns bit i % 32 of word i // 32"),
+    "U": ("radio", "radios of a team: those of its robots, then the base station's where there is one"),
+    "W": ("word", "words of 32 radios; radio i owns bit i % 32 of word i // 32"),
     "F": ("free", "free points of the largest map"),
     "B": ("boundary", "boundary points of the largest map"),
     "H": ("word", "as W where communication is limited, else 1"),
@@ -117,8 +118,10 @@ STATE = {
         "_clear_flags _share_points"),
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_clear_flags _share_points"),
     "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited",
-        "_hear_robots"),
-    "hears": Field(wp.int32, "E N W", "", "the same in bits: of the robots that robot i hears", "_hear_robots"),
+        "_hear_robots _receive_signals"),
+    "hears": Field(wp.int32, "E U W", "", "the same in bits, of all radios that radio i hears",
+        "_hear_robots _receive_signals"),
+    "base": Field(wp.vec3, "E", "m", "where the base station is, or would be, z = 0", "_place_base"),
 
     # How much that is. Weights: `Maps.free_weight`, 1 a point on maps of even density.
     "covered": Field(wp.int32, "E", "weight", "of the free points that the team has seen", "_clear_env _merge_scan"),
@@ -128,6 +131,16 @@ STATE = {
         "_clear_env _close_step"),
     "shared": Field(wp.int32, "E", "weight", "of the free points that two robots or more have seen",
         "_clear_env _merge_scan"),
+    "known_weight": Field(wp.int32, "E U", "weight", "of the free points that a radio knows, where communication is"
+        " limited", "_place_base _share_points"),
+    "base_sum": Field(wp.int64, "E", "weight", "sum of what the base station knows over the episode's local steps",
+        "_place_base _note_links"),
+    "worst_sum": Field(wp.int64, "E", "weight", "the same of the robot that knows least at each step",
+        "_place_base _note_links"),
+    "told_step": Field(wp.int32, "E", "steps", "local step after which every radio knew 95 %; -1 before",
+        "_place_base _note_links"),
+    "connected": Field(wp.int32, "E N", "steps", "local steps in which the robot was connected (`radio._note_links`)",
+        "_place_base _note_links"),
     "milestone_step": Field(wp.int32, "E M", "steps", "local step that reached the mark; -1 before",
         "_clear_env _close_step"),
     "milestone_overlap": Field(wp.float32, "E M", "", "shared / covered at that moment", "_clear_env _close_step"),
@@ -184,6 +197,11 @@ SCRATCH = {
         "_share_points"),
     "told_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_share_points"),
 
+    "counted": Field(wp.int32, "E", "weight", "what may end the episode where that is not what the team has seen",
+        "_note_links"),
+    "reached": Field(wp.int32, "E W", "", "bits of the radios found to be connected with the base station",
+        "_note_links"),
+
     # Drawing.
     "body_pixel": Field(wp.int32, "E N G", "", "pixels of the robot's body, that of its centre first",
         "_list_bodies"),
@@ -204,11 +222,13 @@ def axis_sizes(
     track: int,
     limited: bool,
     body_pixels: int = 1,
+    base_station: bool = False,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
-    words = -(-num_robots // ROBOTS_PER_WORD)
+    radios = num_robots + base_station
+    words = -(-radios // ROBOTS_PER_WORD)
     return {
-        "E": num_envs, "N": num_robots, "W": words, "F": max(free, 1), "B": max(boundary, 1),
+        "E": num_envs, "N": num_robots, "U": radios, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
         "O": max(nearby, 1), "G": body_pixels, "T": track, "R": TERMS, "D": 3 * BINS,

@@ -12,6 +12,7 @@ from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track
 from maexp.kernels.planner import plan
+from maexp.kernels.radio import note_links, place_base
 from maexp.kernels.reset import place_teams, start_episodes
 from maexp.kernels.reward import close_step, reward_robots
 from maexp.kernels.shards import Shard
@@ -29,6 +30,7 @@ def local_step(launch: Launch, shard: Shard) -> None:
     scan(launch, shard, active)
     merge_scan(launch, shard, active)
     share_maps(launch, shard, active)
+    note_links(launch, shard)
     reward_robots(launch, shard)
     record_track(launch, shard, active, ahead=1)
     close_step(launch, shard)
@@ -47,6 +49,7 @@ def reset(launch: Launch, shard: Shard) -> None:
     """Start the envs of ``mask`` anew: place their teams and take the first scan."""
     mask = shard.view.mask
     place_teams(launch, shard)
+    place_base(launch, shard)
     list_near(launch, shard, mask)
     scan(launch, shard, mask)
     merge_scan(launch, shard, mask)

@@ -100,6 +100,7 @@ def setups() -> dict:
     from maexp.envs import CommConfig, ObservationConfig, PlannerConfig, RobotConfig
 
     near, sight = CommConfig(range=9.0), CommConfig(range=20.0, line_of_sight=True)
+    base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, base_station=True)
     kinds = [RobotConfig(kind=kind) for kind in ("ackermann", "differential", "omnidirectional", "ackermann")]
     dwa, wavefront = (PlannerConfig(name=name) for name in ("dwa", "wavefront"))
     return {
@@ -112,6 +113,7 @@ def setups() -> dict:
         ),
         "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "oracle"),
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
+        "signals": (dict(planner=wavefront, comm=base, done="everyone", num_robots=6), "cost_utility"),
         "rollouts": (dict(planner=wavefront), "lookahead"),
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),
@@ -153,7 +155,9 @@ def play_alone() -> str:
     visible = mk.visible_points(points[:150], points[150:], points[0], obstacle_radius=0.3)
     merged = mk.merge_maps(grid.flatten(1)[:, None].expand(-1, 3, -1), torch.rand(3, 3, 3, generator=generator) < 0.5)
     distance = mk.geodesic_distance(grid, torch.tensor([[5, 200]] * 3))
-    return digest(visible, merged, distance, mk.frontier_cells(grid, ~grid & (points[:51, 0].view(3, 17, 1) > 6.0)))
+    power = mk.received_power(grid[0], points[:60], points[60:120], edge=0.7)
+    frontier = mk.frontier_cells(grid, ~grid & (points[:51, 0].view(3, 17, 1) > 6.0))
+    return digest(visible, merged, distance, power, frontier)
 
 
 def main(cache: str) -> None:

@@ -10,18 +10,18 @@ from worlds import room
 import maexp.kernels as mk
 from maexp.agents.policies import POLICIES
 from maexp.agents.training.collect import make_collector
-from maexp.envs import ExplorationEnv, PlannerConfig
+from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
 DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
 """The CPU against itself shows that the comparison itself works where there is no GPU."""
 
 
-def play(device: str, planner: str) -> TensorDictBase:
+def play(device: str, planner: str, **settings) -> TensorDictBase:
     """Six macro steps of five teams of three, with fixed actions, on `device`."""
     env = ExplorationEnv(
         [room(30, 22), room(26, 19, "rotated")], num_envs=5, num_robots=3, device=device, seed=3,
-        local_steps=5, planner=PlannerConfig(name=planner),
+        local_steps=5, planner=PlannerConfig(name=planner), **settings,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(0)
     state, seen = env.reset(), []
@@ -45,6 +45,19 @@ def test_episodes_agree(device, planner):
     assert here["info", "coverage"].max() > 0.2 and torch.equal(there["done"], here["done"])
     pictures = [one["agents", "observation", "map"].int() for one in (here, there)]
     assert ((pictures[0] - pictures[1]).abs() > 2).float().mean() < 1e-3
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_radios_agree(device):
+    """Who hears whom, what the base station knows, and fading, which is drawn from the same keys."""
+    comm = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, base_station=True)
+    here, there = (play(one, "wavefront", comm=comm, done="base")["info"] for one in ("cpu", device))
+    for name in ("base_coverage", "worst_coverage", "base_coverage_auc", "counted_coverage", "connected"):
+        torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
+    assert 0.05 < here["connected"].mean() < 0.95 and here["base_coverage"].max() > 0.1
+    free, points = torch.rand(9, 12) < 0.8, 8.0 * torch.rand(2, 50, 2)
+    found = [mk.received_power(free.to(one), *points, edge=0.9).cpu() for one in ("cpu", device)]
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("device", DEVICES)

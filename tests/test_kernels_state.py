@@ -21,7 +21,7 @@ PLANNERS = ("dwa", "wavefront", "direct")
 def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=None) -> ExplorationEnv:
     return ExplorationEnv(
         worlds or [room(22, 19)], num_envs=envs, num_robots=robots, local_steps=3, num_threads=1,
-        planner=PlannerConfig(name=planner), comm=CommConfig(range=9.0) if limited else None,
+        planner=PlannerConfig(name=planner), comm=CommConfig(range=9.0, signal=True) if limited else None,
         observation=ObservationConfig(map="known"),
     )  # fmt: skip
 

@@ -121,6 +121,7 @@ class ScenarioSettings:
     num_steering: int | None = None
     max_steer: float | None = None
     success_coverage: float = 0.95  # share of the free points that ends an episode, in (0, 1]
+    done: str = "union"  # whose: what the team has seen; or base, everyone: what the station, or every robot, knows
     collision: str = "centre"  # or footprint
     importing: ImportSettings = import_settings()
 

@@ -213,7 +213,7 @@ def _ends(batch: TensorDictBase, success_coverage: float) -> dict[str, torch.Ten
     after, info = batch["next"], batch["next", "info"]
     ends = {
         "coverage": info["coverage"].squeeze(-1),
-        "success_rate": succeeded(info["coverage"].squeeze(-1), success_coverage),
+        "success_rate": succeeded(info, success_coverage).squeeze(-1),
         "collisions": info["collided"].sum(-1),
         "path_length": info["path_length"].mean(-1),
     }

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from tensordict import TensorDict, TensorDictBase
 
 from maexp.envs.environment import ExplorationEnv
-from maexp.envs.specs import INFO_ENV
+from maexp.envs.specs import OF_TEAM
 
 from .spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
 
@@ -169,7 +169,7 @@ class TeamVectorEnv(VectorEnv):
         told: dict[str, np.ndarray] = {}
         for name, value in now["info"].items():
             array = value.cpu().numpy()
-            told |= self._told(name, array[:, 0] if name in INFO_ENV else array)
+            told |= self._told(name, array[:, 0] if name in OF_TEAM else array)
         if self._kind == "targets":
             told |= self._told(MASK, now["agents", "observation", "targets_mask"].cpu().numpy().astype(np.int8))
         return told

@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 from tensordict import TensorDictBase
 
 from maexp.envs.environment import ExplorationEnv
-from maexp.envs.specs import INFO_ENV
+from maexp.envs.specs import OF_TEAM
 
 from .spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
 
@@ -159,7 +159,7 @@ class TeamParallelEnv(ParallelEnv):
         for i, name in self._numbered():
             if name in self.agents:
                 observations[name] = self._seen_by(i)
-                infos[name] = {key: value[0] if key in INFO_ENV else value[i] for key, value in team.items()}
+                infos[name] = {key: value[0] if key in OF_TEAM else value[i] for key, value in team.items()}
                 if self._kind == "targets":
                     infos[name][MASK] = observations[name][MASK].copy()
         return observations, infos
