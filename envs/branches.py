@@ -32,8 +32,9 @@ def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig 
     """An env of `count` branches of teams of `env`, on other maps perhaps, that draws no pictures."""
     from maexp.envs.environment import ExplorationEnv
 
+    comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
-        env.settings, num_envs=count, comm=comm or env.settings.comm,
+        env.settings, num_envs=count, comm=comm,
         observation=replace(env.settings.observation, pictures=False),
     )  # fmt: skip
     made = ExplorationEnv.__new__(ExplorationEnv)

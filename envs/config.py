@@ -109,6 +109,9 @@ class CommConfig:
     reaches 80 cells. ``noise`` [dB] is how much each part of the loss fades at most, drawn for every pair and moment.
 
     ``base_station`` is a radio with a map of its own: True stands where robot 0 starts, or it is a place (x, y) [m].
+
+    ``strategy`` is what robots do to tell others what they know, whatever their policy (`maexp.envs.strategy`):
+    nothing but to talk when they meet (``opportunistic``), or to report or meet every ``period`` decisions.
     """
 
     range: float = math.inf
@@ -119,6 +122,8 @@ class CommConfig:
     cell: float | Literal["auto"] = "auto"
     noise: float = 0.0
     base_station: bool | tuple[float, float] = False
+    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = "opportunistic"
+    period: int = 8
 
     @property
     def limited(self) -> bool:
@@ -131,6 +136,7 @@ class CommConfig:
         return self.base_station is not False
 
 
+STRATEGIES = ("opportunistic", "rendezvous", "relay", "return_to_base", "pursuit")
 DONE = ("union", "base", "everyone")
 """Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
 station knows, or what every robot knows that has not collided."""
@@ -283,8 +289,9 @@ def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None
         raise ValueError(f"planner=direct takes controls, observation.targets={count} shows goals: add action=regions")
 
 
-def check_comm(config: CommConfig) -> CommConfig:
+def check_comm(config: CommConfig, num_robots: int, planner: PlannerConfig) -> CommConfig:
     """Check every value, and make a place a tuple."""
+    _check_strategy(config, num_robots, planner)
     everyone = "0 or more metres (inf: everyone hears everyone)"
     _check_number("comm.range", config.range, everyone, least=0.0, finite=False)
     for name in ("line_of_sight", "signal"):
@@ -304,6 +311,23 @@ def check_comm(config: CommConfig) -> CommConfig:
     if cell != "auto" and not (number and 0.0 < cell < math.inf):
         raise ValueError(f'comm.cell={cell!r} must be "auto" or a number of metres above 0')
     return replace(config, base_station=_check_base(config.base_station))
+
+
+def _check_strategy(config: CommConfig, num_robots: int, planner: PlannerConfig) -> None:
+    name = config.strategy
+    _check_choice("comm.strategy", name, STRATEGIES)
+    if isinstance(config.period, bool) or not isinstance(config.period, int) or config.period < 1:
+        raise ValueError(f"comm.period={config.period!r} must be a whole number of decisions, 1 or more")
+    if name == "opportunistic":
+        return
+    if planner.name != "wavefront":
+        raise ValueError(f"comm.strategy={name} sends robots back: planner={planner.name} finds no way, use wavefront")
+    if not config.limited:
+        raise ValueError(f"comm.strategy={name} is for radios that do not reach: add comm=ir2, comm.range or the like")
+    if name in ("relay", "return_to_base") and not config.has_base:
+        raise ValueError(f"comm.strategy={name} needs a base station: add comm.base_station=true")
+    if name == "relay" and num_robots < 2:
+        raise ValueError(f"comm.strategy=relay needs an explorer and a relay: num_robots={num_robots}, give 2 or more")
 
 
 def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:

@@ -27,6 +27,7 @@ from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import REWARD_TERMS, action_spec, done_spec, info_shapes, observation_spec, reward_spec
 from maexp.envs.starts import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
+from maexp.envs.strategy import Strategy
 from maexp.envs.target_view import TargetView, draw_targets
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
@@ -146,6 +147,7 @@ class ExplorationEnv(EnvBase):
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
         shown = settings.observation.targets
+        self.strategy = None if settings.comm.strategy == "opportunistic" else Strategy(self)
         self.target_view = TargetView(self, shown) if shown else None
         if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
             self.rand_action = partial(draw_targets, super().rand_action)
@@ -220,6 +222,8 @@ class ExplorationEnv(EnvBase):
             state["command"].copy_(torch.nan_to_num(control))
         else:
             region, offset = self._find_goals(action)
+            if self.strategy is not None:
+                region, offset = self.strategy.direct(region, offset)
             state["region"].copy_(region)
             state["offset"].copy_(offset)
 
@@ -365,13 +369,17 @@ class ExplorationEnv(EnvBase):
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""
         state = {name: self.simulation.tensors[name].clone() for name in STATE}
-        return state | ({} if self.target_view is None else self.target_view.state_dict())
+        return state | self._memories()
+
+    def _memories(self) -> dict[str, torch.Tensor]:
+        """What those remember that look at the simulation, copied."""
+        parts = (self.strategy, self.target_view)
+        return {name: one for part in parts if part is not None for name, one in part.state_dict().items()}
 
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
-        wanted = {name: own[name] for name in STATE}
-        wanted |= {} if self.target_view is None else self.target_view.state_dict()
+        wanted = {name: own[name] for name in STATE} | self._memories()
         wrong = [n for n, one in wanted.items() if n not in state_dict or state_dict[n].shape != one.shape]
         if wrong:
             raise ValueError(
@@ -381,8 +389,9 @@ class ExplorationEnv(EnvBase):
         for name in STATE:
             own[name].copy_(state_dict[name])
         self._fix_starts()
-        if self.target_view is not None:
-            self.target_view.load_state_dict(state_dict)
+        for part in (self.strategy, self.target_view):
+            if part is not None:
+                part.load_state_dict(state_dict)
 
     def __reduce__(self):
         return rebuild, describe(self)

@@ -127,7 +127,7 @@ def complete_settings(
     reward = check_reward(one_config("reward", reward, RewardConfig))
     observation = one_config("observation", observation, ObservationConfig)
     check_observation(observation, planner)
-    comm = check_comm(one_config("comm", comm, CommConfig))
+    comm = check_comm(one_config("comm", comm, CommConfig), num_robots, planner)
     check_base(maps, comm)
     targets = check_targets(one_config("targets", targets, TargetsConfig))
     lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))

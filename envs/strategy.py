@@ -1,0 +1,221 @@
+"""What robots do about radios that do not reach: `comm.strategy`, around any planner or policy.
+
+A strategy takes over where its rules send a robot to tell somebody what it knows; else the robot goes where its policy
+sends it. The rules use what the robot itself can know: its own map and odometer, the time, where the base station is,
+and whom it was connected with when, over any number of others. How far it is back into contact a robot guesses from the
+straight line, and from its odometer: no farther than it has driven since.
+
+Sources: reports to a base, PRoID (arXiv 2604.10433); appointments, Tellaroli et al. 2023 (2309.13494); a relay, Hua et
+al. 2025 (2510.04161); pursuit where it pays, mTARE (Cao et al. 2023).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from maexp.envs.navigation import to_action
+from maexp.kernels import unpack_flags
+from maexp.kernels.types import DT
+
+if TYPE_CHECKING:
+    from maexp.envs.environment import ExplorationEnv
+
+PACE = 0.7  # share of its greatest speed that a robot counts on for its way back
+DETOUR = 1.5  # how much longer than the straight line it takes its way back to be
+IDLE = 2  # decisions without anything new after which a robot has nothing better to do than to tell
+PATIENCE = 3  # decisions that robots wait for others after the time agreed on
+WORTH = 1.0  # a pursuit pays where the other misses so many radar discs, and
+WAY_COST = 0.3  # as many more for every radar range of way there
+NEAR = 0.5  # a robot this near to a place is there [radar ranges]
+
+
+class Strategy:
+    """The strategy of an env's teams.
+
+    Args:
+        env: the env; only read.
+
+    Attributes:
+        state: tensors that later decisions depend on; U radios, the base station's last. ``met`` int32 [E, N, U], the
+            macro step in which a robot was last connected with a radio, -1: never; ``place`` [E, N, U, 2], where that
+            was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what it knew
+            then; ``knew`` and ``grew`` int32 [E, N], what it knew last and when that last became more; ``duty`` bool
+            [E, N], who is on its way to tell; ``due`` int32 [E, N], ``spot`` [E, N, 2] and ``party`` bool [E, N, U]:
+            when, where and with whom it has an appointment.
+    """
+
+    def __init__(self, env: ExplorationEnv):
+        self.env, self.name, self.period = env, env.comm_config.strategy, env.comm_config.period
+        s, device = env.simulation.tensors, env.device
+        e, n, u = *s["center"].shape[:2], s["known_weight"].shape[1]
+        self.has_base, self.robots = env.comm_config.has_base, n
+        self.reach = max(one.range for one in env.radar_configs)
+        self.drive = env.simulation.robot_tensors["max_speed"] * (PACE * DT * env.local_steps)  # of a decision [m]
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.int32) -> torch.Tensor:
+            return torch.zeros(shape, dtype=dtype, device=device)
+
+        self.state = {
+            "met": zeros(e, n, u), "place": zeros(e, n, u, 2, dtype=torch.float32),
+            "driven": zeros(e, n, u, dtype=torch.float32), "told": zeros(e, n, u), "knew": zeros(e, n),
+            "grew": zeros(e, n), "duty": zeros(e, n, dtype=torch.bool), "due": zeros(e, n),
+            "spot": zeros(e, n, 2, dtype=torch.float32), "party": zeros(e, n, u, dtype=torch.bool),
+        }  # fmt: skip
+
+    @torch.no_grad()
+    def direct(self, region: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Region [E, N] and offset [E, N, 2] of where robots go, given where their policy sends them."""
+        self._look()
+        duty, goal = getattr(self, f"_{self.name}")()
+        self.state["duty"] = duty & (self.sim["collided"] == 0)
+        own_region, own_offset = to_action(self.env, goal)
+        duty = self.state["duty"]
+        return torch.where(duty, own_region, region), torch.where(duty.unsqueeze(-1), own_offset, offset)
+
+    # What a robot knows of the others
+
+    def _look(self) -> None:
+        """Bring the memory up to date: who is connected with whom now."""
+        self.sim = sim = self.env.simulation.tensors
+        s, n = self.state, self.robots
+        self.step = sim["macro_step"].view(-1, 1)
+        self.known = sim["known_weight"][:, :n]
+        self.at = sim["center"][..., :2]
+        radios = torch.cat([self.at, sim["base"][:, None, :2]], 1)[:, : s["met"].shape[-1]]
+        self.linked = links = self._links()
+        begins = self.step == 0
+        wide = begins.unsqueeze(-1)
+        odometer = sim["path_length"]
+        for name, blank in (("met", -1), ("driven", 0), ("told", 0), ("party", False)):
+            s[name] = s[name].masked_fill(wide, blank)
+        for name, blank in (("duty", False), ("knew", 0), ("grew", 0), ("due", 0)):
+            s[name] = s[name].masked_fill(begins, blank)
+        s["place"] = torch.where(links.unsqueeze(-1), radios.unsqueeze(1), s["place"])
+        s["met"] = torch.where(links, self.step.unsqueeze(-1).to(torch.int32), s["met"])
+        s["driven"] = torch.where(links, odometer.unsqueeze(-1), s["driven"])
+        s["told"] = torch.where(links, self.known.unsqueeze(-1), s["told"])
+        s["grew"] = torch.where(self.known > s["knew"], self.step.to(torch.int32), s["grew"])
+        s["knew"] = self.known.clone()
+        if self.has_base:  # every robot knows where that is
+            s["place"][:, :, n] = sim["base"][:, None, :2]
+        self.straight = (s["place"] - self.at.unsqueeze(2)).norm(dim=-1)
+        since = torch.where(s["met"] < 0, torch.inf, odometer.unsqueeze(-1) - s["driven"])
+        self.way = torch.minimum(since, DETOUR * self.straight)  # into contact with a radio again [m]
+        self.left = (self.env.macro_steps - self.step) * self.drive  # how far a robot still gets in the episode [m]
+        self.idle = self.step - s["grew"] >= IDLE
+
+    def _links(self) -> torch.Tensor:
+        """Radios that each robot is connected with over any number of others, bool [E, N, U]."""
+        words = self.sim["hears"]
+        radios = words.shape[1]
+        links = unpack_flags(words.transpose(1, 2).contiguous(), radios).transpose(1, 2).float()
+        for _ in range(max(radios - 1, 1).bit_length()):
+            links = ((links @ links) > 0).float()
+        return links[:, : self.robots] > 0
+
+    # The strategies: bool [E, N], who is taken over, and float32 [E, N, 2], where to [m]
+
+    def _return_to_base(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Who has something to tell reports every `comm.period` decisions, when nothing new comes, and in time before
+        the end."""
+        n, s = self.robots, self.state
+        since = self.step - s["met"][..., n].clamp_min(0)
+        go = s["duty"] | (since >= self.period) | self.idle | self._is_late()
+        return go & self._has_news(n) & ~self.linked[..., n], s["place"][:, :, n]
+
+    def _has_news(self, radio: int) -> torch.Tensor:
+        """Robots that have learned something since they were last connected with a radio."""
+        return self.known > self.state["told"][..., radio]
+
+    def _is_late(self) -> torch.Tensor:
+        """Robots that get back to the base station just before the episode ends."""
+        return self.left <= self.way[..., self.robots] + self.drive
+
+    def _rendezvous(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Robots that are connected agree to meet `comm.period` decisions later, at the base station or where the first
+        of them is; whoever is parted from others of its party is there in time, and waits."""
+        s, n = self.state, self.robots
+        mates = self.linked[..., :n]
+        missing = (s["party"] & ~self.linked).any(-1) & (self.step <= s["due"] + PATIENCE)
+        bound = mates & missing.unsqueeze(1)  # [i, j]: i is with j, who has promised to meet somebody else
+        due = torch.where(bound, s["due"].unsqueeze(1), torch.iinfo(torch.int32).max)
+        first = due.argmin(-1)  # the earliest promise counts for all who are together
+        keeps = bound.any(-1)
+        leader = mates.float().argmax(-1)  # the first of those connected
+        party = self.linked.clone()
+        spot = self._pick(self.at, leader)
+        if self.has_base:
+            party[..., n], spot = True, s["place"][:, :, n]
+        s["due"] = torch.where(keeps, s["due"].gather(1, first), self.step + self.period).to(torch.int32)
+        s["spot"] = torch.where(keeps.unsqueeze(-1), self._pick(s["spot"], first), spot)
+        promised = s["party"].gather(1, first.unsqueeze(-1).expand_as(s["party"])) | self.linked
+        s["party"] = torch.where(keeps.unsqueeze(-1), promised, party)
+        absent = s["party"] & ~self.linked
+        time = (s["due"] - self.step) * self.drive
+        back = (DETOUR * (s["spot"] - self.at).norm(dim=-1)).minimum(self._driven(absent)) + self.drive
+        news = (absent & (self.known.unsqueeze(-1) > s["told"])).any(-1)
+        go = absent.any(-1) & ((time <= back) | (self.idle & news) | (s["duty"] & keeps))
+        if self.has_base:
+            go = go | (self._is_late() & self._has_news(n) & ~self.linked[..., n])
+        return go, s["spot"]
+
+    def _driven(self, absent: torch.Tensor) -> torch.Tensor:
+        """How far robots have driven since they parted from the last of those `absent` [m], float32 [E, N]."""
+        since = self.sim["path_length"].unsqueeze(-1) - self.state["driven"]
+        return torch.where(absent, since, 0.0).amax(-1)
+
+    def _pick(self, places: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
+        """Rows [E, N, 2] of others' places, int64 [E, N]."""
+        return places.gather(1, robot.unsqueeze(-1).expand(-1, -1, 2))
+
+    def _relay(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The last robot goes to and fro between the base station and whom it has not met for longest; the others come
+        home when they find nothing new, and in time before the end."""
+        s, n = self.state, self.robots
+        home, goal = self._has_news(n) & ~self.linked[..., n], s["place"][:, :, n].clone()
+        go = home & (s["duty"] | self.idle | self._is_late())
+        last = n - 1
+        met = s["met"][:, last, :last]
+        unheard = (met >= 0) & ~self.linked[:, last, :last]
+        fresh = met > s["met"][:, last, n : n + 1]  # met since it was last connected with the base station
+        report = home[:, last] & (fresh.any(-1) | self.idle[:, last] | self._is_late()[:, last])
+        oldest = torch.where(unheard, met, torch.iinfo(torch.int32).max).argmin(-1)
+        where = s["place"][:, last, :last][torch.arange(len(met), device=met.device), oldest]
+        seek = ~report & unheard.any(-1) & ((where - self.at[:, last]).norm(dim=-1) > NEAR * self.reach)
+        go[:, last] = report | seek
+        goal[:, last] = torch.where(report.unsqueeze(-1), goal[:, last], where)
+        return go, goal
+
+    def _pursuit(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """A robot goes to where it last heard the one that misses most, the base station too, as soon as that pays."""
+        s = self.state
+        maps = self.env.simulation.map_tensors
+        area = torch.tensor([one.free_area for one in self.env.maps], device=self.env.device)
+        disc = (maps["total_weight"] / area * torch.pi * self.reach**2)[self.sim["map_id"].long()].view(-1, 1, 1)
+        gap = self.straight / self.reach
+        there = (gap <= NEAR) & ~self.linked  # nobody is here any more: it will not be looked for again
+        s["told"] = torch.where(there, self.known.unsqueeze(-1), s["told"])
+        misses = (self.known.unsqueeze(-1) - s["told"]) / disc
+        known = s["met"] >= 0
+        if self.has_base:
+            known[..., self.robots] = True
+        pays = torch.where(known & ~self.linked, misses - WORTH - WAY_COST * gap, -torch.inf)
+        best, whom = pays.max(-1)
+        goal = s["place"].gather(2, whom.view(*whom.shape, 1, 1).expand(-1, -1, 1, 2)).squeeze(2)
+        go = best > 0.0
+        if self.has_base:
+            home = self._has_news(self.robots) & ~self.linked[..., self.robots] & (self._is_late() | self.idle)
+            goal = torch.where(home.unsqueeze(-1), s["place"][:, :, self.robots], goal)
+            go = go | home
+        return go, goal
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Everything that later decisions depend on, copied."""
+        return {f"strategy_{name}": value.clone() for name, value in self.state.items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on where `state_dict` was taken."""
+        for name, value in self.state.items():
+            self.state[name] = state[f"strategy_{name}"].to(value).clone()
