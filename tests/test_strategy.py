@@ -1,0 +1,225 @@
+"""What robots do about radios that do not reach: who goes to tell, where to, and that it repeats."""
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+from worlds import room
+
+from maexp.agents.policies import POLICIES
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.envs.config import STRATEGIES
+from maexp.envs.strategy import PATIENCE
+from maexp.kernels.types import REGIONS
+
+WORLD = room(40, 22)
+BASE = (2.0, 10.0)
+
+
+def make(strategy: str = "return_to_base", robots: int = 2, envs: int = 1, base=BASE, **settings) -> ExplorationEnv:
+    comm = CommConfig(range=settings.pop("range", 6.0), base_station=base, strategy=strategy,
+                      period=settings.pop("period", 3))  # fmt: skip
+    settings = {"local_steps": 10, "macro_steps": 40, "num_threads": 1, "seed": 2, "success_coverage": 1.0} | settings
+    return ExplorationEnv(WORLD, envs, robots, comm=comm, **settings)
+
+
+def put(env: ExplorationEnv, places: dict[int, tuple[float, float]]) -> None:
+    """Move robots by hand, and let one local step tell them whom they hear there."""
+    s = env.simulation.tensors
+    for robot, place in places.items():
+        at = torch.tensor(place)
+        s["path_length"][:, robot] += (s["center"][:, robot, :2] - at).norm(dim=-1)
+        for name in ("center", "pose"):
+            s[name][:, robot] = 0.0
+            s[name][:, robot, :2] = at
+    env.simulation.step(0, 1)
+
+
+def stay(env: ExplorationEnv) -> TensorDict:
+    """The action that keeps every robot where it is."""
+    (left, low), (right, high) = WORLD.extent
+    lower, size = torch.tensor([left, low]), torch.tensor([right - left, high - low]) / REGIONS
+    cell = ((env.simulation.tensors["center"][..., :2] - lower) / size).clamp(0, REGIONS - 1e-3)
+    index = cell.long()
+    td = env.fake_tensordict().select(("agents", "action")).clone()
+    td["agents", "action", "region"] = index[..., 0] * REGIONS + index[..., 1]
+    td["agents", "action", "offset"] = 2.0 * (cell - index) - 1.0
+    return td
+
+
+def wait(env: ExplorationEnv, steps: int = 1) -> torch.Tensor:
+    """Who is on duty after so many decisions to stay, bool [N]."""
+    for _ in range(steps):
+        env.step(stay(env))
+    return env.strategy.state["duty"][0]
+
+
+def goal_of(env: ExplorationEnv, robot: int) -> list[float]:
+    return env.simulation.tensors["goal"][0, robot].tolist()
+
+
+def start(env: ExplorationEnv, *poses) -> None:
+    env.set_starts([[*one, 0.0] for one in poses])
+    env.reset()
+
+
+def test_a_robot_reports_and_is_released():
+    env = make()
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    assert not wait(env, 2).any(), "connected"
+    put(env, {1: (17.0, 10.0)})
+    assert not wait(env, 2).any(), "not yet"
+    assert wait(env).tolist() == [False, True], "period after it was last connected"
+    assert goal_of(env, 1) == pytest.approx(BASE, abs=1e-3)
+    told = env.simulation.tensors["known_weight"][0, 2].item()
+    put(env, {1: (6.0, 12.0)})
+    assert wait(env, 2).tolist() == [False, False] and env.simulation.tensors["known_weight"][0, 2] > told
+
+
+def test_who_has_nothing_to_tell_does_not_report():
+    env = make(robots=1)
+    start(env, (4.0, 10.0))
+    wait(env)
+    env.simulation.tensors["known_free"].fill_(-1)  # it knows everything already
+    put(env, {0: (17.0, 10.0)})
+    assert not wait(env, 5).any()
+
+
+def test_robots_come_home_in_time():
+    """Before the end they turn back as far away as they are, long before the period is over."""
+    env = make(robots=1, period=1000)
+    start(env, (4.0, 10.0))
+    wait(env)
+    put(env, {0: (36.0, 10.0)})
+    duty = []
+    for _ in range(38):
+        env.strategy.state["grew"][:] = env.simulation.tensors["macro_step"].view(-1, 1)  # there is always news
+        duty.append(bool(wait(env)[0]))
+        if duty[-1]:
+            break
+    drive = 0.7 * env.robot_configs[0].max_speed * 1.0  # of a decision [m]
+    assert 40 - len(duty) == pytest.approx(32.0 / drive + 1, abs=1.0), "no farther back than it has driven"
+
+
+def test_an_appointment_is_kept_with_patience():
+    env = make("rendezvous", base=False, period=6)
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    agreed = env.strategy.state
+    assert agreed["due"].tolist() == [[6, 6]] and agreed["spot"][0, 1].tolist() == pytest.approx([4.0, 10.0], abs=0.01)
+    put(env, {1: (30.0, 10.0)})
+    duty = []
+    for _ in range(5 + PATIENCE + 2):
+        duty.append(wait(env).tolist())
+        put(env, {1: (30.0, 10.0)})  # something holds it up
+    assert agreed["due"][0, 1] != 6, "the other has not come: it is no longer waited for"
+    assert [False, True] in duty[:5] or [True, True] in duty[:5], "who is far away leaves before the time"
+    assert duty[6] == [True, True] and duty[-1] == [False, False]
+    put(env, {1: (6.0, 12.0)})
+    wait(env)
+    assert agreed["party"][0].all() and agreed["due"][0, 0] == agreed["due"][0, 1], "they agree anew"
+
+
+def test_the_earliest_promise_counts_for_all_who_are_together():
+    env = make("rendezvous", robots=3, base=False, period=6)
+    start(env, (4.0, 10.0), (6.0, 12.0), (30.0, 10.0))
+    wait(env)
+    put(env, {0: (24.0, 10.0)})  # 0 has promised 1 to be back, and now meets 2
+    wait(env)
+    wait(env)
+    s = env.strategy.state
+    assert s["due"][0].tolist() == [6, 6, 6] and s["spot"][0, 2].tolist() == pytest.approx([4.0, 10.0], abs=0.01)
+    assert s["party"][0, 2].tolist() == [True, True, True]
+
+
+def test_a_relay_goes_to_and_fro():
+    env = make("relay")
+    start(env, (9.5, 10.0), (4.0, 10.0))
+    wait(env)
+    put(env, {0: (17.0, 10.0)})
+    assert wait(env).tolist() == [False, True] and goal_of(env, 1) == pytest.approx([9.5, 10.0], abs=0.5)
+    put(env, {1: (20.0, 12.0)})  # they meet far from the base station, and have seen more
+    wait(env)
+    put(env, {0: (36.0, 10.0)})
+    assert wait(env).tolist() == [False, True] and goal_of(env, 1) == pytest.approx(BASE, abs=1e-3)
+    put(env, {1: (4.0, 10.0)})
+    wait(env)
+    assert env.strategy.state["duty"].tolist() == [[False, True]], "told, it looks for the explorer"
+    assert goal_of(env, 1) == pytest.approx([17.0, 10.0], abs=1.0)
+
+
+def test_a_pursuit_pays_by_what_the_other_misses():
+    env = make("pursuit", base=False)
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    put(env, {1: (17.0, 10.0)})
+    assert not wait(env).any(), "too little"
+    env.simulation.tensors["known_weight"][0, 1] += 800
+    assert wait(env).tolist() == [False, True] and goal_of(env, 1) == pytest.approx([4.0, 10.0], abs=0.1)
+    put(env, {0: (36.0, 10.0), 1: (4.0, 12.0)})
+    assert not wait(env)[1], "there, and nobody to be heard"
+
+
+@pytest.mark.parametrize("strategy", [one for one in STRATEGIES if one != "opportunistic"])
+def test_decisions_repeat(strategy):
+    """For any size of the batch, from a saved state and in a copy, with targets or a planner's goals."""
+    world = {"base": True, "local_steps": 10, "observation": ObservationConfig(targets=4), "robots": 3}
+    small, large = (make(strategy, envs=count, **world) for count in (1, 3))
+    for env in (small, large):
+        env.set_episodes(torch.arange(env.num_envs))
+    generator = torch.Generator().manual_seed(1)
+    picks = torch.randint(4, (6, 3, 3), generator=generator)
+    one, many = small.reset(), large.reset()
+    on_duty = 0
+    for k, pick in enumerate(picks):
+        if k == 3:
+            saved = small.state_dict()
+            small = pickle.loads(pickle.dumps(small))
+            small.load_state_dict(saved)
+        states = []
+        for env, td, rows in ((small, one, pick[:1]), (large, many, pick)):
+            td["agents", "action", "target"] = rows
+            states.append(env.step(td))
+        one, many = (step_mdp(state) for state in states)
+        for name in ("pose", "known_weight", "hears"):
+            assert torch.equal(small.simulation.tensors[name][0], large.simulation.tensors[name][0]), name
+        for name, value in small.strategy.state.items():
+            assert torch.equal(value[0], large.strategy.state[name][0]), name
+        on_duty += int(large.strategy.state["duty"].sum())
+    assert on_duty or strategy in ("pursuit", "relay")
+
+
+def test_a_new_episode_remembers_nothing():
+    env = make("rendezvous", robots=3, envs=2, base=True, macro_steps=5)
+    policy, td = POLICIES["cost_utility"](env), env.reset()
+    for _ in range(4):
+        td = step_mdp(env.step(policy(td)))
+    fresh = make("rendezvous", robots=3, envs=2, base=True, macro_steps=5)
+    fresh.reset()
+    for one in (env, fresh):
+        one.set_episodes(torch.arange(2))
+        one.reset()
+        one.step(stay(one))
+    for name, value in env.strategy.state.items():
+        if name not in ("place", "spot"):  # those that have never met are nowhere
+            assert torch.equal(value, fresh.strategy.state[name]), name
+
+
+@pytest.mark.parametrize(
+    "comm, settings, words",
+    [
+        (dict(strategy="shout"), {}, "comm.strategy='shout'"),
+        (dict(strategy="rendezvous"), {}, "is for radios that do not reach"),
+        (dict(strategy="relay", range=5.0), {}, "needs a base station"),
+        (dict(strategy="return_to_base", range=5.0), {}, "needs a base station"),
+        (dict(strategy="relay", range=5.0, base_station=True), dict(num_robots=1), "num_robots=1"),
+        (dict(strategy="pursuit", range=5.0), dict(planner=PlannerConfig(name="dwa")), "planner=dwa finds no way"),
+        (dict(strategy="pursuit", range=5.0, period=0), {}, "comm.period=0"),
+        (dict(strategy="pursuit", range=5.0, period=2.5), {}, "comm.period=2.5"),
+    ],
+)
+def test_bad_settings_are_named(comm, settings, words):
+    with pytest.raises(ValueError, match=words):
+        ExplorationEnv(WORLD, comm=CommConfig(**comm), **settings)
