@@ -30,6 +30,8 @@ COLUMNS = {
     "success_rate": "success",
     "collisions": "collisions",
     "path_length": "path [m]",
+    "base_coverage_auc": "base over time",
+    "worst_coverage_auc": "worst over time",
 }
 
 
@@ -88,7 +90,8 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
     rests on, where it is little."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("policy", no_wrap=True)
-    columns = [name for name in COLUMNS if in_reach(name, results[0].success_coverage)]
+    told = results[0].summary()
+    columns = [name for name in COLUMNS if name in told and in_reach(name, results[0].success_coverage)]
     for name in columns:
         table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)  # [m] is no style of rich's
     for name, result in zip(result_names(results), results, strict=True):
