@@ -289,9 +289,8 @@ def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None
         raise ValueError(f"planner=direct takes controls, observation.targets={count} shows goals: add action=regions")
 
 
-def check_comm(config: CommConfig, num_robots: int, planner: PlannerConfig) -> CommConfig:
+def check_comm(config: CommConfig) -> CommConfig:
     """Check every value, and make a place a tuple."""
-    _check_strategy(config, num_robots, planner)
     everyone = "0 or more metres (inf: everyone hears everyone)"
     _check_number("comm.range", config.range, everyone, least=0.0, finite=False)
     for name in ("line_of_sight", "signal"):
@@ -310,14 +309,15 @@ def check_comm(config: CommConfig, num_robots: int, planner: PlannerConfig) -> C
     number = isinstance(cell, int | float) and not isinstance(cell, bool)
     if cell != "auto" and not (number and 0.0 < cell < math.inf):
         raise ValueError(f'comm.cell={cell!r} must be "auto" or a number of metres above 0')
+    _check_choice("comm.strategy", config.strategy, STRATEGIES)
+    if isinstance(config.period, bool) or not isinstance(config.period, int) or config.period < 1:
+        raise ValueError(f"comm.period={config.period!r} must be a whole number of decisions, 1 or more")
     return replace(config, base_station=_check_base(config.base_station))
 
 
-def _check_strategy(config: CommConfig, num_robots: int, planner: PlannerConfig) -> None:
+def check_strategy(config: CommConfig, num_robots: int, planner: PlannerConfig) -> None:
+    """Raise ValueError if the team, its radios or its planner do not go with `comm.strategy`."""
     name = config.strategy
-    _check_choice("comm.strategy", name, STRATEGIES)
-    if isinstance(config.period, bool) or not isinstance(config.period, int) or config.period < 1:
-        raise ValueError(f"comm.period={config.period!r} must be a whole number of decisions, 1 or more")
     if name == "opportunistic":
         return
     if planner.name != "wavefront":

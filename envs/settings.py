@@ -21,6 +21,7 @@ from maexp.envs.config import (
     check_lookahead,
     check_observation,
     check_reward,
+    check_strategy,
     check_targets,
     complete_planner,
     complete_radar,
@@ -127,7 +128,8 @@ def complete_settings(
     reward = check_reward(one_config("reward", reward, RewardConfig))
     observation = one_config("observation", observation, ObservationConfig)
     check_observation(observation, planner)
-    comm = check_comm(one_config("comm", comm, CommConfig), num_robots, planner)
+    comm = check_comm(one_config("comm", comm, CommConfig))
+    check_strategy(comm, num_robots, planner)
     check_base(maps, comm)
     targets = check_targets(one_config("targets", targets, TargetsConfig))
     lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))
