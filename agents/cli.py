@@ -51,6 +51,11 @@ VERBS = {
         ("task", "place"),
         ("list", "show", "run", "verify", "freeze"),
     ),
+    "leaderboard": Verb(
+        "makes rows of runs of suites and draws a page of them that needs nothing but a browser",
+        ("maexp leaderboard outputs/mine docs/leaderboard out=site",),
+        ("places...",),
+    ),
     "view": Verb(
         "shows a run, a recorded episode or a map in 3D: window, picture or browser",
         ("maexp view RUN", "maexp view RUN browser=true", "maexp view floor.yaml policy=nearest_frontier",
@@ -135,7 +140,7 @@ def overview() -> str:
     """What `maexp` alone prints."""
     lines = ["maexp: multi-robot exploration with reinforcement learning on point-cloud maps", ""]
     for name, verb in VERBS.items():
-        lines += [f"  {name:<10}{verb.summary}", *(f"  {'':<10}  {one}" for one in verb.examples), ""]
+        lines += [f"  {name:<12}{verb.summary}", *(f"  {'':<12}  {one}" for one in verb.examples), ""]
     return "\n".join([*lines, "maexp VERB --help lists the settings and choices of a verb."])
 
 

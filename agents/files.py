@@ -12,7 +12,7 @@ from maexp.envs.files import whole_file
 
 def write_json(path: Path, content: Any) -> None:
     """A JSON file, null where a number is NaN."""
-    write_text(path, json.dumps(_without_nan(content), indent=2) + "\n")
+    write_text(path, json.dumps(without_nan(content), indent=2) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -42,10 +42,10 @@ def command(verb: str, *words: str) -> str:
     return shlex.join(["maexp", verb, *words])
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """JSON has no NaN: null instead."""
     if isinstance(value, dict):
-        return {name: _without_nan(one) for name, one in value.items()}
+        return {name: without_nan(one) for name, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(one) for one in value]
+        return [without_nan(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

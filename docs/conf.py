@@ -1,6 +1,7 @@
 """Sphinx: the pages of this folder and the reference from docstrings. Build: sphinx-build -W docs docs/_build."""
 
 from importlib import metadata
+from pathlib import Path
 
 project = "MAexp"
 release = metadata.version("maexp")
@@ -29,5 +30,16 @@ def escape(app, what, name, obj, options, lines):
     lines[:] = [line.replace("[*,", r"[\*,").replace("|free|", r"\|free\|") for line in lines]
 
 
+def draw_leaderboard(app, error):
+    """The page of the rows, beside their tables."""
+    from maexp.agents.suites.rows import find_rows, read_row
+    from maexp.agents.suites.site import write_page
+
+    if error is None and app.builder.format == "html":
+        rows = [read_row(path) for path in find_rows(Path(app.srcdir) / "leaderboard")]
+        write_page(Path(app.outdir) / "leaderboard", rows)
+
+
 def setup(app):
+    app.connect("build-finished", draw_leaderboard)
     app.connect("autodoc-process-docstring", escape)

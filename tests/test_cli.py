@@ -49,8 +49,8 @@ def test_alone_it_lists_the_verbs_with_examples(capsys):
 def test_help_names_settings_and_choices(verb, capsys):
     assert main([verb, "--help"]) == 0
     text = capsys.readouterr().out
-    assert "num_robots=" in text or verb in ("policies", "suite")
-    if verb not in ("maps", "irsim", "export", "policies", "suite"):
+    assert "num_robots=" in text or verb in ("policies", "suite", "leaderboard")
+    if verb not in ("maps", "irsim", "export", "policies", "suite", "leaderboard"):
         assert "maze_small" in text and "wavefront" in text and "camera" in text
 
 

@@ -98,6 +98,8 @@ COMMANDS = [line for line in shown() if line.startswith("maexp")]
 
 def small(line: str) -> list[str]:
     """The words of a command, with what it stands for, and small."""
+    if line.startswith("maexp leaderboard"):
+        return [*shlex.split(line)[1:], "suite=small.yaml"]
     if line.startswith("maexp suite "):
         line = line.replace("run minival", "run small.yaml").replace("mine.yaml", "small.yaml")
         line = line.replace("FOLDER", "outputs/mine")
@@ -125,13 +127,14 @@ def small(line: str) -> list[str]:
 
 def set_stage(words: list[str]) -> None:
     """Earlier commands of a page made what this one reads, and none made what it is to write."""
-    if words[0] == "suite" and "outputs/mine" in "".join(words[2:]) and not Path("outputs/mine").exists():
+    mine = words[0] in ("suite", "leaderboard") and "outputs/mine" in "".join(words[2:])
+    if mine and not Path("outputs/mine").exists():
         assert main(["suite", "run", "small.yaml", "policy=random", "hydra.run.dir=outputs/mine"]) == 0
     for name, value in (word.split("=", 1) for word in words if "=" in word):
         place = Path(value)
         if name == "hydra.run.dir" and place.is_dir():
             shutil.rmtree(place)
-        elif name == "out":
+        elif name == "out" and not place.is_dir():
             place.unlink(missing_ok=True)
         elif name == "checkpoint" and not place.exists():
             shutil.copytree("outputs/run", place)
@@ -173,6 +176,7 @@ def folder(tmp_path_factory) -> Path:
     export_ros_map(room(8, 6, spacing=0.1), place / "cupboard.yaml")
     (place / "scan.xyz").write_text("1 2 nan\n" + "\n".join(f"{i % 9} {i // 9} 0" for i in range(90)))
     make_small_suite(place / "small.yaml")
+    shutil.copytree(ROOT / "docs" / "leaderboard", place / "docs" / "leaderboard")
     shutil.copy(ROOT / "docs" / "examples" / "policies" / "nearest.py", place)
     page = (ROOT / "docs" / "extending.md").read_text()
     (place / "my_robots.py").write_text(re.findall(r"`my_robots.py`:\n\n```python\n(.*?)```", page, re.DOTALL)[0])

@@ -50,7 +50,7 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
     Args:
         verb: decides which settings take a list (num_robots=1,2,6)
         words: name=value, or bare values for the settings in `positional`, in order
-        positional: settings that may be given without their name
+        positional: settings that may be given without their name; one that ends in ... takes all that is left
         multirun: commas mean a sweep, so they are left alone
 
     Raises:
@@ -58,17 +58,22 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
     """
     names = list(positional)
     known = {*schema(verb).__dataclass_fields__, "hydra"}
-    result = []
+    result, several = [], []
     for word in words:
         name, sign, value = word.partition("=")
         setting = sign and re.fullmatch(r"[+~]*[\w./@:-]+", name)
         if not setting or (names and re.split(r"[./]", name.lstrip("+~"))[0] not in known):
             if not names:
                 raise UserError(f"{word!r} is no setting of maexp {verb}: write name=value (see maexp {verb} --help).")
+            if names[0].endswith("..."):
+                several.append(quote(word))
+                continue
             name, value = names.pop(0), word
         if verb == "benchmark":
             name = ALSO.get(name, name)
         result.append(_make_override(verb, name, value, multirun))
+    if several:
+        result.append(f"{names[0].removesuffix('...')}=[{','.join(several)}]")
     return result
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.files import short, write_file, write_text
+from maexp.agents.files import short, without_nan, write_file, write_text
 from maexp.agents.suites.play import Batch
 from maexp.agents.suites.score import Results
 from maexp.agents.suites.suite import Suite, sha256
@@ -144,16 +144,10 @@ def read_json(path: Path) -> dict[str, Any]:
 def dump(value: Any, indent: str = "") -> str:
     """JSON with lists on one line each, null where a number is none."""
     if not isinstance(value, dict) or not value:
-        return json.dumps(_without_nan(value))
+        return json.dumps(without_nan(value))
     inner = indent + "  "
     lines = [f"{inner}{json.dumps(str(name))}: {dump(one, inner)}" for name, one in value.items()]
     return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, list | tuple):
-        return [_without_nan(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _processor() -> str:

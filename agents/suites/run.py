@@ -88,7 +88,6 @@ class SuiteRun:
                 self.advance(len(played[-1].decisions))
         return played, sums(part, maps, self.seed)
 
-
     def _read(self, name: str, first: int) -> Batch:
         """A batch that was played before."""
         try:

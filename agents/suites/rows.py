@@ -1,0 +1,214 @@
+"""A row of the leaderboard: a small JSON file of what `results.json` says, and a film of an episode of each part."""
+
+import base64
+import json
+import re
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.errors import UserError
+from maexp.agents.evaluation.films import play_teams
+from maexp.agents.files import short, write_text
+from maexp.agents.suites import folder
+from maexp.agents.suites.play import Replay, build_env, build_maps
+from maexp.agents.suites.suite import Suite, load_suite
+from maexp.agents.suites.verify import verify
+from maexp.envs import ObservationConfig
+from maexp.envs.metrics import label_copies
+from maexp.envs.viewing.episode import Episode
+
+FORMAT = "maexp-leaderboard-row-1"
+KEPT = ("suite", "policy", "score", "random", "reference", "decisions", "run")
+SHOWN = ("coverage_step_95", "collisions")  # metrics of a part beside the score
+FRAMES, CELLS = 60, 96  # of a film, and cells of its picture on the longer side
+EACH = "*"  # in SHAPE: every entry
+NUMBER = int | float
+MEAN = {"mean": NUMBER | None, "ci95": [NUMBER | None], "n": int}
+SHAPE = {
+    "format": str, "verified": bool, "metric": str, "policy": str, "decisions": dict,
+    "run": {"commit": str | None, "versions": dict},
+    "suite": {"name": str, "version": int, "checksum": str},
+    "score": MEAN | {"mean": NUMBER, "normalised": NUMBER | None},
+    "random": {"score": NUMBER},
+    "reference": {"policy": str, "score": NUMBER, "parts": {EACH: NUMBER}, "difference": MEAN, "improvement": MEAN},
+    "parts": {EACH: {"normalised": NUMBER | None, "episodes": [NUMBER], "copies": [int], "lost": int}},
+    "films": {EACH: {"map": str, "cells": [int], "seconds": [NUMBER], "coverage": [int], "tracks": [[int]],
+                     "picture": str}},
+}  # fmt: skip
+"""Of a row: what the page and the tables read."""
+UNSEEN, WALL, NOTHING = 253, 254, 255  # in the picture; below: the frame in which a cell was first seen
+
+
+def make_row(
+    where: Path, file: str | None, check: bool, advance: Callable[[int], None] = lambda count: None
+) -> dict[str, Any]:
+    """The row of the folder of a run.
+
+    Args:
+        file: of its suite, where that does not come with the package
+        check: play its actions again, and refuse it where the results do not follow from them
+        advance: called with the number of episodes that were played again
+
+    Raises:
+        UserError: it is damaged, not of the suite's own maps, or not what it says.
+    """
+    results = folder.read_json(where / folder.RESULTS)
+    if check:
+        _check_verified(where, verify(where, file, advance))
+    suite = load_suite(file or str(results["suite"]["name"]))
+    if results["suite"]["checksum"] != suite.checksum:
+        raise UserError(f"{short(where)} was played with another version of {suite.name} than is here.")
+    if not results["suite"]["frozen_maps"]:
+        raise UserError(f"{short(where)} was played on other maps (seed={results['suite']['seed']}): it has no score.")
+    row: dict[str, Any] = {"format": FORMAT, "verified": check, "metric": suite.score}
+    row |= {name: results[name] for name in KEPT}
+    row["reference"] = {name: one for name, one in results["reference"].items() if name != "differences"}
+    row["reference"]["difference"] = results["reference"]["difference"][suite.score]
+    row["parts"] = {part: _describe_part(suite, part, one, results) for part, one in results["parts"].items()}
+    row["films"] = {part: make_film(suite, part, where) for part in suite.parts}
+    return json.loads(json.dumps(_rounded(row)))
+
+
+def _check_verified(where: Path, report: dict[str, Any]) -> None:
+    if not report["verified"]:
+        first = report["differences"][0]
+        why = f"{first['file']}: {first['where']}"
+        raise UserError(f"{short(where)} is not what it says ({why}): no row is made of it.")
+
+
+def _describe_part(suite: Suite, part: str, summary: dict, results: dict) -> dict[str, Any]:
+    told = {name: summary[name] for name in (suite.score, *SHOWN) if name in summary}
+    episodes = results["episodes"][part]
+    values = {name: np.array(episodes[name], dtype=np.float64) for name in suite.metrics}
+    return told | {
+        "normalised": summary["normalised"],
+        "episodes": episodes[suite.score],
+        "copies": label_copies(np.array(episodes["map"]), values).tolist(),
+        "lost": len(episodes["lost"]),
+        "seconds": 0.1 * suite.parts[part].limit,
+    }
+
+
+def make_film(suite: Suite, part: str, where: Path) -> dict[str, Any]:
+    """The first episode of a part as a page can show it."""
+    noted = folder.read_batch(where, suite, part, 0)
+    known = suite.parts[part]
+    env = build_env(known, build_maps(known), 1, suite.seed, ObservationConfig(pictures=False), device="cpu")
+    every = max(1, known.limit // FRAMES)
+    return describe_film(play_teams(env, Replay(noted, 1, env.device), "", first=0, every=every)[0])
+
+
+def describe_film(episode: Episode) -> dict[str, Any]:
+    """{map, cells, seconds, coverage, tracks, picture}.
+
+    `cells` of the picture, x before y; `seconds` and `coverage` [per mille] of each frame; `tracks` x, y of each robot
+    in each frame, from the middle of the lowest to that of the highest cell of the longer side [per mille]; `picture`
+    deflated bytes, in base64, row by row from below: the frame in which a cell was first seen, or UNSEEN, WALL or
+    NOTHING.
+    """
+    place = episode.map
+    points = np.concatenate([place.free[:, :2], place.boundary[:, :2]]).astype(np.float64)
+    low, size = points.min(0), np.ptp(points, axis=0)
+    cell = max(float(size.max()) / (CELLS - 1), place.resolution)
+    width, height = (np.rint(size / cell).astype(int) + 1).tolist()
+    picture = np.full((height, width), NOTHING, np.uint8)
+    columns, rows = np.rint((points - low) / cell).astype(int).T
+    free = len(place.free)
+    picture[rows[free:], columns[free:]] = WALL
+    first = np.where(episode.free_seen_at < 0, UNSEEN, episode.free_seen_at).min(0)
+    picture[rows[:free], columns[:free]] = NOTHING  # a cell with free ground shows that
+    np.minimum.at(picture, (rows[:free], columns[:free]), first.astype(np.uint8))
+    centres = (episode.center.astype(np.float64) - low) / size.max()
+    return {
+        "map": place.name,
+        "cells": [width, height],
+        "seconds": episode.seconds.tolist(),
+        "coverage": np.rint(1000 * episode.coverage).astype(int).tolist(),
+        "tracks": np.rint(1000 * centres).astype(int).reshape(len(episode), -1).tolist(),
+        "picture": base64.b64encode(zlib.compress(picture.tobytes(), 9)).decode(),
+    }
+
+
+def file_of(row: dict[str, Any]) -> str:
+    """Where a leaderboard keeps a row: SUITE/POLICY.json, with the version where that is not the first."""
+    suite = row["suite"]
+    name = suite["name"] if suite["version"] == 1 else f"{suite['name']}-v{suite['version']}"
+    return f"{_plain(name)}/{_plain(row['policy'])}.json"
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^\w.+-]", "_", name)[:80].lstrip(".") or "_"
+
+
+def write_row(where: Path, row: dict[str, Any]) -> Path:
+    """Write a row into a leaderboard; one of the same name is replaced."""
+    path = where / file_of(row)
+    write_text(path, folder.dump(row) + "\n")
+    return path
+
+
+def read_row(path: Path) -> dict[str, Any]:
+    """A row from its file.
+
+    Raises:
+        UserError: it is damaged, or its score does not follow from its episodes.
+    """
+    try:
+        row = json.loads(path.read_text())
+        _check_shape(row, SHAPE, "row")
+        _check_numbers(row)
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise UserError(f"{short(path)} is damaged or no row of a leaderboard ({told}).") from error
+    return row
+
+
+def _check_shape(value: Any, shape: Any, where: str) -> None:
+    """Raise ValueError where an entry is missing or of another kind."""
+    if isinstance(shape, dict):
+        if not isinstance(value, dict) or not value:
+            raise ValueError(f"{where} has no entries")
+        for name, one in shape.items():
+            for key in value if name == EACH else (name,):
+                if key not in value:
+                    raise ValueError(f"{where}.{key} is missing")
+                _check_shape(value[key], one, f"{where}.{key}")
+    elif isinstance(shape, list):
+        if not isinstance(value, list) or not value:
+            raise ValueError(f"{where} is no list")
+        for one in value:
+            _check_shape(one, shape[0], where)
+    elif not isinstance(value, shape) or (isinstance(value, bool) and shape is not bool):
+        raise ValueError(f"{where} is of another kind")
+
+
+def _check_numbers(row: dict[str, Any]) -> None:
+    """Raise ValueError where parts do not fit, or the score does not follow from the episodes."""
+    if row["format"] != FORMAT:
+        raise ValueError(f"format {row['format']}")
+    parts = row["parts"]
+    if not set(parts) == set(row["films"]) == set(row["reference"]["parts"]):
+        raise ValueError("parts, films and reference are not of the same parts")
+    if not all(row["metric"] in one and len(one["copies"]) == len(one["episodes"]) for one in parts.values()):
+        raise ValueError("a part has too few entries")
+    score = np.mean([np.mean(one["episodes"]) for one in parts.values()])
+    if not abs(score - row["score"]["mean"]) < 1e-5:
+        raise ValueError("its score does not follow from its episodes")
+
+
+def find_rows(where: Path) -> list[Path]:
+    """The files of the rows of a leaderboard."""
+    return sorted(where.glob("*/*.json"))
+
+
+def _rounded(value: Any) -> Any:
+    """Six decimals are enough for a page."""
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return round(value, 6) if isinstance(value, float) and value == value else value

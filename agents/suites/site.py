@@ -1,0 +1,84 @@
+"""The leaderboard as a page that needs nothing but a browser, and as tables in Markdown."""
+
+import html
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maexp.agents.benchmark.compare import improvement
+from maexp.agents.evaluation.evidence import brackets
+from maexp.agents.evaluation.figures import COLOURS
+from maexp.agents.files import without_nan, write_text
+from maexp.agents.suites.score import profile
+
+TEMPLATE = Path(__file__).with_name("page.html")
+PAGE, TABLES = "index.html", "README.md"
+MARK = "/*DATA*/"
+
+
+def write_site(where: Path, rows: list[dict[str, Any]]) -> list[Path]:
+    """Write the page and the tables of rows; returns the files."""
+    tables = ["# Leaderboard", "", *(line for one in group(rows) for line in table(one))]
+    write_text(where / TABLES, "\n".join(tables))
+    return [write_page(where, rows), where / TABLES]
+
+
+def write_page(where: Path, rows: list[dict[str, Any]]) -> Path:
+    """Write the page of rows; returns it."""
+    data = json.dumps(without_nan([describe_suite(one) for one in group(rows)]), separators=(",", ":"))
+    data = data.replace("<", "\\u003c")  # no name in it can end the script
+    page = TEMPLATE.read_text().replace(MARK, f"const SUITES = {data}; const COLOURS = {json.dumps(COLOURS)};")
+    write_text(where / PAGE, page)
+    return where / PAGE
+
+
+def group(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Rows by suite and checksum, the best first; the quick suite comes first."""
+    found: dict[tuple, list] = {}
+    for row in rows:
+        found.setdefault((row["suite"]["name"], row["suite"]["version"], row["suite"]["checksum"]), []).append(row)
+    order = sorted(found, key=lambda key: (key[0] != "minival", key))
+    return [sorted(found[key], key=lambda row: -row["score"]["mean"]) for key in order]
+
+
+def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the page knows of a suite: its rows, each with its profile, and who beats whom how often."""
+    values, copies = (
+        [{part: np.array(one[name]) for part, one in row["parts"].items()} for row in rows]
+        for name in ("episodes", "copies")
+    )
+    numbers, first = range(len(rows)), rows[0]
+    return {
+        **{name: first["suite"][name] for name in ("name", "version", "checksum")},
+        **{name: first[name] for name in ("metric", "random")},
+        "reference": {name: first["reference"][name] for name in ("policy", "score", "parts")},
+        "rows": [row | {"profile": profile(own)} for row, own in zip(rows, values, strict=True)],
+        "better": [
+            [None if x == y else improvement(values[x], values[y], (copies[x], copies[y])) for y in numbers]
+            for x in numbers
+        ],
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """A suite's rows as a table in Markdown."""
+    suite, reference = rows[0]["suite"], rows[0]["reference"]["policy"]
+    columns = ("", "policy", "score", "95 % interval", f"between `random` and `{reference}`",
+               f"less `{reference}`, points", "verified")  # fmt: skip
+    lines = [f"## {suite['name']}, version {suite['version']}", "", _line(columns), _line(["---"] * len(columns))]
+    for number, row in enumerate(rows, 1):
+        score, less = row["score"], row["reference"]["difference"]
+        between = "-" if score["normalised"] is None else f"{score['normalised']:.2f}"
+        name = html.escape(row["policy"]).replace("|", "\\|").replace("`", "'")
+        points = f"{100 * less['mean']:+.1f}{brackets(less, lambda end: f'{100 * end:+.1f}')}"
+        interval = brackets(score, "{:.3f}".format).strip() or "-"
+        verified = "yes" if row["verified"] else "no"
+        lines.append(_line([str(number), f"`{name}`", f"{score['mean']:.3f}", interval, between, points, verified]))
+    return [*lines, ""]
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
