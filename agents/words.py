@@ -9,7 +9,7 @@ from maexp.agents.policies.names import check_name
 from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import POLICIES, find_override, move_sweeps, split_sweeps
+from maexp.agents.settings.overrides import POLICIES, find_override, find_sweeps
 from maexp.agents.settings.resolved import resolve, without_hydra
 from maexp.agents.settings.schema import NAMES
 from maexp.envs.scenarios import SCENARIOS
@@ -38,12 +38,13 @@ def check_words(verb: str, overrides: list[str]) -> None:
 
 def check_sweep(verb: str, overrides: list[str]) -> None:
     """The same for every value of a sweep, before its first run."""
-    firsts = [word for word in move_sweeps(overrides) if not word.startswith("sweep=")]
-    several = [k for k, word in enumerate(overrides) if word not in firsts]
-    for k in several:
-        for value in split_sweeps([overrides[k]])[1][0]:
+    swept = find_sweeps(overrides)
+    names = [word.partition("=")[0] for word in overrides]
+    firsts = [swept[name][0] if name in swept else word for name, word in zip(names, overrides, strict=True)]
+    for k, name in enumerate(names):
+        for value in swept.get(name, []):
             check_words(verb, [*firsts[:k], value, *firsts[k + 1 :]])
-    if not several:
+    if not swept:
         check_words(verb, firsts)
 
 

@@ -20,7 +20,7 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.collect import Teams, WorkerLost, batch_statistics, divide_teams
-from maexp.agents.training.logs import read_metrics
+from maexp.agents.training.logs import read_metrics, tag
 from maexp.agents.training.train import make_both
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.metrics import episode_metrics
@@ -410,7 +410,7 @@ def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeyp
         events = EventAccumulator("run/tensorboard").Reload()
         for name in written[0]:
             wanted = [(row["frames"], row[name]) for row in written if row[name] == row[name]]
-            found = [(e.step, e.value) for e in events.Scalars(name)] if wanted else []
+            found = [(e.step, e.value) for e in events.Scalars(tag(name))] if wanted else []
             assert [step for step, _ in found] == [step for step, _ in wanted], name
             assert [value for _, value in found] == pytest.approx([value for _, value in wanted], rel=1e-5), name
     if "wandb" in present:

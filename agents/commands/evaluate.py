@@ -26,6 +26,7 @@ from maexp.agents.evaluation.comparison import choose_best, describe_differences
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.evaluation.kept import FOLDER, Kept, identify
+from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
 from maexp.agents.files import command, short, write_json
 from maexp.agents.locking import lock
@@ -151,7 +152,12 @@ def evaluate_all(
         kept = Kept(where / f"{player.name}_N{env.num_robots}", identity)
         with Progress(f"{player.name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
             settings = {"name": player.name, "seed": cfg.seed, "advance": progress.advance, "kept": kept}
-            played = evaluate_recorded(policy, env, cfg.episodes, **settings)
+
+            def play(policy: Callable = policy, settings: dict = settings) -> EvaluationResult:
+                return evaluate_recorded(policy, env, cfg.episodes, **settings)
+
+            known = player.kind == "classical"
+            played = play_once(player.name, env, play, cfg.episodes, cfg.seed, "recorded") if known else play()
             results.append(replace(played, learned=player.learned))
     return results
 

@@ -15,11 +15,13 @@ from omegaconf.errors import OmegaConfBaseException
 from maexp.agents.commands import train
 from maexp.agents.commands.run_folder import claim_folder
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.once import keeping_episodes
+from maexp.agents.evaluation.sweeps import tell_runs
 from maexp.agents.files import command, short, write_json
 from maexp.agents.locking import lock
 from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.compose import compose_config, compose_recipe, explain
-from maexp.agents.settings.overrides import find_override, quote, set_names, without
+from maexp.agents.settings.overrides import find_override, find_sweeps, quote, set_names, without
 from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.schema import TrainSettings, register_schema
 from maexp.agents.training.checkpoint import list_checkpoints
@@ -40,6 +42,9 @@ def run_sweep(verb: str, overrides: list[str]) -> int:
         chosen = find_override(overrides, "hydra.sweep.dir")
         folder = claim_folder(chosen or _default_folder(verb), chosen is not None)
         words = without(overrides, "hydra.sweep.dir")
+    swept = find_sweeps(words)
+    if "seed" in swept and find_override(words, "evaluation_seed") is None:  # the same episodes judge all teams
+        words.append(f"evaluation_{swept['seed'][0]}")
     with lock(folder, f"maexp {verb} -m"):
         write_json(folder / SWEEP, {"format": FORMAT, "words": words})
         try:
@@ -50,8 +55,11 @@ def run_sweep(verb: str, overrides: list[str]) -> int:
             if isinstance(error, UserError):
                 raise
             return STOPPED
-        combine_curves(folder)
-    print(f"All runs are in {folder}, their curves together in curves.png")
+        runs = swept_words(folder, [*swept])
+        combine_curves(runs, folder / "curves.png")
+        evaluated = tell_runs({" ".join(words) or one.name: one for one, words in runs.items()}, folder / "runs.csv")
+    table = ", their table in runs.csv" * evaluated
+    print(f"All runs are in {short(folder)}, their curves together in curves.png{table}")
     return 0
 
 
@@ -76,25 +84,30 @@ def read_words(place: str, overrides: list[str]) -> list[str]:
 def _run_jobs(verb: str, words: list[str]) -> None:
     register_schema(verb)
     job = hydra.main(version_base="1.3", config_path="pkg://maexp.conf", config_name=verb)(_run_job)
-    with mock.patch.object(sys, "argv", [f"maexp {verb}", "-m", *words]), _raise_errors():
+    with mock.patch.object(sys, "argv", [f"maexp {verb}", "-m", *words]), _raise_errors(), keeping_episodes():
         try:
             job()
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(explain(error, verb)) from error
 
 
-def combine_curves(folder: Path) -> None:
-    """curves.png of all runs below `folder`: one line per setting, the seeds averaged."""
+def swept_words(folder: Path, names: list[str]) -> dict[Path, list[str]]:
+    """The runs below `folder`, with the words of each that set one of `names`."""
+    runs = {}
+    for config in sorted(folder.glob("*/config.yaml"), key=lambda one: (len(one.parent.name), one.parent.name)):
+        words = config.read_text().splitlines()[0].split()[3:]
+        runs[config.parent] = [word for word in words if word.partition("=")[0] in names]
+    return runs
+
+
+def combine_curves(runs: dict[Path, list[str]], path: Path) -> None:
+    """The learning curves of all runs: one line per setting, the seeds averaged."""
     from maexp.agents.evaluation.plots import draw_curves
 
     settings: dict[str, list[Path]] = {}
-    for config in sorted(folder.glob("*/config.yaml")):
-        words = config.read_text().splitlines()[0].split()[3:]
-        swept = " ".join(word for word in words if not word.startswith("seed="))
-        settings.setdefault(swept or "all", []).append(config.parent)
-    common = set.intersection(*(set(name.split()) for name in settings)) if len(settings) > 1 else set()
-    named = {" ".join(w for w in name.split() if w not in common): runs for name, runs in settings.items()}
-    draw_curves(named, folder / "curves.png")
+    for folder, words in runs.items():
+        settings.setdefault(" ".join(word for word in words if not word.startswith("seed=")), []).append(folder)
+    draw_curves(settings, path)
 
 
 def _raise_errors():

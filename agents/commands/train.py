@@ -12,13 +12,13 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.kept import FOLDER
 from maexp.agents.files import command, short
 from maexp.agents.locking import lock
-from maexp.agents.settings.checks import check_counts, team_sizes, words_of
+from maexp.agents.settings.checks import check_counts, check_seed, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.imitation import check_warm_start, warm_start
-from maexp.agents.training.logs import check_logger
+from maexp.agents.training.logs import check_logger, log_results
 from maexp.agents.training.named import Player, find_players, suit_observation
 from maexp.agents.training.train import (
     TrainingRun,
@@ -28,6 +28,7 @@ from maexp.agents.training.train import (
     train,
     write_config,
 )
+from maexp.agents.training.validation import judged
 
 STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
@@ -69,6 +70,7 @@ def check(cfg: TrainSettings) -> None:
     check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep", "evaluate_episodes")
     check_counts(cfg, "episodes", "evaluate_every", least=0)
     team_sizes(cfg.num_robots)
+    check_seed(judged(cfg).seed, "evaluation_seed")
     check_collector(cfg.collector)
     check_expert(cfg)
     check_logger(cfg.logger)
@@ -131,7 +133,7 @@ def _describe(cfg: TrainSettings) -> str:
 
 def finish(done: TrainingRun) -> None:
     """Evaluate the trained team beside random goals and classical planners; write the summary and the pictures."""
-    cfg, where = done.cfg, done.folder
+    cfg, where = judged(done.cfg), done.folder
     written = ["config.yaml", "metrics.csv", "checkpoints/"]
     draw_curves(where)
     written.append("curves.png")
@@ -149,6 +151,7 @@ def finish(done: TrainingRun) -> None:
         written += ["summary.json", *draw_results(results, where)]
     draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
     written.append("rollout.gif")
+    log_results(where, done.cfg.logger, done.frames, done.settings)
     shutil.rmtree(where / FOLDER, ignore_errors=True)
     print(f"Written to {short(where)}: {', '.join(written)}")
     evaluate = command("evaluate", f"checkpoint={short(where)}", "num_robots=1,2,6,8")

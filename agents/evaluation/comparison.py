@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.evidence import brackets, verdict
+from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
@@ -29,8 +30,9 @@ def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num
 def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
     """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
+        settings = {"seed": seed, "advance": progress.advance}
         played = [
-            evaluate(POLICIES[name](env), env, count, name=name, seed=seed, advance=progress.advance)
+            play_once(name, env, lambda n=name: evaluate(POLICIES[n](env), env, count, name=n, **settings), count, seed)
             for name in planners
         ]
     return max(played, key=lambda one: one.episodes[DECIDES].mean())

@@ -1,5 +1,6 @@
 """What a run found: summary.json and results.json, and the table on the terminal."""
 
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
@@ -86,24 +87,42 @@ def write_results(path: Path, results: list[EvaluationResult], run: dict) -> Non
 
 
 def print_results(results: list[EvaluationResult], title: str) -> None:
-    """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there; below it what that
-    rests on, where it is little."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("policy", no_wrap=True)
-    told = results[0].summary()
-    columns = [name for name in COLUMNS if name in told and in_reach(name, results[0].success_coverage)]
-    for name in columns:
-        table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)  # [m] is no style of rich's
-    for name, result in zip(result_names(results), results, strict=True):
-        summary = result.summary()
-        total = summary["exploration_ratio"]["n"]
-        table.add_row(name, *(_cell(metric, summary[metric], total) for metric in columns))
-    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
-    Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
+    """`print_table` of results; below it what they rest on, where it is little."""
+    rows = [(name, one.summary()) for name, one in zip(result_names(results), results, strict=True)]
+    print_table(title, rows, results[0].success_coverage)
     whole = [one for one in results if not one.place]
     named = zip(result_names(whole), whole, strict=True)
     for sentence in describe_evidence([one.evidence._replace(policy=name) for name, one in named]):
         print(sentence)
+
+
+def print_table(
+    title: str, rows: list[tuple[str, dict]], goal: float, more: dict[str, Callable[[dict], str]] | None = None
+) -> None:
+    """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there.
+
+    Args:
+        rows: a name, and {metric: {mean, std, ci95, n}}.
+        goal: the coverage that ends an episode.
+        more: further columns, and what of a row stands in each.
+    """
+    more = more or {}
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("policy", no_wrap=True)
+    columns = find_columns(rows, goal)
+    for name in [*more, *(COLUMNS[one] for one in columns)]:
+        table.add_column(escape(name), justify="right", no_wrap=True)  # [m] is no style of rich's
+    for name, summary in rows:
+        total = summary["exploration_ratio"]["n"]
+        cells = (_cell(metric, summary[metric], total) for metric in columns)
+        table.add_row(escape(name), *(escape(tell(summary)) for tell in more.values()), *map(escape, cells))
+    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
+    Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
+
+
+def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:
+    """Those of `COLUMNS` that rows have and that episodes which end at `goal` tell something about."""
+    return [name for name in COLUMNS if in_reach(name, goal) and all(name in summary for _, summary in rows)]
 
 
 def _cell(metric: str, value: dict, total: int) -> str:

@@ -192,3 +192,10 @@ def split_sweeps(words: list[str]) -> tuple[list[str], list[list[str]]]:
     parsed = OverridesParser.create().parse_overrides(list(words))
     names = [one.key_or_group for one in parsed]
     return names, [[f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()] for one in parsed]
+
+
+def find_sweeps(overrides: list[str]) -> dict[str, list[str]]:
+    """The settings given several values, each with its overrides, one per value."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    several = [word for word, one in zip(overrides, parsed, strict=True) if one.is_sweep_override()]
+    return dict(zip(*split_sweeps(several), strict=True))

@@ -200,6 +200,7 @@ class TrainSettings(LearnerSettings):
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best")
     evaluate_every: int = setting(5, "iterations between two evaluations on validation maps, from the start; 0: none")
     evaluate_episodes: int = setting(64, "validation episodes, of the team and of the planners it is compared with")
+    evaluation_seed: int | None = setting(None, "of episodes that judge a team; default: seed, of a sweep the first")
     collector: CollectorSettings = field(default_factory=CollectorSettings)
     logger: LoggerSettings = field(default_factory=LoggerSettings)
 

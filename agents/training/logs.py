@@ -3,16 +3,24 @@
 import csv
 import importlib
 import io
+import json
 import math
 import os
 import uuid
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.results import COLUMNS
 from maexp.agents.files import write_text
 from maexp.agents.settings.schema import LoggerSettings
 
 MODES = ("online", "offline")
+RESULTS = "summary.json"
+PICTURES = {"curves": "png", "coverage": "png", "rollout": "gif"}
+"""What a logger shows of a run's files."""
+Table = tuple[list[str], list[list[Any]]]
 
 
 class MetricsLog:
@@ -109,6 +117,48 @@ def check_logger(settings: LoggerSettings) -> None:
         raise UserError(f"logger.mode={settings.mode} is unknown: choose one of {', '.join(MODES)}.")
 
 
+GROUPS = {
+    "reward": ("reward", "reward_"),
+    "episodes": ("episodes", "coverage", "success_rate", "collisions", "path_length"),
+    "validation": ("validation_",),
+    "progress": ("iteration", "frames", "seconds", "frames_per_second", "time_", "policy_lag"),
+}
+"""Group -> the columns of metrics.csv that it holds, by their names or what they begin with; the rest is learning."""
+
+
+def tag(column: str) -> str:
+    """What a column of metrics.csv is called where tags are grouped: validation_gain is validation/gain."""
+    for group, names in GROUPS.items():
+        if any(column == name or (name.endswith("_") and column.startswith(name)) for name in names):
+            return f"{group}/{column.removeprefix(f'{group}_')}"
+    return f"learning/{column}"
+
+
+def compare(summary: dict[str, Any]) -> tuple[list[str], list[list[Any]]]:
+    """The columns and rows of the table of a summary.json: a policy, and the means of its metrics."""
+    policies = [name for name in summary["run"]["distinct_episodes"] if name in summary]
+    told = [name for name in COLUMNS if all(name in summary[one] for one in policies)]
+    metrics = [name for name in told if any(summary[one][name]["n"] for one in policies)]
+    return ["policy", *metrics], [[one, *(summary[one][name]["mean"] for name in metrics)] for one in policies]
+
+
+def log_results(folder: Path, settings: LoggerSettings, frames: int, config: dict) -> None:
+    """What came of a run goes to its loggers, too: the comparison, the pictures and the film.
+
+    Args:
+        folder: the run's, with its files
+        frames: macro steps of its training
+        config: plain settings
+    """
+    summary = folder / RESULTS
+    table = compare(json.loads(summary.read_text())) if summary.is_file() else None
+    pictures = {name: file for name in PICTURES if (file := folder / f"{name}.{PICTURES[name]}").is_file()}
+    for name in settings.backends if table or pictures else ():
+        backend = BACKENDS[name](folder, settings, config, frames)
+        with closing(backend):
+            backend.write_results(table, pictures, frames)
+
+
 class TensorBoard:
     """Event files in `tensorboard/`. Where a killed run had logged beyond its checkpoint, that is struck out."""
 
@@ -119,7 +169,25 @@ class TensorBoard:
 
     def write(self, row: dict[str, float]) -> None:
         for name, value in row.items():
-            self.writer.add_scalar(name, value, row["frames"])
+            self.writer.add_scalar(tag(name), value, row["frames"])
+
+    def write_results(self, table: Table | None, pictures: dict[str, Path], frames: int) -> None:
+        """Scalars and a table in words; pictures and film as they are, for its own encoder needs moviepy."""
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        if table is not None:
+            columns, rows = table
+            for policy, *values in rows:
+                for name, value in zip(columns[1:], values, strict=True):
+                    if value is not None:
+                        self.writer.add_scalar(f"comparison/{name}/{policy}", value, frames)
+            lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row] for row in rows)]
+            self.writer.add_text("comparison", "\n".join(f"| {' | '.join(line)} |" for line in lines), frames)
+        for name, path in pictures.items():
+            width, height = Image.open(path).size
+            image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
+            self.writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), frames)
 
     def close(self) -> None:
         self.writer.close()
@@ -147,10 +215,26 @@ class WeightsAndBiases:
             raise UserError(f"logger=wandb cannot start ({why}): {advice}.") from error
 
     def write(self, row: dict[str, float]) -> None:
-        self.run.log(row, step=row["frames"])
+        self.run.log({tag(name): value for name, value in row.items()}, step=row["frames"])
+
+    def write_results(self, table: Table | None, pictures: dict[str, Path], frames: int) -> None:
+        """A table, pictures and the film."""
+        import wandb
+
+        content: dict[str, Any] = {}
+        if table is not None:
+            content["comparison"] = wandb.Table(columns=table[0], data=table[1])
+        for name, path in pictures.items():
+            film = path.suffix == ".gif"
+            content[name] = wandb.Video(str(path), format="gif") if film else wandb.Image(str(path))
+        self.run.log(content, step=frames)
 
     def close(self) -> None:
         self.run.finish()
+
+
+def _cell(value: Any) -> str:
+    return "" if value is None else value if isinstance(value, str) else f"{value:.4g}"
 
 
 BACKENDS = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}

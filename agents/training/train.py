@@ -47,7 +47,7 @@ from maexp.agents.training.checkpoint import (
 )
 from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
 from maexp.agents.training.logs import MetricsLog
-from maexp.agents.training.validation import COLUMNS, ENDS, Validation
+from maexp.agents.training.validation import COLUMNS, ENDS, Validation, judged
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv, PointCloudMap
 
@@ -140,7 +140,7 @@ class TrainingRun:
     @cached_property
     def validation(self) -> Validation:
         """The validation episodes of the run."""
-        return Validation(self.cfg, self.suite)
+        return Validation(judged(self.cfg), self.suite)
 
     @cached_property
     def checksums(self) -> dict[str, str]:

@@ -3,6 +3,7 @@
 The planners play them once in a run; a run that is resumed takes what they did from its checkpoint.
 """
 
+import copy
 import math
 from functools import cached_property
 from typing import Any
@@ -25,6 +26,13 @@ PAIRED = {"validation_gain": (DECIDES, 100.0), "validation_steps_95": (STEPS, 1.
 """Column -> the metric and its factor: the team's less the best planner's in the same episodes."""
 ENDS = ("", "_low", "_high")
 COLUMNS = ("validation_coverage", "validation_coverage_auc", *(f"{name}{end}" for name in PAIRED for end in ENDS))
+
+
+def judged(cfg: TrainSettings) -> TrainSettings:
+    """The settings with the seed of the episodes that judge the team."""
+    cfg = copy.deepcopy(cfg)
+    cfg.seed = cfg.seed if cfg.evaluation_seed is None else cfg.evaluation_seed
+    return cfg
 
 
 class Validation:
