@@ -102,9 +102,9 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
     return np.array(frame)
 
 
-def add_headline(frame: np.ndarray, text: str) -> np.ndarray:
-    """A picture with a line of text on top, uint8 (height, width, 3)."""
-    height = frame.shape[1] // 14 // 2 * 2  # even sides, for video codecs
+def add_headline(frame: np.ndarray, text: str, height: int | None = None) -> np.ndarray:
+    """A picture with a line of text on top, uint8 (height, width, 3); the line's `height` is even, for video codecs."""
+    height = height or frame.shape[1] // 14 // 2 * 2
     strip = Image.new("RGB", (frame.shape[1], height), STRIP)
     font = _font(max(10, int(0.7 * height)))
     at = (frame.shape[1] // 2, height // 2)

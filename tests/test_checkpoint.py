@@ -32,9 +32,11 @@ def run(tmp_path):
     return tmp_path
 
 
-def test_keeps_the_newest_and_the_best(run):
+def test_keeps_the_newest_the_best_and_the_start(run):
+    save_checkpoint(run / "checkpoints", state(0), 0, keep=9)
     save_checkpoint(run / "checkpoints", state(10), 10, keep=2)
-    assert [path.stem for path in list_checkpoints(run / "checkpoints")] == ["iteration_000010", "iteration_000003"]
+    kept = [path.stem for path in list_checkpoints(run / "checkpoints")]
+    assert kept == ["iteration_000010", "iteration_000003", "iteration_000000"]
     assert load_checkpoint(run / "checkpoints" / "best.pt")["iteration"] == 2
 
 

@@ -14,7 +14,7 @@ from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import describe_episodes
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.comparison import describe_differences
+from maexp.agents.evaluation.comparison import describe_differences, describe_training, find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
 from maexp.agents.evaluation.evidence import Evidence, describe_evidence
 from maexp.agents.evaluation.results import COLUMNS, paired_differences, print_results
@@ -293,6 +293,25 @@ def test_differences_are_those_of_the_same_episodes():
     assert describe_differences(teams, {}) == [] and paired_differences(teams[1:]) == {}
     tied = [result("trained", [0.9, 0.05], [100.0, 300.0], True), teams[1]]
     assert "The trained team cannot be told from voronoi" in describe_differences(tied, {3: "voronoi"})[0]
+
+
+def test_what_the_training_was_worth_is_a_sentence():
+    teams = [result("trained", [0.9, 0.3], [100.0, 200.0], True), result("untrained", [0.6, 0.2], [150.0, 250.0])]
+    assert describe_training(teams) == [
+        "The trained team is ahead of the untrained team: +22.0 points of coverage over time [+10.0, +30.0], "
+        "-50 steps to 95 % [-50, -50]."
+    ]
+    same = replace(teams[0], policy="warm_start")
+    assert "cannot be told from the warm start" in describe_training([teams[0], same])[0]
+    assert describe_training([teams[0], replace(teams[1], num_robots=2)]) == describe_training(teams[:1]) == []
+
+
+def test_the_typical_episode_is_the_closest_to_the_mean():
+    one, other = result("trained", [0.5, 0.5], [1.0, 1.0]), result("voronoi", [0.5, 0.5], [1.0, 1.0])
+    one.episodes["coverage_auc"] = other.episodes["coverage_auc"] + np.array([0.4, 0.0, 0.1, 0.3, 0.2])
+    assert find_typical(one, other, 5) == (4, pytest.approx(0.2), pytest.approx(0.2))
+    assert find_typical(one, other, 3) == (2, pytest.approx(0.1), pytest.approx(0.2))
+    assert find_typical(other, None, 5)[0] == 2
 
 
 def test_differences_pair_what_was_played_in_the_same_place_by_as_many():

@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from maexp.agents.evaluation import plots
-from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_curves, draw_summary
+from maexp.agents.evaluation import learning, plots
+from maexp.agents.evaluation.learning import draw_curves
+from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_summary
 
 
 @pytest.fixture
 def figures(monkeypatch) -> list:
     """The figures drawn, kept to look into; they are written all the same."""
     kept, save = [], plots.save
-    monkeypatch.setattr(plots, "save", lambda figure, path: kept.append(figure) or save(figure, path))
+    for module in (learning, plots):
+        monkeypatch.setattr(module, "save", lambda figure, path: kept.append(figure) or save(figure, path))
     return kept
 
 
@@ -58,7 +60,7 @@ def test_curves_show_the_known_columns_with_units(tmp_path, figures):
 
 def test_smoothing_is_a_mean():
     values = np.random.default_rng(0).normal(size=200)
-    smooth = plots._smooth(values)
+    smooth = learning._smooth(values)
     assert smooth.shape == values.shape
     assert smooth[100] == pytest.approx(values[95:106].mean())
     assert smooth[0] == pytest.approx(values[:6].mean())
@@ -104,6 +106,27 @@ def test_settings_are_compared_in_colours_and_styles(tmp_path, figures):
     assert [line.get_label() for line in labelled] == ["mappo", "ippo"]
     assert labelled[0].get_color() != labelled[1].get_color()
     assert labelled[0].get_linestyle() != labelled[1].get_linestyle()
+
+
+def test_gains_have_a_band_and_the_planner_is_zero(tmp_path, figures):
+    rows = [
+        {"frames": 10 * k, "validation_gain": k - 2, "validation_gain_low": k - 3, "validation_gain_high": k,
+         "reward": 0.5, "coverage": 0.95 + 0.001 * k}
+        for k in range(9)
+    ]  # fmt: skip
+    rows.insert(5, {"frames": 45, "reward": 0.5})
+    coverage = np.array([[0.1, 0.9], [0.2, 0.8]])
+    ends = {"trained": ([0.0, 1.0], coverage), "voronoi": ([0.0, 1.0], coverage[:1])}
+    draw_curves(rows, tmp_path / "curves.png", rival="voronoi", ends=ends)
+    shown = panels(figures[0])
+    assert list(shown) == ["Gain in coverage over time", "Coverage over time, held-out episodes"], "the rest is flat"
+    gain, after = shown.values()
+    line, zero = gain.lines
+    np.testing.assert_allclose(line.get_xydata(), [[10 * k, k - 2] for k in range(9)])
+    assert list(zero.get_ydata()) == [0, 0] and [text.get_text() for text in gain.texts] == ["voronoi"]
+    band = {tuple(point) for point in gain.collections[0].get_paths()[0].vertices}
+    assert {(10.0 * k, k - 3.0) for k in range(9)} | {(10.0 * k, float(k)) for k in range(9)} <= band
+    assert [line.get_label() for line in after.lines][:2] == ["trained (n = 2)", "voronoi (n = 1)"]
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -10,10 +11,12 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from maexp.agents.cli import main
+from maexp.agents.commands.train import draw_rollout
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog, read_metrics
@@ -91,13 +94,14 @@ def test_the_files_of_a_run(capsys):
     assert sum(row["episodes"] for row in rows) == 3 * 2  # 6 macro steps of 3 teams, 3 to an episode
     assert rows[1]["validation_coverage"] > 0 and rows[0]["validation_coverage"] != rows[0]["validation_coverage"]
     assert start["validation_coverage"] > 0
-    assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2"]
+    assert [path.stem[-1] for path in list_checkpoints(folder / "checkpoints")] == ["3", "2", "0"]
     assert (folder / "checkpoints" / "best.pt").is_file()
     assert "num_robots: 2" in (folder / "config.yaml").read_text()
     summary = json.loads((folder / "summary.json").read_text())
     classical = {"cost_utility", "rrt_frontiers", "nearest_frontier"}
-    assert set(summary) == {"trained", "random", "difference", "run"} | classical
-    assert set(summary["difference"]["trained"]) == {"random"} | classical
+    assert set(summary) == {"trained", "untrained", "random", "difference", "run"} | classical
+    assert set(summary["difference"]) == {"trained"}
+    assert set(summary["difference"]["trained"]) == {"untrained", "random"} | classical
     for other in ("random", "cost_utility"):
         for metric, found in summary["difference"]["trained"][other].items():
             if metric in ("exploration_ratio", "coverage_auc", "path_length", "coverage_step_95_censored"):
@@ -108,7 +112,48 @@ def test_the_files_of_a_run(capsys):
     assert summary["run"]["maps"] == ["maze_small_70"]
     printed = capsys.readouterr().out
     assert f"{summary['run']['best_classical']['2']}, the best classical planner on the validation maps" in printed
-    assert "trained" in printed and "Next: maexp evaluate" in printed
+    assert "the untrained team: " in printed and "Next: maexp evaluate" in printed
+
+
+def test_what_a_training_started_from_stands_beside_it():
+    folder = run("run", 3, "episodes=2", "checkpoint_keep=1", "checkpoint_every=1", "classical=[]")
+    summary = json.loads((folder / "summary.json").read_text())
+    words = [f"checkpoint={folder}/checkpoints/iteration_000000.pt", "episodes=2", "num_envs=3", "hydra.run.dir=start"]
+    assert main(["evaluate", *words]) == 0
+    assert json.loads(Path("start/results.json").read_text())["trained"] == summary["untrained"] != summary["trained"]
+    (folder / "checkpoints" / "iteration_000000.pt").write_bytes(b"damaged")
+    resume(folder, 4)
+    assert "untrained" not in json.loads((folder / "summary.json").read_text())
+
+
+def test_the_film_is_of_the_episode_that_stands_for_the_mean(monkeypatch):
+    """Of those that are played first; what is filmed is what was evaluated, whoever draws actions."""
+    seen = {}
+
+    def film(cfg, env, teams, results, path):
+        seen["results"] = results
+        draw_rollout(cfg, env, teams, results, path)
+
+    def draw_film(episodes, caption, columns):
+        seen.update(episodes=episodes, caption=caption, columns=columns)
+        return [np.zeros((8, 8, 3), dtype=np.uint8)]
+
+    monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", film)
+    monkeypatch.setattr("maexp.agents.evaluation.films.draw_film", draw_film)
+    run("run", 1, "episodes=5", "classical=[nearest_frontier]", "num_robots=2,3", "num_envs=6")
+    known = {one.policy: one for one in seen["results"] if one.num_robots == 2}
+    assert [one.policy for one in seen["episodes"]] == ["trained", "untrained", "nearest_frontier"]
+    place, told = seen["caption"]
+    number = int(re.search(r", episode (\d+) of seed 0$", place)[1])
+    apart = known["trained"].episodes["coverage_auc"] - known["nearest_frontier"].episodes["coverage_auc"]
+    away = abs(apart - apart.mean())
+    assert away[number] == away.min() and away.max() > 0
+    assert f"trained - nearest_frontier: {100 * apart[number]:+.1f} points" in told
+    assert f"of 5 episodes the closest to the mean ({100 * apart.mean():+.1f})" in told
+    for episode in seen["episodes"]:
+        mine = known[episode.policy]
+        assert episode.map.name == mine.maps[number] and episode.map.name in place
+        assert episode.coverage[-1] == pytest.approx(mine.episodes["exploration_ratio"][number], abs=1e-6)
 
 
 def test_a_metric_that_comes_late_is_an_error(tmp_path):

@@ -12,7 +12,7 @@ from maexp.agents.cli import main
 from maexp.agents.evaluation.films import draw_film, play_teams
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, MapError, make_map
-from maexp.envs.render import EXPLORED, draw_frame, watch_episode
+from maexp.envs.render import EXPLORED, draw_frame, draw_grid, watch_episode
 from maexp.envs.viewing.episode import Episode, EpisodeRecorder
 
 TINY = ["scenario.held_out=[70]", "scenario.macro_steps=2", "num_robots=2"]
@@ -125,6 +125,10 @@ def test_film_shows_the_teams_at_the_same_time():
     for record in (2, 9):
         left, right = (draw_frame(episodes[k].snapshot((record, min(record, 3))[k]), 440) for k in (0, 1))
         assert np.array_equal(frames[record][:, :440], left) and np.array_equal(frames[record][:, -440:], right)
+    below = draw_film(episodes, ["One line.", "Another."], columns=1)[9]
+    alone = draw_grid([draw_frame(episodes[k].snapshot((9, 3)[k]), 440) for k in (0, 1)], columns=1)
+    assert np.array_equal(below[-len(alone) :], alone) and len(below) % 2 == 0 and len(below) > len(alone)
+    assert (below[: len(below) - len(alone)] < 100).any(), "letters"
 
 
 @pytest.mark.parametrize("count", [1, 3])

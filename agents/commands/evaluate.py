@@ -22,7 +22,7 @@ from maexp.agents.evaluation.baseline import (
     write_episodes,
 )
 from maexp.agents.evaluation.begun import begin, continue_evaluation, is_begun
-from maexp.agents.evaluation.comparison import choose_best, describe_differences
+from maexp.agents.evaluation.comparison import choose_best, describe_differences, describe_training
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
 from maexp.agents.evaluation.kept import FOLDER, Kept, identify
@@ -206,7 +206,7 @@ def report(
     extra |= {"algorithm": cfg.algorithm.name} if "checkpoint" not in cfg or cfg.checkpoint else {}
     write_results(path, results, describe_run(cfg, suite.held_out, seconds) | extra)
     print_results(results, f"{cfg.scenario.name}: {describe_episodes(cfg.episodes, results, suite)}")
-    for sentence in describe_differences(results, best):
+    for sentence in [*describe_differences(results, best), *describe_training(results)]:
         print(sentence)
 
 

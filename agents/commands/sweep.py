@@ -102,7 +102,7 @@ def swept_words(folder: Path, names: list[str]) -> dict[Path, list[str]]:
 
 def combine_curves(runs: dict[Path, list[str]], path: Path) -> None:
     """The learning curves of all runs: one line per setting, the seeds averaged."""
-    from maexp.agents.evaluation.plots import draw_curves
+    from maexp.agents.evaluation.learning import draw_curves
 
     settings: dict[str, list[Path]] = {}
     for folder, words in runs.items():

@@ -2,13 +2,17 @@
 
 import copy
 import shutil
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from maexp.agents.build import choose_device, make_env, model_settings
 from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.comparison import find_typical
+from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.kept import FOLDER
 from maexp.agents.files import command, short
 from maexp.agents.locking import lock
@@ -16,7 +20,7 @@ from maexp.agents.settings.checks import check_counts, check_seed, team_sizes, w
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.schema import TrainSettings
-from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger, log_results
 from maexp.agents.training.named import Player, find_players, suit_observation
@@ -29,6 +33,7 @@ from maexp.agents.training.train import (
     write_config,
 )
 from maexp.agents.training.validation import judged
+from maexp.envs import ExplorationEnv
 
 STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
@@ -132,25 +137,25 @@ def _describe(cfg: TrainSettings) -> str:
 
 
 def finish(done: TrainingRun) -> None:
-    """Evaluate the trained team beside random goals and classical planners; write the summary and the pictures."""
+    """Evaluate the trained team beside what it started from and others; write the summary and the pictures."""
     cfg, where = judged(done.cfg), done.folder
-    written = ["config.yaml", "metrics.csv", "checkpoints/"]
-    draw_curves(where)
-    written.append("curves.png")
-    best: dict[int, str] = {}
+    written, results = ["config.yaml", "metrics.csv", "checkpoints/"], []
+    players = [trained_player(done), *start_players(done), *find_others(cfg)]
+    best = done.validation.best if cfg.episodes or cfg.evaluate_every else {}
+    shown = copy.deepcopy(cfg)
+    suit_observation(shown, players)
+    device, held_out = choose_device(cfg, "train_device"), done.suite.held_out
     if cfg.episodes:
-        device = choose_device(cfg, "train_device")
-        others = find_others(cfg)
-        best = done.validation.best
-        shown = copy.deepcopy(cfg)
-        players = [trained_player(done), *others]
-        suit_observation(shown, players)
-        envs = (make_env(shown, done.suite.held_out, size, device=device) for size in done.sizes)
+        envs = [make_env(shown, held_out, size, device=device) for size in done.sizes]
         results = [one for env in envs for one in evaluate_all(cfg, env, players, where / FOLDER)]
         report(cfg, results, done.suite, best, where / "summary.json", training_seconds=round(done.seconds, 2))
         written += ["summary.json", *draw_results(results, where)]
-    draw_rollout(cfg, done, best.get(done.sizes[0]), where / "rollout.gif")
-    written.append("rollout.gif")
+    size = done.sizes[0]
+    beside = [one for one in players if one.kind in ("checkpoint", "start") or one.name == best.get(size)]
+    draw_curves(where, done.validation.rival, [one for one in results if one.num_robots == size], beside)
+    env = envs[0] if results else make_env(shown, held_out[:1], size, 1, device=device)
+    draw_rollout(cfg, env, beside, results, where / "rollout.gif")
+    written += ["curves.png", "rollout.gif"]
     log_results(where, done.cfg.logger, done.frames, done.settings)
     shutil.rmtree(where / FOLDER, ignore_errors=True)
     print(f"Written to {short(where)}: {', '.join(written)}")
@@ -164,19 +169,49 @@ def trained_player(done: TrainingRun) -> Player:
     return Player("trained", lambda env: done.learner.policy, "checkpoint", pictures=looks, direct=direct)
 
 
-def draw_curves(where: Path) -> None:
-    """curves.png from metrics.csv."""
-    from maexp.agents.evaluation.plots import draw_curves as draw
+def start_players(done: TrainingRun) -> list[Player]:
+    """The team as it was before its training; none where that checkpoint is gone."""
+    try:
+        saved = load_checkpoint(done.folder / "checkpoints" / START)
+    except UserError as error:
+        warnings.warn(f"what the training started from is left out: {error}", stacklevel=2)
+        return []
+    model, like = model_settings(done.cfg), trained_player(done)
+    name = "warm_start" if done.cfg.warm_start else "untrained"
+    return [replace(like, name=name, kind="start", build=lambda env: restore_policy(env, model, saved))]
 
-    draw(where / "metrics.csv", where / "curves.png")
+
+def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside: list[Player]) -> None:
+    """curves.png from metrics.csv, and from what the players `beside` the trained one did in the end."""
+    from maexp.agents.evaluation.learning import draw_curves as draw
+
+    names = [one.name for one in beside]
+    ends = {one.policy: (one.times, one.coverage, one.maps) for one in results if one.policy in names}
+    draw(where / "metrics.csv", where / "curves.png", rival=rival, ends=ends)
 
 
-def draw_rollout(cfg: TrainSettings, done: TrainingRun, best: str | None, path: Path) -> None:
-    """A film of the trained team in the first held-out episode, beside the best classical planner if there is one."""
+def draw_rollout(
+    cfg: TrainSettings, env: ExplorationEnv, teams: list[Player], results: list[EvaluationResult], path: Path
+) -> None:
+    """A film of the teams side by side in the held-out episode that stands for the mean difference of the first to the
+    last; in the first episode where there are no results.
+
+    All teams of `env` play, as in the evaluation: so whoever draws actions draws the same ones.
+    """
     from maexp.agents.evaluation.films import draw_film, play_teams
     from maexp.envs.film import write_gif
 
-    env = make_env(cfg, done.suite.held_out[:1], done.sizes[0], 1, device=choose_device(cfg, "train_device"))
-    teams = [trained_player(done), *([] if best is None else find_players([best]))]
-    episodes = [play_teams(env, one.make(env), one.name, seed=cfg.seed)[0] for one in teams]
-    write_gif(draw_film(episodes), path)
+    known = {one.policy: one for one in results if one.num_robots == env.num_robots}
+    number, caption = 0, []
+    if known:
+        rival = known[teams[-1].name] if len(teams) > 1 else None
+        count = min(env.num_envs, cfg.episodes)
+        number, apart, mean = find_typical(known["trained"], rival, count)
+        pair = "trained" if rival is None else f"trained - {rival.policy}"
+        caption = [
+            f"{pair}: {100 * apart:+.1f} points of coverage over time, of {count} episodes the closest to the mean "
+            f"({100 * mean:+.1f})"
+        ]
+    episodes = [play_teams(env, one.make(env), one.name, teams=[number], seed=cfg.seed)[0] for one in teams]
+    caption.insert(0, f"{episodes[0].map.name}, episode {number} of seed {cfg.seed}")
+    write_gif(draw_film(episodes, caption, columns=len(episodes)), path)

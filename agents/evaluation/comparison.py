@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.evidence import brackets, verdict
@@ -15,6 +17,8 @@ from maexp.envs.metrics import in_reach
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"
+STARTS = {"untrained": "the untrained team", "warm_start": "the warm start"}
+"""Name of what a training started from -> what sentences call it."""
 
 
 def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num_robots: int) -> str | None:
@@ -47,10 +51,40 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
     whole = [one for one in results if not one.place]
     rivals = {one.num_robots: one for one in whole if one.policy == best.get(one.num_robots)}
     return [
-        _describe(name, rivals[one.num_robots].policy, one.minus(rivals[one.num_robots]), one.success_coverage)
+        _describe(
+            name,
+            f"{rivals[one.num_robots].policy}, the best classical planner on the validation maps",
+            one.minus(rivals[one.num_robots]),
+            one.success_coverage,
+        )
         for name, one in zip(result_names(whole), whole, strict=True)
         if one.learned and one.num_robots in rivals
     ]
+
+
+def describe_training(results: list[EvaluationResult]) -> list[str]:
+    """A sentence for each size of the trained team: how far it is ahead of what it started from."""
+    starts = {one.num_robots: one for one in results if one.policy in STARTS}
+    return [
+        _describe(name, STARTS[start.policy], one.minus(start), one.success_coverage)
+        for name, one in zip(result_names(results), results, strict=True)
+        if one.policy == "trained" and (start := starts.get(one.num_robots))
+    ]
+
+
+def find_typical(one: EvaluationResult, other: EvaluationResult | None, among: int) -> tuple[int, float, float]:
+    """The episode that stands for the mean: of the first `among`, the one whose difference in coverage over time is
+    closest to the mean of all.
+
+    Args:
+        other: less whom, on the same episodes; None: nobody
+
+    Returns:
+        Its number, its difference and the mean.
+    """
+    apart = one.episodes[DECIDES] - (0.0 if other is None else other.episodes[DECIDES])
+    number = int(np.abs(apart[:among] - apart.mean()).argmin())
+    return number, float(apart[number]), float(apart.mean())
 
 
 def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
@@ -58,7 +92,7 @@ def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str
     points = f"{100 * auc['mean']:+.1f} points of coverage over time{brackets(auc, lambda end: f'{100 * end:+.1f}')}"
     later = ", ".join(_later(found, mark) for mark in (95, 99) if mark == 95 or in_reach(f"_{mark}", goal))
     name = name.replace("trained", "The trained team", 1)
-    return f"{name} {verdict(auc)} {rival}, the best classical planner on the validation maps: {points}, {later}."
+    return f"{name} {verdict(auc)} {rival}: {points}, {later}."
 
 
 def _later(found: dict[str, dict], mark: int) -> str:

@@ -1,6 +1,7 @@
 """Films of held-out episodes, and the episodes themselves as files that replay without simulation."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from maexp.envs.viewing.episode import Episode, EpisodeRecorder
 WRITERS = {"gif": write_gif, "mp4": write_mp4}
 EPISODES = "episodes"  # folder of the episode files
 MOST_TEAMS = 64  # in one film or on one page
+LINE = 26  # pixels of a line of the caption
 WIDTHS = ((1, 512), (2, 440), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
 
 
@@ -43,17 +45,20 @@ def play_teams(
     name: str,
     *,
     first: int = 0,
+    teams: Sequence[int] | None = None,
     seed: int = 0,
     every: int | None = None,
 ) -> list[Episode]:
-    """Evaluation episodes `first`, `first` + 1, ... of all teams of `env`, recorded.
+    """Evaluation episodes `first`, `first` + 1, ... of the teams of `env`, recorded.
 
     Args:
+        teams: numbers of the teams to record; None: all
         policy: a TensorDictModule that writes the action; `name` is what the files call it
         seed: of the policy's random numbers; the global ones go on as if nothing had happened
         every: local steps from one record to the next; None: about 150 records in a full episode
     """
-    recorders = [EpisodeRecorder(name) for _ in range(env.num_envs)]
+    teams = range(env.num_envs) if teams is None else teams
+    recorders = [EpisodeRecorder(name) for _ in teams]
 
     def look(snapshots: list[dict]) -> None:
         for recorder, snapshot in zip(recorders, snapshots, strict=True):
@@ -63,14 +68,14 @@ def play_teams(
     with torch.random.fork_rng(devices):
         torch.manual_seed(seed)
         env.set_episodes(torch.arange(first, first + env.num_envs, device=env.device))
-        watch_episode(env, policy, look, range(env.num_envs), every)
+        watch_episode(env, policy, look, teams, every)
     return [recorder.episode() for recorder in recorders]
 
 
-def draw_film(episodes: list[Episode]) -> list[np.ndarray]:
+def draw_film(episodes: list[Episode], caption: Sequence[str] = (), columns: int | None = None) -> list[np.ndarray]:
     """The pictures of a film, uint8 (height, width, 3): the teams side by side, at the same time each.
 
-    Where policies differ, each team's picture has the name of its own on top.
+    Where policies differ, each team's picture has the name of its own on top. `caption`: lines of text over all.
     """
     several = len({one.policy for one in episodes}) > 1
     width = next(pixels for most, pixels in WIDTHS if len(episodes) <= most)
@@ -82,7 +87,10 @@ def draw_film(episodes: list[Episode]) -> list[np.ndarray]:
                 picture = draw_frame(episode.snapshot(record), width)
                 latest[k] = record, add_headline(picture, episode.policy) if several else picture
         pictures = [latest[k][1] for k in range(len(episodes))]
-        frames.append(pictures[0] if len(pictures) == 1 else draw_grid(pictures))
+        frame = pictures[0] if len(pictures) == 1 else draw_grid(pictures, columns)
+        for line in reversed(caption):
+            frame = add_headline(frame, line, LINE)
+        frames.append(frame)
     return frames
 
 

@@ -24,13 +24,15 @@ from maexp.envs import ExplorationEnv
 
 NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
+START = "iteration_000000.pt"
+"""What the training started from; it stays."""
 FORMAT = "maexp-checkpoint-1"
 KINDS = {"overrides": list, "settings": dict, "followers": list, "maps": dict, "iteration": int, "policy": dict}
 """What every reader of a checkpoint relies on."""
 
 
 def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: bool = False) -> Path:
-    """Write `state` as the checkpoint of `iteration` and delete all but the newest `keep`.
+    """Write `state` as the checkpoint of `iteration` and delete all but the newest `keep` and the start.
 
     Args:
         folder: the run's `checkpoints/`
@@ -42,7 +44,8 @@ def save_checkpoint(folder: Path, state: dict, iteration: int, keep: int, best: 
     for target in [path] + [folder / BEST] * best:
         _write_atomically(target, state)
     for old in list_checkpoints(folder)[keep:]:
-        old.unlink()
+        if old.name != START:
+            old.unlink()
     for leftover in folder.glob(".*.part"):
         leftover.unlink()
     return path

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from maexp.agents.checksums import warn_of_changed_maps
 from maexp.agents.errors import UserError
+from maexp.agents.evaluation.comparison import STARTS
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
 from maexp.agents.policies.load import is_exported, load_policy_folder, open_policy
 from maexp.agents.policies.names import describe_unknown, plug_ins
@@ -26,8 +27,8 @@ from maexp.agents.settings.schema import CommonSettings
 from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, model_of, restore_policy
 from maexp.envs import ExplorationEnv, PointCloudMap
 
-Kind = Literal["classical", "exported", "checkpoint", "own"]
-TAKEN = ("run", "difference", "headroom_share", "trained", "best_classical")
+Kind = Literal["classical", "exported", "checkpoint", "start", "own"]
+TAKEN = ("run", "difference", "headroom_share", "trained", *STARTS, "best_classical")
 """What results call something else."""
 
 
@@ -61,6 +62,8 @@ class Player:
     @property
     def learned(self) -> bool:
         """Whether it competes with the classical planners, which differences are told to."""
+        if self.kind == "start":
+            return False
         return self.kind != "classical" or self.name not in (*CLASSICAL, *REFERENCES)
 
     def make(self, env: ExplorationEnv) -> Callable:
