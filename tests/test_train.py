@@ -116,9 +116,9 @@ def test_the_files_of_a_run(capsys):
 
 
 def test_what_a_training_started_from_stands_beside_it():
-    folder = run("run", 3, "episodes=2", "checkpoint_keep=1", "checkpoint_every=1", "classical=[]")
+    folder = run("run", 3, "episodes=3", "checkpoint_keep=1", "checkpoint_every=1", "classical=[]", "algorithm.lr=0.3")
     summary = json.loads((folder / "summary.json").read_text())
-    words = [f"checkpoint={folder}/checkpoints/iteration_000000.pt", "episodes=2", "num_envs=3", "hydra.run.dir=start"]
+    words = [f"checkpoint={folder}/checkpoints/iteration_000000.pt", "episodes=3", "num_envs=3", "hydra.run.dir=start"]
     assert main(["evaluate", *words]) == 0
     assert json.loads(Path("start/results.json").read_text())["trained"] == summary["untrained"] != summary["trained"]
     (folder / "checkpoints" / "iteration_000000.pt").write_bytes(b"damaged")
@@ -194,7 +194,7 @@ def test_teams_of_several_sizes_in_one_batch(capsys):
     for folder, count in (("whole", frames[0]), ("parts", frames[1])):
         assert main(["train", *TINY, *words, f"hydra.run.dir={folder}", count, "episodes=3"]) == 0
     summary = json.loads(Path("parts/summary.json").read_text())
-    teams = {f"{policy} N={n}" for policy in ("trained", "random") for n in (1, 3)}
+    teams = {f"{policy} N={n}" for policy in ("trained", "untrained", "random") for n in (1, 3)}
     assert summary.keys() - {"run", "difference"} == teams
     assert summary["run"]["num_robots"] == [1, 3]
     assert "5 teams of 1 and 3 robots" in capsys.readouterr().out
