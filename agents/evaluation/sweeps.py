@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.evaluation.comparison import DECIDES
+from maexp.agents.evaluation.comparison import DECIDES, STARTS
 from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.evaluation.results import find_columns, print_table
 from maexp.agents.files import write_text
@@ -56,11 +56,12 @@ def _teams(run: str, summary: dict[str, Any]) -> list[tuple[str, dict]]:
 
 
 def _planners(found: dict[str, dict]) -> list[tuple[str, dict]]:
-    """The policies beside them: once where all runs have the same episodes, else with the run's name."""
+    """The policies beside them: once where all runs have the same episodes, else with the run's name. What each team
+    started from is in its own run's table."""
     rows: dict[str, dict] = {}
     for run, summary in found.items():
         for name in summary["run"]["distinct_episodes"]:
-            if TRAINED.fullmatch(name) or summary[name] in rows.values():
+            if TRAINED.fullmatch(name) or name.partition(" ")[0] in STARTS or summary[name] in rows.values():
                 continue
             rows[f"{name}, {run}" if name in rows else name] = summary[name]
     return list(rows.items())
