@@ -42,6 +42,12 @@ def test_a_pack_is_counted():
     assert course.close >= course.needless > 0
 
 
+def test_coarse_cells_hold_nobody_back():
+    """Cells longer than what a robot drives in a call: it does not turn back to the middle of its own."""
+    _, course = play("cost_utility", make_floor(25, room=8, door=2), 1.0, seconds=300.0)
+    assert course.done and course.reached[0] < 120.0
+
+
 @pytest.mark.parametrize("name", ["crob_lab_slam", "rail_lab"])
 def test_real_floors(name, data_dir):
     grid, cell = read_floor(data_dir / "maps2d" / f"{name}.yaml", 0.2)

@@ -6,6 +6,7 @@ Policies need onnxruntime and are left out where it is not installed.
 
 import argparse
 import importlib.util
+import itertools
 import logging
 import sys
 import time
@@ -36,30 +37,47 @@ def measure(given: argparse.Namespace) -> None:
 
 
 def simulate(given: argparse.Namespace) -> None:
-    """Print how a team explores a floor: one line for each policy and run."""
+    """Print how a team explores floors: one line for each policy and run, with --compare a table of each policy."""
     logging.getLogger("maexp.runtime").setLevel(logging.INFO if given.notes else logging.ERROR)
-    if given.floor is None:
-        cell = given.resolution
-        grid = make_floor(round(given.metres / cell), round(ROOM / cell), max(round(1.0 / cell), 1))
-    else:
-        grid, cell = read_floor(given.floor, given.resolution)
-    size = f"{grid.shape[1] * cell:.0f} x {grid.shape[0] * cell:.0f} m, {(grid == 0).sum() * cell**2:.0f} m2 free"
-    print(f"{given.floor or 'rooms'}: {size}; {given.robots} robots of {given.radius:g} m start together")
-    for policy in given.policy.split(","):
-        for seed in range(given.seed, given.seed + given.runs):
-            first = np.random.default_rng(seed) if given.start is None else np.array(given.start)
-            places = place_team(grid, cell, given.radius, given.robots, first)
-            floor = Floor(grid, cell, places, given.radius, given.range, given.speed)
-            planner = TeamPlanner(
-                policy, radar_range=given.range, robot_radius=given.radius, max_speed=given.speed, seconds=1.0,
-                bounded=True, distinct=given.distinct, spare=given.spare, seed=seed,
-            )  # fmt: skip
-            course = explore(floor, planner, given.seconds)
-            print(describe(policy, seed, course), flush=True)
-            if given.notes:
-                print("".join(f"    {one}\n" for one in course.notes), end="")
-            if given.picture:
-                draw(given.picture, floor, course)
+    courses: dict[tuple[str, bool], list[Course]] = {}
+    for name in given.floor or [None]:
+        grid, cell = open_floor(given, name)
+        size = f"{grid.shape[1] * cell:.0f} x {grid.shape[0] * cell:.0f} m, {(grid == 0).sum() * cell**2:.0f} m2 free"
+        print(f"{name or 'rooms'}: {size}; {given.robots} robots of {given.radius:g} m start together")
+        seeds = range(given.seed, given.seed + given.runs)
+        for policy, seed in itertools.product(given.policy.split(","), seeds):
+            for distinct in (True, False) if given.compare else (given.distinct,):
+                course = run(given, grid, cell, policy, seed, distinct)
+                courses.setdefault((policy, distinct), []).append(course)
+    if given.compare:
+        for policy in given.policy.split(","):
+            print(compare(policy, courses[policy, True], courses[policy, False], given.seconds))
+
+
+def open_floor(given: argparse.Namespace, name: str | None) -> tuple[np.ndarray, float]:
+    """Its grid and the edge of a cell [m]; None: rooms of our own."""
+    if name is not None:
+        return read_floor(name, given.resolution)
+    cell = given.resolution
+    return make_floor(round(given.metres / cell), round(ROOM / cell), max(round(1.0 / cell), 1)), cell
+
+
+def run(given: argparse.Namespace, grid: np.ndarray, cell: float, policy: str, seed: int, distinct: bool) -> Course:
+    """One exploration, told in a line."""
+    first = np.random.default_rng(seed) if given.start is None else np.array(given.start)
+    places = place_team(grid, cell, given.radius, given.robots, first)
+    floor = Floor(grid, cell, places, given.radius, given.range, given.speed)
+    planner = TeamPlanner(
+        policy, radar_range=given.range, robot_radius=given.radius, max_speed=given.speed, seconds=1.0,
+        bounded=True, distinct=distinct, spare=given.spare, seed=seed,
+    )  # fmt: skip
+    course = explore(floor, planner, given.seconds)
+    print(describe(policy if distinct else f"{policy}, shared", seed, course), flush=True)
+    if given.notes:
+        print("".join(f"    {one}\n" for one in course.notes), end="")
+    if given.picture:
+        draw(given.picture, floor, course)
+    return course
 
 
 def describe(policy: str, seed: int, course: Course) -> str:
@@ -68,9 +86,28 @@ def describe(policy: str, seed: int, course: Course) -> str:
                       for mark, when in zip(MARKS, course.reached, strict=True))  # fmt: skip
     end = f"done after {course.seconds:.0f} s" if course.done else f"broken off after {course.seconds:.0f} s"
     return (
-        f"{policy:<17} seed {seed}: {marks}; {end}, {100 * course.share:.1f} % seen; {course.driven:.0f} m driven; "
+        f"{policy:<20} seed {seed}: {marks}; {end}, {100 * course.share:.1f} % seen; {course.driven:.0f} m driven; "
         f"needless duplicates {course.needless}, close goals {course.close}, waits {course.waits}"
     )
+
+
+def compare(policy: str, apart: list[Course], shared: list[Course], limit: float) -> str:
+    """A table of means: robots that take distinct targets, robots that may share one, and the paired difference with
+    its 95 % interval over runs. A share that was never seen counts with the time limit [s]."""
+    rows = {f"{100 * mark:g} % [s]": lambda one, k=k: min(one.reached[k], limit) for k, mark in enumerate(MARKS)}
+    rows |= {"done [s]": lambda one: one.seconds if one.done else limit, "driven [m]": lambda one: one.driven}
+    rows |= {"needless duplicates": lambda one: one.needless, "close goals": lambda one: one.close}
+    rows |= {"waits": lambda one: one.waits, "runs that were done": lambda one: 100.0 * one.done}
+    head = f"{'':<20}{'distinct':>10}{'shared':>10}   distinct - shared [95 %]"
+    lines = [f"{policy}, {len(apart)} runs: means", head]
+    for name, tell in rows.items():
+        one, other = (np.array([tell(course) for course in courses], float) for courses in (apart, shared))
+        drawn = np.random.default_rng(0).integers(len(one), size=(2000, len(one)))
+        low, high = np.percentile((one - other)[drawn].mean(1), [2.5, 97.5])
+        unit = " %" * (name == "runs that were done")
+        difference = f"{(one - other).mean():+.1f} [{low:+.1f}, {high:+.1f}]" if len(one) > 4 else ""
+        lines.append(f"{name:<20}{f'{one.mean():.1f}{unit}':>10}{f'{other.mean():.1f}{unit}':>10}   {difference}")
+    return "\n".join(lines)
 
 
 def draw(path: str, floor: Floor, course: Course) -> None:
@@ -105,7 +142,7 @@ def read_words(words: list[str]) -> argparse.Namespace:
     parser.add_argument("--resolution", type=float, default=0.1, help="edge of a cell, at least [m]")
     parser.add_argument("--robots", type=int, default=3)
     if simulates:
-        parser.add_argument("floor", nargs="?", help="a map_server yaml; default: rooms of our own")
+        parser.add_argument("floor", nargs="*", help="map_server yamls; default: rooms of our own")
         parser.add_argument("--policy", default="cost_utility", help="one or several: cost_utility,universal")
         parser.add_argument("--start", type=float, nargs=2, help="x y [m] that the team begins at; default: drawn")
         parser.add_argument("--radius", type=float, default=0.35, help="of a robot [m]")
@@ -116,6 +153,7 @@ def read_words(words: list[str]) -> argparse.Namespace:
         parser.add_argument("--runs", type=int, default=1, help="from so many places, one seed after the other")
         parser.add_argument("--spare", default="wait", help="robots without a target: wait, or home")
         parser.add_argument("--together", dest="distinct", action="store_false", help="robots may share a target")
+        parser.add_argument("--compare", action="store_true", help="each run both ways, and a table of the differences")
         parser.add_argument("--notes", action="store_true", help="print what the planner says")
         parser.add_argument("--picture", help="file to draw the last run in (.png)")
     else:

@@ -105,6 +105,13 @@ def _graph(passable: np.ndarray) -> csr_array:
     return csr_array((weights.ravel(), ends.ravel(), first), shape=(len(at),) * 2)
 
 
+def is_clear(grid: KnownGrid, passable: np.ndarray, start: np.ndarray, end: np.ndarray) -> bool:
+    """Whether the straight line between two points [m], in the grid's frame, leads over passable cells alone."""
+    count = int(np.ceil(4.0 * np.abs(end - start).max() / grid.cell)) + 1  # four points a cell
+    cells = grid.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
+    return bool((cells >= 0).all() and (passable.ravel()[cells] != BLOCKED).all())
+
+
 def cells_ahead(passable: list[np.ndarray], distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
     """The cell that lies `ahead` [cells] from each robot on its way to each of its cells, int64 [n, k]; -1 = no way.
 
