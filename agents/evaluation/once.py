@@ -38,7 +38,7 @@ def play_once(name: str, env: ExplorationEnv, play: Callable[[], EvaluationResul
     content = zlib.crc32(starts.tobytes())
     for one in clouds:
         content = zlib.crc32(one.encode() if isinstance(one, str) else one.tobytes(), content)
-    key = (name, env.settings, content, *played)
+    key = (name, repr(env.settings), content, *played)
     if key not in kept:
         kept[key] = play()
     return kept[key]

@@ -20,6 +20,7 @@ LOOKS = 5  # ticks between two scans
 MARKS = (0.95, 0.99, 0.995)
 SPARE = 2.0  # a target counts as left over if no goal lies so near to it [m]
 ASIDE = np.radians([0.0, 30.0, -30.0, 60.0, -60.0, 90.0, -90.0])  # headings that a robot tries, off its way
+STANDS = 0.5  # metres between places to see the floor from, for what could be seen
 BEAM = 0.5  # cells between two points of a beam, and between two beams at the end of their range
 
 
@@ -28,8 +29,8 @@ class Course:
     """What came of an exploration.
 
     Attributes:
-        reached: seconds until each of `MARKS` of the floor was seen; infinite: never.
-        share: of the floor, seen at the end.
+        reached: seconds until each of `MARKS` of what can be seen of the floor was seen; infinite: never.
+        share: of what can be seen of the floor, seen at the end.
         seconds: until it was done, or broken off.
         done: whether the planner said that nothing was left.
         driven: way of all robots [m].
@@ -68,12 +69,10 @@ class Floor:
         self.radius, self.reach, self.speed = radius, reach, speed
         self.seen = np.zeros(grid.shape, bool)
         self.gap = distance_transform_edt(grid == FREE) * cell - 0.5 * cell
-        parts, _ = label(grid == FREE)
-        y, x = self.cells(self.at)
-        self.counts = np.isin(parts, parts[y, x]) & (grid == FREE)
         beams = np.arange(0.0, 2.0 * math.pi, BEAM * cell / reach)
         unit = np.stack([np.cos(beams), np.sin(beams)], -1)
         self.rays = unit[:, None] * np.arange(0.0, reach, BEAM * cell)[:, None]
+        self.counts = self._within_sight() & (grid == FREE)
         self.look()
 
     def cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,17 +83,35 @@ class Floor:
     def look(self) -> None:
         """Scan from where the robots are: every beam sees as far as the first wall, and that."""
         for at in self.at:
-            y, x = self.cells(at + self.rays)
-            wall = self.grid[y, x] != FREE
-            clear = np.cumsum(wall, axis=1) - wall == 0
-            self.seen[y[clear], x[clear]] = True
+            self._scan(at, self.seen)
+
+    def _scan(self, at: np.ndarray, seen: np.ndarray) -> None:
+        """Mark what a lidar sees from there."""
+        y, x = self.cells(at + self.rays)
+        wall = self.grid[y, x] != FREE
+        clear = np.cumsum(wall, axis=1) - wall == 0
+        seen[y[clear], x[clear]] = True
+
+    def _within_sight(self) -> np.ndarray:
+        """The cells that robots of this size can see from where they get to, bool [H, W]."""
+        fits = self.gap >= self.radius
+        starts = self.cells(self.at)
+        fits[starts] = True
+        parts, _ = label(fits)
+        y, x = np.nonzero(np.isin(parts, parts[starts]))
+        blocks = np.stack([y, x]) // max(1, round(STANDS / self.cell))
+        first = np.unique(blocks, axis=1, return_index=True)[1]
+        seen = np.zeros(self.grid.shape, bool)
+        for at in (np.stack([x, y], -1)[first] + 0.5) * self.cell:
+            self._scan(at, seen)
+        return seen
 
     def known(self) -> np.ndarray:
         """The team's map as ROS has it: -1 unknown, 0 free, 100 wall."""
         return np.where(self.seen, np.where(self.grid == FREE, 0, 100), -1)
 
     def share(self) -> float:
-        """Of the free cells that hang together with where the team began, those seen."""
+        """Of the free cells that robots of this size can see from where they get to, those seen."""
         return float(self.seen[self.counts].mean())
 
     def drive(self, ways: list[np.ndarray]) -> float:
