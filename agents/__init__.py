@@ -3,7 +3,7 @@
 Names are looked up on first use, so that `maexp maps ...` need not wait for TorchRL.
 """
 
-from maexp.envs.lazy import lazy_names
+from maexp.kernels.lazy import lazy_names
 
 _HOMES = {
     "make_env": "command_env",

@@ -3,7 +3,7 @@
 Names are looked up on first use, so that a command line or a robot's computer need not wait for TorchRL and Warp.
 """
 
-from maexp.envs.lazy import lazy_names
+from maexp.kernels.lazy import lazy_names
 
 _HOMES = {
     "SCENARIOS": "scenarios",

@@ -24,10 +24,9 @@ from maexp.envs.navigation import Navigation
 from maexp.envs.targets import TargetTracker
 from maexp.kernels.belief import NOBODY, recall, write_worlds
 from maexp.kernels.blocks import block_sides
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, MARGIN_CELLS, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, record, replay
-from maexp.kernels.wavefront import MARGIN_CELLS
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv

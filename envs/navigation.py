@@ -19,12 +19,12 @@ from maexp.envs.nav_grid import bank_nav_grids
 from maexp.envs.simulation import navigation_bytes, refuse_too_many
 from maexp.kernels import goals, outlook, targets
 from maexp.kernels.blocks import FrontierBlocks
-from maexp.kernels.geodesic import STRAIGHT
+from maexp.kernels.constants import COMFORT, MARGIN_CELLS, RAYS, STRAIGHT
 from maexp.kernels.known_grid import KnownGrids
 from maexp.kernels.launches import Launch, finish_filling, launch_named, launch_on, record, replay, view
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.tree import _grow_tree
-from maexp.kernels.wavefront import COMFORT, MARGIN_CELLS, PathSearch, distinct_masks
+from maexp.kernels.wavefront import PathSearch, distinct_masks
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
@@ -248,7 +248,7 @@ class Navigation:
         """The rays of a radius [m], computed once: their cells and what those count."""
         if radius not in self._rays:
             across = math.hypot(int(self.width.max()), int(self.height.max()))  # no ray stays in a grid for longer
-            shape = (outlook.RAYS, int(min(radius / float(self.cell_size.min()), across)) + 2)
+            shape = (RAYS, int(min(radius / float(self.cell_size.min()), across)) + 2)
             rays = [wp.zeros(shape, dtype=kind, device=str(self.device)) for kind in (wp.vec2i, wp.vec3)]
             finish_filling(self.device)
             self.launch(outlook._spread_rays, shape, inputs=[], outputs=rays)

@@ -4,7 +4,7 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from maexp.envs.config import CommConfig
-from maexp.envs.target_view import FEATURES
+from maexp.envs.features import FEATURES
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS
 from maexp.kernels.types import REGIONS

@@ -1,48 +1,21 @@
-"""What a learned choice among frontier targets sees: for every robot its best candidates, with features that do not
-depend on the map.
-
-Lengths count in radar ranges and areas in radar discs, so that one policy fits every scenario and team size. The
-features of a candidate contain what the classical planner `cost_utility` would think of it: a policy starts from there.
-"""
+"""What a learned choice among frontier targets sees: for every robot its best candidates, with the features of
+`maexp.envs.features`."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 
-from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, plan_in_turn, value_targets
+from maexp.envs.choices import WAY_AHEAD, value_targets
+from maexp.envs.features import AROUND, FEATURES, NEAR, Moment
+from maexp.envs.targets import Scene, TargetTracker, plan_in_turn
 from maexp.kernels.teamwork import compare_with_others, gather_gain
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
-
-FAR = 4.0  # lengths between targets and robots count up to so many radar ranges
-WAY_AHEAD = 3.0  # cells from a robot to the point that tells where its way begins
-
-FEATURES = (
-    # What cost_utility thinks of it: value when it is the robot's turn, value without the others, whether it takes it,
-    # share of the gain that robots before it have claimed, and how far off [ranges] the nearest other robot goes.
-    "score", "value", "planned", "claimed", "plan_gap",
-    # The way: log(1 + length [ranges]), 1 / (1 + length), straight distance [ranges], way / distance - 1.
-    "travel", "nearness", "distance", "detour",
-    # What is to be seen from there [discs], frontier cells [10], whether it is worth going to at once; gain of the
-    # candidates within 1 and 2.5 ranges of it [1 and 4 discs].
-    "gain", "size", "worth", "gain_near", "gain_around",
-    # Cosine and sine of where it lies, where the way begins and where the unknown beyond it lies, from the heading;
-    # how far the middle of the unknown is from it [ranges].
-    "ahead", "aside", "way_ahead", "way_aside", "unknown_ahead", "unknown_aside", "unknown_far",
-    # The others: least way of one of them [ranges], that less the own way, whether the own is the shortest, distance to
-    # the own last target and to the nearest last target of another [ranges].
-    "rival", "lead", "nearest", "own_last", "mates_last",
-    # Of the robot and its team, the same for all candidates: candidates [10], speed [of the limit], way driven until
-    # the next decision [ranges], time left [of the episode], log(1 + what is known [discs]), others that move [4].
-    "count", "speed", "drive", "time_left", "known", "mates",
-)  # fmt: skip
-"""Names of the last axis of the features, with their units."""
 
 
 class TargetView:
@@ -109,11 +82,62 @@ class TargetView:
         s["way"] = torch.where(some, scene.travel.gather(2, best), 0.0)
         s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
-        travel = s["way"] / nav.radar_range
-        near = _Near(self, s, scene, best, some, travel)
-        columns = near.plan() | near.way() | near.worth() | near.bearings() | near.team()
-        features = torch.stack([columns[name].expand(best.shape) for name in FEATURES], -1)
-        return {"features": torch.where(some.unsqueeze(-1), features, 0.0), "mask": first_if_none(some)}, best
+        features = self._moment(s, scene, best, some, value.gather(2, best)).features()
+        return {"features": features, "mask": first_if_none(some)}, best
+
+    def _moment(
+        self, state: dict[str, torch.Tensor], scene: Scene, best: torch.Tensor, some: torch.Tensor, value: torch.Tensor
+    ) -> Moment:
+        """What features are made of; each robot hears only those it hears.
+
+        Args:
+            state: what `show` has just noted, of the envs that are looked at.
+            best, some: of the candidates, int64 and bool [E, N, M].
+            value: what they are worth, float32 [E, N, M].
+        """
+        nav, env, tracker = scene.nav, self.env, self.tracker
+        reach, point, gain, hears = nav.radar_range, state["point"], scene.gain.gather(2, best), nav.state["comm"]
+        open_value = torch.where(some, value, -torch.inf)
+        score, taken, claimed = plan_in_turn(gain, open_value, point / reach, hears)
+        where = _pick(point, taken.unsqueeze(-1)).squeeze(2)
+        ways = torch.where(scene.alive.unsqueeze(-1), nav.way / reach, torch.inf)
+        plans, last = (where, some.any(-1)), (state["last"], state["has_last"])
+        rival, *gaps = compare_with_others(point, best, ways, hears, plans, last)
+        plan_gap, own_last, mates_last = (gap / reach for gap in gaps)
+        near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR, AROUND)
+        speed, at = tracker.speed(), nav.centers()
+        own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
+        left = 1.0 - nav.state["macro_step"].float() / env.macro_steps
+        cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
+        return Moment(
+            xp=torch,
+            reach=reach,
+            mask=some,
+            travel=state["way"] / reach,
+            to=point - at.unsqueeze(2),
+            way=nav.points_on_way(torch.where(some, state["cell"], -1), WAY_AHEAD) - at.unsqueeze(2),
+            toward=state["toward"],
+            gain=gain,
+            gain_near=near,
+            gain_around=around,
+            size=scene.size.gather(2, best),
+            value=value,
+            score=score,
+            claimed=claimed,
+            planned=torch.arange(best.shape[-1], device=best.device) == taken.unsqueeze(-1),
+            plan_gap=plan_gap,
+            own_last=own_last,
+            mates_last=mates_last,
+            rival=rival,
+            at=at,
+            heading=nav.state["pose"][..., 3:],
+            speed=speed.unsqueeze(-1),
+            max_speed=nav.pick(env.simulation.robot_tensors["max_speed"]).unsqueeze(-1),
+            drive=tracker.drive(speed).unsqueeze(-1),
+            mates=hears & ~own & scene.alive.unsqueeze(1),
+            time_left=left.view(-1, 1, 1),
+            area=cells.unsqueeze(-1),
+        )
 
     def note(self, chosen: torch.Tensor, where: torch.Tensor) -> None:
         """Remember where robots go: what they chose, int64 [E, N], -1 = nothing, and where that is, float32 [E, N, 2]
@@ -167,101 +191,6 @@ class TargetView:
             for name in part:
                 part[name] = state[f"{prefix}_{name}"].to(part[name]).clone()
         self.tracker.nav.update()  # plain DWA drives along the ways that were found when the robots last looked
-
-
-class _Near:
-    """The features of the candidates of one moment, group by group."""
-
-    def __init__(
-        self, view: TargetView, state: dict[str, torch.Tensor], scene: Scene, best: torch.Tensor, some: torch.Tensor,
-        travel: torch.Tensor,
-    ):  # fmt: skip
-        self.view, self.state, self.scene = view, state, scene
-        self.best, self.some, self.travel = best, some, travel
-        nav = scene.nav
-        self.nav, self.reach = nav, nav.radar_range
-        self.point = state["point"]
-        self.to = self.point - nav.centers().unsqueeze(2)
-        self.distance = self.to.norm(dim=-1) / self.reach
-        self.gain = scene.gain.gather(2, best)
-
-    def plan(self) -> dict[str, torch.Tensor]:
-        """What the classical planner would do, each robot hearing only those it hears."""
-        some, hears = self.some, self.nav.state["comm"]
-        value = value_targets(self.scene).gather(2, self.best)
-        open_value = torch.where(some, value, -torch.inf)
-        score, taken, claimed = plan_in_turn(self.gain, open_value, self.point / self.reach, hears)
-        where = _pick(self.point, taken.unsqueeze(-1)).squeeze(2)
-        return {
-            "score": score,
-            "value": value.clamp_min(-FAR),
-            "planned": torch.zeros_like(score).scatter_(2, taken.unsqueeze(-1), 1.0),
-            "claimed": claimed,
-        } | self._others(where)
-
-    def way(self) -> dict[str, torch.Tensor]:
-        return {
-            "travel": self.travel.log1p(),
-            "nearness": 1.0 / (1.0 + self.travel),
-            "distance": self.distance,
-            "detour": (self.travel / self.distance.clamp_min(0.1)).clamp(max=FAR) - 1.0,
-        }
-
-    def worth(self) -> dict[str, torch.Tensor]:
-        gain = torch.where(self.some, self.gain, 0.0)
-        near, around = gather_gain(self.point, gain, self.reach, 1.0, 2.5)
-        return {
-            "gain": self.gain,
-            "size": self.scene.size.gather(2, self.best) / 10.0,
-            "worth": (self.gain >= LEAST_GAIN).float(),
-            "gain_near": near,
-            "gain_around": around / 4.0,
-        }
-
-    def bearings(self) -> dict[str, torch.Tensor]:
-        heading = self.nav.state["pose"][..., 3]
-        ahead = torch.stack((heading.cos(), heading.sin()), -1).unsqueeze(2)
-        wanted = torch.where(self.some, self.state["cell"], -1)
-        way = self.nav.points_on_way(wanted, WAY_AHEAD) - self.nav.centers().unsqueeze(2)
-        toward = self.state["toward"]
-        columns = {"unknown_far": toward.norm(dim=-1) / self.reach}
-        for name, vector in (("", self.to), ("way_", way), ("unknown_", toward)):
-            unit = vector / vector.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-            columns[f"{name}ahead"] = (unit * ahead).sum(-1)
-            columns[f"{name}aside"] = unit[..., 1] * ahead[..., 0] - unit[..., 0] * ahead[..., 1]
-        return columns
-
-    def _others(self, where: torch.Tensor) -> dict[str, torch.Tensor]:
-        """``where``, float32 [E, N, 2]: where the robots would go [m]."""
-        scene, s = self.scene, self.state
-        ways = torch.where(scene.alive.unsqueeze(-1), self.nav.way / self.reach, torch.inf)
-        plans, last = (where, self.some.any(-1)), (s["last"], s["has_last"])
-        rival, *gaps = compare_with_others(self.point, self.best, ways, self.nav.state["comm"], plans, last)
-        plan_gap, own_last, mates_last = ((gap / self.reach).clamp(max=FAR) for gap in gaps)
-        return {
-            "rival": rival.clamp(max=2 * FAR),
-            "lead": (rival - self.travel).clamp(-FAR, FAR),
-            "nearest": (self.travel <= rival).float(),
-            "plan_gap": plan_gap,
-            "own_last": own_last,
-            "mates_last": mates_last,
-        }
-
-    def team(self) -> dict[str, torch.Tensor]:
-        nav, env, tracker = self.nav, self.view.env, self.view.tracker
-        speed, limit = tracker.speed(), nav.pick(env.simulation.robot_tensors["max_speed"])
-        own = torch.eye(self.best.shape[1], dtype=torch.bool, device=self.best.device)
-        mates = nav.state["comm"] & ~own & self.scene.alive.unsqueeze(1)
-        cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
-        columns = {
-            "count": self.some.sum(-1) / 10.0,
-            "speed": speed / limit,
-            "drive": tracker.drive(speed) / self.reach,
-            "time_left": (1.0 - nav.state["macro_step"].float() / env.macro_steps).unsqueeze(-1),
-            "known": (1.0 + cells / (math.pi * self.reach**2)).log(),
-            "mates": mates.sum(-1) / 4.0,
-        }
-        return {name: value.unsqueeze(-1).float() for name, value in columns.items()}
 
 
 def first_if_none(mask: torch.Tensor) -> torch.Tensor:

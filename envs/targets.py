@@ -4,13 +4,15 @@ from, which targets are given up, and how a chosen one is approached."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 import warp as wp
 
+from maexp.envs.features import drive_until_next
 from maexp.envs.navigation import Navigation
 from maexp.kernels import goals, targets
+from maexp.kernels.assignment import FORBIDDEN, assign_targets
 from maexp.kernels.launches import launch_named, launch_on, view
 from maexp.kernels.sharing import share_targets
 from maexp.kernels.teamwork import choose_in_turn
@@ -21,14 +23,13 @@ if TYPE_CHECKING:
 
 DWELL = 3  # decisions beside a target that does not go away, or stuck on the way to it, before it is given up
 STUCK = 0.25  # a robot that has moved less than so many clearances since the last decision is stuck
-BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, are hardly worth a way of their own
 SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What targets are chosen from. K targets per robot; those that are absent are infinitely far.
+    """What targets are chosen from, a `maexp.envs.choices.Scene`. K targets per robot; those that are absent are
+    infinitely far.
 
     Attributes:
         travel: float32 [E, N, K], way from robot to target [m].
@@ -50,6 +51,19 @@ class Scene:
     alive: torch.Tensor
     nav: Navigation
     block: torch.Tensor | None = None
+    xp: ClassVar = torch
+
+    @property
+    def radar_range(self) -> float:
+        return self.nav.radar_range
+
+    @property
+    def cell(self) -> torch.Tensor:
+        return self.nav.cell_of_env().view(-1, 1, 1)
+
+    @property
+    def at(self) -> torch.Tensor:
+        return self.nav.centers()
 
     def spread(self, per_row: torch.Tensor) -> torch.Tensor:
         """[E, R, K] of what is known -> [E, N, K] of the robots."""
@@ -75,13 +89,23 @@ class Scene:
         blocks = values.new_zeros((*values.shape[:2], self.nav.num_blocks, *values.shape[3:]))
         return blocks.scatter_add_(2, index, torch.where(there, values, 0.0))
 
+    def ways_ahead(self, cells: float) -> torch.Tensor:
+        return self.nav.points_on_way(self.cells(), cells) - self.at.unsqueeze(2)
 
-def value_targets(scene: Scene) -> torch.Tensor:
-    """What every target is worth to every robot by itself, in radar discs, float32 [E, N, K]; -inf: out of reach.
+    def total(self, values: torch.Tensor) -> torch.Tensor:
+        return self.to_blocks(values).sum(2)
 
-    Unknown area against the way there (Burgard et al. 2005).
-    """
-    return scene.gain - BETA * scene.travel / scene.nav.radar_range
+    def in_turn(self, gain: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+        everyone = torch.ones((*self.alive.shape, self.alive.shape[1]), dtype=torch.bool, device=gain.device)
+        return plan_in_turn(gain, value, self.points / self.radar_range, everyone)[0]
+
+    def match(self, among: torch.Tensor) -> torch.Tensor:
+        cost = (self.travel * (100.0 / self.cell)).clamp(max=FORBIDDEN - 1)  # hundredths of a cell
+        match = assign_targets(torch.where(among, cost, FORBIDDEN).to(torch.int32)).unsqueeze(-1)
+        return torch.arange(cost.shape[-1], device=cost.device) == match
+
+    def found_by_trees(self, samples: int, branch: float) -> torch.Tensor:
+        return self.of_blocks(self.spread(self.nav.grow_trees(samples, branch)))
 
 
 def plan_in_turn(
@@ -224,7 +248,7 @@ class TargetTracker:
     def drive(self, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
         accel, limit = (self.nav.pick(self.env.simulation.robot_tensors[one]) for one in ("max_accel", "max_speed"))
-        return torch.minimum(speed * self.seconds + 0.5 * accel * self.seconds**2, limit * self.seconds)
+        return drive_until_next(torch, speed, accel, limit, self.seconds)
 
     def speed(self) -> torch.Tensor:
         """Of every robot [m/s], float32 [E, N]."""

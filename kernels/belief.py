@@ -9,7 +9,7 @@ W worlds, a row of knowledge each (`known_grid`); C cells, Q tiles (the radar's 
 
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE, UNKNOWN
+from maexp.kernels.constants import OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS

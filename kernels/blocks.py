@@ -7,17 +7,15 @@ numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the e
 import numpy as np
 import warp as wp
 
+from maexp.kernels.constants import BLOCKS_PER_RANGE, MARGIN_CELLS, UNREACHED
 from maexp.kernels.frontier import is_frontier
-from maexp.kernels.geodesic import UNREACHED
 from maexp.kernels.known_grid import NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.passable import has_wall
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.wavefront import MARGIN_CELLS, PathSearch
+from maexp.kernels.wavefront import PathSearch
 
 wp.set_module_options(MODULE_OPTIONS)
-
-BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 
 
 @wp.kernel

@@ -9,15 +9,11 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
-
-UNKNOWN = 0
-FREE = 1
-OBSTACLE = 2
-
 
 
 @wp.func

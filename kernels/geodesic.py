@@ -18,18 +18,12 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
+from maexp.kernels.constants import BLOCKED, DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
 
-STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
-DIAGONAL = 14  # weight of a step to a diagonal neighbour
-UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them still fit in int32
-
-
-BLOCKED, OPEN, TIGHT = 0, 1, 2  # states of a cell
-TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken where the way around is long
 
 BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
 LAST_BUCKET = BUCKETS - 1

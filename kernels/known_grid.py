@@ -10,13 +10,12 @@ loaded), or whose env has another map, is cleared and painted anew: nobody has t
 
 import warp as wp
 
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
 wp.set_module_options(MODULE_OPTIONS)
-
 
 
 @wp.struct

@@ -7,13 +7,12 @@ import math
 
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE, UNKNOWN
+from maexp.kernels.constants import OBSTACLE, RAYS, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
 
-RAYS = 48  # rays that look around from a target
 
 RAY_ANGLE = 2.0 * math.pi / RAYS
 

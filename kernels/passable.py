@@ -7,14 +7,12 @@ cleared, they are drawn anew.
 import numpy as np
 import warp as wp
 
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import BLOCKED, TIGHT
+from maexp.kernels.constants import BLOCKED, FREE, OBSTACLE, TIGHT, UNKNOWN
 from maexp.kernels.known_grid import KnownGrids, NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
-
 
 
 @wp.kernel

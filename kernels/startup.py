@@ -1,4 +1,4 @@
-"""Start Warp quietly: on a machine without a GPU its native code warns on every start that there is none."""
+"""Importing this starts Warp, quietly: on a machine without a GPU its native code warns on every start of that."""
 
 import os
 import zlib
@@ -57,3 +57,6 @@ def _silent_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+start_warp()

@@ -5,8 +5,8 @@ Rows are those of `KnownGrids`. S envs are looked at, some or all; `env` says wh
 
 import warp as wp
 
-from maexp.kernels.frontier import OBSTACLE
-from maexp.kernels.geodesic import SKIP, STRAIGHT, UNREACHED
+from maexp.kernels.constants import OBSTACLE, STRAIGHT, UNREACHED
+from maexp.kernels.geodesic import SKIP
 from maexp.kernels.known_grid import NavGrids, nav_cell, nav_center
 from maexp.kernels.passable import near_wall
 from maexp.kernels.startup import MODULE_OPTIONS

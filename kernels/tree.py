@@ -5,12 +5,11 @@ A tree grows from every robot over its passable cells. Coordinates are in cells 
 
 import warp as wp
 
-from maexp.kernels.frontier import FREE, UNKNOWN
+from maexp.kernels.constants import FREE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
-
 
 
 @wp.func

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from maexp.kernels.geodesic import SKIP, UNREACHED, DistanceSearch
+from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
+from maexp.kernels.geodesic import SKIP, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.pace import fit_clearance, hold_back
@@ -32,10 +33,6 @@ if TYPE_CHECKING:
     from maexp.kernels.simulation import Simulation
 
 wp.set_module_options(MODULE_OPTIONS)
-
-MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
-COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
-
 
 
 @wp.kernel

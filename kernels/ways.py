@@ -2,11 +2,9 @@
 
 import warp as wp
 
-from maexp.kernels.geodesic import DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
+from maexp.kernels.constants import DIAGONAL, SNAP_CELLS, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
 
 PATH_CELLS = 64  # cells of a path that are kept, counted from the robot
-SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells
-
 
 
 @wp.func

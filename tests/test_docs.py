@@ -17,8 +17,8 @@ from tensordict.nn.probabilistic import composite_lp_aggregate
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.envs import SCENARIOS, ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig, make_map
 from maexp.envs.config import ROBOT_KINDS
+from maexp.envs.features import FEATURES
 from maexp.envs.specs import REWARD_TERMS
-from maexp.envs.target_view import FEATURES
 from maexp.kernels.state import STATE
 from maexp.kernels.types import PICTURE_CHANNELS
 

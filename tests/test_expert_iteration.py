@@ -17,7 +17,7 @@ from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import model_config
 from maexp.agents.training.branching import BranchingActor
 from maexp.envs import ExplorationEnv, ObservationConfig
-from maexp.envs.target_view import FEATURES
+from maexp.envs.features import FEATURES
 
 WORDS = ("algorithm=expert_iteration", "action=targets", "algorithm.branch_horizon=1", "algorithm.candidates=3")
 ROW = TRAININGS["expert_iteration"]

@@ -15,10 +15,11 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.runtime import TeamPlanner
-from maexp.agents.runtime.features import FEATURES, Candidates, Motion, list_candidates
+from maexp.agents.runtime.features import Candidates, Motion, list_candidates
 from maexp.agents.runtime.folder import LearnedChoice
-from maexp.agents.runtime.values import LEAST_GAIN
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs.choices import LEAST_GAIN
+from maexp.envs.features import FEATURES, TABLE, Feature
 from maexp.envs.navigation import Navigation
 
 
@@ -74,6 +75,23 @@ def test_features_are_those_of_the_env(num_robots):
                 np.testing.assert_allclose(a[:, column], b[:, column], atol=2e-4, err_msg=FEATURES[column])
         count += int(ours.mask.sum())
     assert count > 20
+
+
+def test_a_feature_of_ones_own_is_the_same_for_robots(monkeypatch):
+    """A row of the table is all that it takes: here how many others are within the radar's range."""
+
+    def crowd(now):
+        gap = now.length(now.at[..., :, None, :] - now.at[..., None, :, :])
+        return 1.0 * now.xp.sum(now.mates & (gap < 1.0), -1)[..., None]
+
+    monkeypatch.setitem(TABLE, "crowd", Feature(crowd, "robots", "others within the radar's range"))
+    found = set()
+    for seen, ours, now, *_ in play(make_env(3)):
+        there = now.env.target_view.show(now.env.target_view.tracker.look())[0]["features"][0].numpy()
+        assert ours.features.shape[-1] == there.shape[-1] == len(FEATURES) + 1
+        np.testing.assert_array_equal(ours.features[..., -1], there[..., -1])
+        found |= set(there[..., -1][seen["targets_mask"][0].numpy()].tolist())
+    assert len(found) > 1
 
 
 @pytest.fixture(scope="module")

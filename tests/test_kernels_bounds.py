@@ -6,8 +6,8 @@ import torch
 import warp as wp
 
 from maexp.kernels import blocks, targets
-from maexp.kernels.frontier import FREE, UNKNOWN
-from maexp.kernels.geodesic import STRAIGHT, TIGHT_FACTOR, UNREACHED, geodesic_distance
+from maexp.kernels.constants import FREE, STRAIGHT, TIGHT_FACTOR, UNKNOWN, UNREACHED
+from maexp.kernels.geodesic import geodesic_distance
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import launch_on
 

@@ -7,7 +7,8 @@ import warp as wp
 from oracle import grid as oracle
 from scipy import ndimage
 
-from maexp.kernels.frontier import FREE, OBSTACLE, frontier_cells, mark_frontier
+from maexp.kernels.constants import FREE, OBSTACLE
+from maexp.kernels.frontier import frontier_cells, mark_frontier
 
 pytestmark = pytest.mark.kernels
 

@@ -12,7 +12,9 @@ from oracle import grid as oracle
 from scipy.sparse.csgraph import dijkstra
 
 import maexp.kernels.geodesic as geodesic
-from maexp.kernels.geodesic import UNREACHED, DistanceSearch, geodesic_distance
+from maexp.kernels import constants
+from maexp.kernels.constants import UNREACHED
+from maexp.kernels.geodesic import DistanceSearch, geodesic_distance
 
 pytestmark = pytest.mark.kernels
 
@@ -138,7 +140,7 @@ def test_mixed_grid_sizes_and_early_stop():
 def test_tight_cells_weigh_more():
     rng = np.random.default_rng(13)
     height, width = 15, 22
-    states = rng.choice([geodesic.BLOCKED, geodesic.OPEN, geodesic.TIGHT], (6, height, width), p=[0.2, 0.4, 0.4])
+    states = rng.choice([constants.BLOCKED, constants.OPEN, constants.TIGHT], (6, height, width), p=[0.2, 0.4, 0.4])
     sources = rng.integers(0, height * width, (6, 2)).astype(np.int32)
     search = DistanceSearch(6, height * width, 2)
     search.sources.assign(sources)
@@ -147,8 +149,8 @@ def test_tight_cells_weigh_more():
     passable = wp.array(states.reshape(6, -1).astype(np.uint8), dtype=wp.uint8, device="cpu")
     search.search(partial(wp.launch, device="cpu"), passable, *arrays)
     for item in range(6):
-        factor = np.where(states[item] == geodesic.TIGHT, geodesic.TIGHT_FACTOR, 1)
-        want = scipy_distance(states[item] != geodesic.BLOCKED, list(sources[item]), factor)
+        factor = np.where(states[item] == constants.TIGHT, constants.TIGHT_FACTOR, 1)
+        want = scipy_distance(states[item] != constants.BLOCKED, list(sources[item]), factor)
         np.testing.assert_array_equal(search.distance.numpy()[item].reshape(height, width), want)
 
 
@@ -174,7 +176,7 @@ def test_searches_stay_within_their_arrays(height, width, directed):
         setattr(search, name, view)
     search.sources.assign(np.array(corners, np.int32)[:, None])
     search.stop.assign(np.array(corners[::-1] if directed else [-1] * 4, np.int32))
-    around = np.full((3, cells), geodesic.OPEN, np.uint8)
+    around = np.full((3, cells), constants.OPEN, np.uint8)
     passable = wp.array(ptr=around[1:].ctypes.data, shape=(1, cells), dtype=wp.uint8, device="cpu")
     lists = ([0] * 4, [0], [width], [height])
     arrays = [wp.array(v, dtype=wp.int32, device="cpu") for v in lists]
@@ -204,4 +206,4 @@ def test_large_open_grid_takes_less_than_the_promised_time():
 
 
 def test_weights_are_the_documented_ones():
-    assert (geodesic.STRAIGHT, geodesic.DIAGONAL, geodesic.UNREACHED) == (10, 14, oracle.UNREACHED)
+    assert (constants.STRAIGHT, constants.DIAGONAL, constants.UNREACHED) == (10, 14, oracle.UNREACHED)

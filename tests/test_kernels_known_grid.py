@@ -7,8 +7,7 @@ import pytest
 import warp as wp
 from test_kernels_wavefront import Scene, array, flag_words
 
-from maexp.kernels.frontier import OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import UNREACHED
+from maexp.kernels.constants import OBSTACLE, UNKNOWN, UNREACHED
 from maexp.kernels.known_grid import KnownGrids
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.ways import nearest_cell

@@ -8,7 +8,7 @@ import warp as wp
 from oracle import pace as oracle
 
 from maexp.kernels import outlook, pace, stopping
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, Robots
 from maexp.kernels.ways import PATH_CELLS
@@ -241,7 +241,7 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
         target = np.stack([world.rng.integers(-1, known.size, blocks) for known in world.known])
         area, middle = wp.zeros((3, blocks), dtype=float), wp.zeros((3, blocks), dtype=wp.vec2)
         radius = 6.1
-        rays = [wp.zeros((outlook.RAYS, 14), dtype=kind) for kind in (wp.vec2i, wp.vec3)]
+        rays = [wp.zeros((RAYS, 14), dtype=kind) for kind in (wp.vec2i, wp.vec3)]
         launch(outlook._spread_rays, rays[0].shape, [], rays)
         launch(
             outlook._look_around, (3, blocks),
@@ -254,6 +254,6 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
             want = (0.0, 0.0, 0.0)
             if target[e, k] >= 0:
                 place = target[e, k] % width, target[e, k] // width
-                want = oracle.look_around(world.known[e], *place, int(radius / cell), outlook.RAYS)
+                want = oracle.look_around(world.known[e], *place, int(radius / cell), RAYS)
             got = area.numpy()[e, k], *(middle.numpy()[e, k] / cell)
             np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-3)

@@ -10,13 +10,13 @@ from oracle.grid import geodesic_distance
 
 from maexp.envs.map import PointCloudMap
 from maexp.envs.nav_grid import build_nav_grid, stack_nav_grids
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, SNAP_CELLS, UNKNOWN
 from maexp.kernels.geodesic import SKIP
 from maexp.kernels.known_grid import KnownGrids, NavGrids
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.types import Maps
 from maexp.kernels.wavefront import PathSearch, distinct_masks
-from maexp.kernels.ways import PATH_CELLS, SNAP_CELLS, in_sight
+from maexp.kernels.ways import PATH_CELLS, in_sight
 
 pytestmark = pytest.mark.kernels
 

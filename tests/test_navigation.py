@@ -11,9 +11,7 @@ from worlds import room, ways_to_blocks
 from maexp.envs import RobotConfig, make_map
 from maexp.envs.navigation import Navigation
 from maexp.envs.targets import keyed_uniform
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.geodesic import UNREACHED
-from maexp.kernels.outlook import RAYS
+from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN, UNREACHED
 
 
 def test_navigation_shows_what_the_team_knows():

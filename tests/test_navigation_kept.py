@@ -7,8 +7,8 @@ import torch
 
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs.features import FEATURES
 from maexp.envs.navigation import Navigation
-from maexp.envs.target_view import FEATURES
 
 MAPS = [make_map("maze_small", 0), make_map("maze", 1)]
 TARGETS, MASK = ("agents", "observation", "targets"), ("agents", "observation", "targets_mask")

@@ -7,18 +7,19 @@ import pytest
 import torch
 from mazes import OFFSET, REGION, make_env
 
-from maexp.agents.policies.classical import (
+from maexp.agents.policies.classical import FrontierPlanner
+from maexp.envs import RobotConfig, make_map
+from maexp.envs.choices import (
     CLASSICAL,
-    FrontierPlanner,
-    _worthwhile,
     rank_by_area,
     rank_by_assignment,
     rank_by_force,
     rank_by_utility,
     rank_nearest,
+    value_targets,
+    worthwhile,
 )
-from maexp.envs import RobotConfig, make_map
-from maexp.envs.targets import Scene, plan_in_turn, value_targets
+from maexp.envs.targets import Scene, plan_in_turn
 
 
 def test_goals_under_dwa_are_in_sight_and_in_reach():
@@ -84,7 +85,7 @@ def test_targets_with_little_to_see_wait():
     """They come last, the nearest first, where a robot gets to others."""
     scene = scene_of([[[5.0, 2.0, INF, 1.0], [1.0, INF, INF, 3.0]]])
     scene = replace(scene, gain=torch.tensor([[[0.2, 0.4, 0.4, 0.2]] * 2]))
-    assert _worthwhile(scene).tolist() == [[[False, True, False, False], [True, False, False, True]]]
+    assert worthwhile(scene).tolist() == [[[False, True, False, False], [True, False, False, True]]]
     for rank in (rank_nearest, rank_by_area, rank_by_assignment):
         first = rank(scene)[0, 0]
         assert first.argsort(descending=True).tolist() == [1, 3, 0, 2] and first[2] == -INF

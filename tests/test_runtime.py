@@ -12,13 +12,13 @@ from runtime_cases import Moment, moments
 from worlds import ways_to_blocks
 
 from maexp.agents.policies import classical
-from maexp.agents.runtime import CHOICES, TeamPlanner, choices, features, frontiers, values, ways
-from maexp.agents.runtime.grid import FREE, UNKNOWN, read_grid
+from maexp.agents.runtime import CHOICES, TeamPlanner, ways
+from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.team import read_team
-from maexp.envs import RobotConfig, target_view
-from maexp.envs import targets as env_targets
-from maexp.kernels import geodesic, outlook, wavefront
-from maexp.kernels import ways as kernel_ways
+from maexp.agents.runtime.trees import grow_trees
+from maexp.envs import RobotConfig
+from maexp.envs.choices import RRT_SAMPLES
+from maexp.kernels.constants import FREE, UNKNOWN
 
 CASES = {
     "indoor": {},
@@ -52,16 +52,7 @@ def test_imports_neither_torch_nor_warp():
     assert done.returncode == 0 and done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
-def test_numbers_are_those_of_the_kernels_and_policies():
-    for ours, theirs, names in (
-        (ways, geodesic, ("STRAIGHT", "DIAGONAL", "TIGHT_FACTOR", "UNREACHED", "BLOCKED", "OPEN", "TIGHT")),
-        (ways, wavefront, ("MARGIN_CELLS", "COMFORT")),
-        (ways, kernel_ways, ("SNAP_CELLS",)),
-        (frontiers, outlook, ("RAYS",)),
-        (values, env_targets, ("BETA", "LEAST_GAIN")),
-        (features, target_view, ("FAR", "WAY_AHEAD", "FEATURES")),
-    ):
-        assert [getattr(ours, name) for name in names] == [getattr(theirs, name) for name in names]
+def test_robots_know_the_planners_of_the_simulator():
     beyond = {"oracle", "clairvoyant", "lookahead"}  # what no robot knows, or what the simulator plays
     assert set(CHOICES) == set(classical.POLICIES) - beyond
 
@@ -119,6 +110,18 @@ def test_robots_take_the_targets_that_the_policies_take(name):
                 np.testing.assert_allclose(plan.goals[plan.active], wanted[plan.active], atol=1e-4, err_msg=policy)
 
 
+def test_a_planner_of_ones_own_chooses_the_same_for_robots():
+    """One function for both: here the largest frontier."""
+
+    def rank_largest(scene):
+        return scene.xp.where(scene.xp.isfinite(scene.travel), scene.size, -scene.xp.inf)
+
+    for now in cases("indoor"):
+        ours, there = survey(now), classical.FrontierPlanner(now.env, rank_largest).look()
+        theirs = rank_largest(there)[0, now.nav.alive()[0]][:, (there.cells()[0, 0] >= 0)].numpy()
+        np.testing.assert_array_equal(rank_largest(ours), theirs)
+
+
 def total_way(nav, goals) -> float:
     points = nav.points(nav.target.clamp_min(0))[0]
     gap = (points - torch.as_tensor(goals).unsqueeze(1)).norm(dim=-1)
@@ -130,20 +133,20 @@ def test_trees_find_frontiers_as_those_of_the_kernels_do():
     ours, theirs = 0, 0
     for now in cases("indoor"):
         scene = survey(now)
-        y, x = np.divmod(choices._grow_trees(scene), scene.grid.width)
+        y, x = np.divmod(grow_trees(scene, RRT_SAMPLES, 0.5 * scene.radar_range), scene.grid.width)
         blocks = scene.targets.block_of(x, y)
         ours += len({tuple(one) for one in blocks.tolist()})
-        theirs += int(now.nav.grow_trees(classical.RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
+        theirs += int(now.nav.grow_trees(RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
     assert ours == pytest.approx(theirs, rel=0.2)
 
 
 def grow_one_by_one(scene) -> list[int]:
-    """What `_grow_trees` does, in plain loops: one tree, one sample, one cell after the other."""
+    """What `grow_trees` does, in plain loops: one tree, one sample, one cell after the other."""
     grid, ends = scene.grid, []
     branch = 0.5 * scene.radar_range / grid.cell
     for at in scene.at:
         nodes = [at / grid.cell]
-        for point in scene.rng.random((choices.RRT_SAMPLES, 2)) * (grid.width, grid.height):
+        for point in scene.rng.random((RRT_SAMPLES, 2)) * (grid.width, grid.height):
             gaps = [math.hypot(*(point - node)) for node in nodes]
             start, gap = nodes[int(np.argmin(gaps))], min(gaps)
             way, last = (point - start) * min(1.0, branch / gap), -1
@@ -164,5 +167,5 @@ def test_trees_are_those_of_plain_loops():
     scene = survey(next(iter(cases("indoor"))))
     twin = replace(scene, rng=np.random.default_rng(3))
     scene = replace(scene, rng=np.random.default_rng(3))
-    ours, theirs = choices._grow_trees(scene), grow_one_by_one(twin)
+    ours, theirs = grow_trees(scene, RRT_SAMPLES, 0.5 * scene.radar_range), grow_one_by_one(twin)
     assert len(theirs) > 20 and np.array_equal(np.sort(ours), np.sort(theirs))

@@ -9,7 +9,8 @@ import pytest
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime import coarse as module
 from maexp.agents.runtime.coarse import coarsen
-from maexp.agents.runtime.grid import FREE, OBSTACLE, UNKNOWN, KnownGrid
+from maexp.agents.runtime.grid import KnownGrid
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 POSES = [(10.5, 7.0, 0.0), (11.5, 7.0, 0.0), (12.5, 7.0, 0.0)]
 

@@ -14,8 +14,8 @@ from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
-from maexp.envs.target_view import FEATURES
-from maexp.envs.targets import BETA
+from maexp.envs.choices import BETA
+from maexp.envs.features import FEATURES
 
 MAPS = [make_map("maze_small", k) for k in (0, 3)]
 COUNT = 40  # no team knows more targets

@@ -1,6 +1,6 @@
 """The six algorithms: their table, losses, estimates of advantages and updaters."""
 
-from maexp.envs.lazy import lazy_names
+from maexp.kernels.lazy import lazy_names
 
 __all__ = ["ALGORITHMS"]
 

@@ -12,12 +12,13 @@ from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.foreign import ForeignCalls
 from maexp.agents.policies.own import is_foreign
 from maexp.agents.runtime import CHOICES, Plan, TeamPlanner
-from maexp.agents.runtime.grid import FREE, OBSTACLE, read_grid
+from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.scene import find_ways
 from maexp.agents.runtime.team import read_team
-from maexp.agents.runtime.ways import UNREACHED, trace
+from maexp.agents.runtime.ways import trace
 from maexp.agents.training.named import Player
 from maexp.envs import ExplorationEnv
+from maexp.kernels.constants import FREE, OBSTACLE, UNREACHED
 
 from .config import TrialConfig
 

@@ -13,7 +13,8 @@ from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
-from maexp.envs.target_view import FEATURES, first_if_none
+from maexp.envs.features import FEATURES
+from maexp.envs.target_view import first_if_none
 
 SCORE = FEATURES.index("score")
 NEARNESS = FEATURES.index("nearness")  # above 0 for every target

@@ -3,7 +3,7 @@
 Names are looked up on first use, as those of `maexp.agents`.
 """
 
-from maexp.envs.lazy import lazy_names
+from maexp.kernels.lazy import lazy_names
 
 _NAMES = ("CLASSICAL", "POLICIES", "REFERENCES", "FrontierPlanner")
 __all__ = ["CLASSICAL", "POLICIES", "REFERENCES", "FrontierPlanner"]

@@ -1,9 +1,9 @@
 """Classical planners, batched on the env's device: the yardstick for what is learned.
 
 A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
-All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way
-from every robot to every target. They differ in which targets each robot likes best. That the robots of a team go to
-different ones, and how a target is approached, they share (`envs/targets.py`).
+All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way from
+every robot to every target. They differ in which targets each robot likes best (`envs/choices.py`). That the robots of
+a team go to different ones, and how a target is approached, they share (`envs/targets.py`).
 
 Sources: docs/planners.md. Tuning: docs/notes.md.
 """
@@ -17,97 +17,12 @@ from functools import partial
 import torch
 from tensordict.nn import TensorDictModule
 
-from maexp.agents.runtime.choices import DECAY, REPULSION, RRT_HYSTERESIS, RRT_SAMPLES
 from maexp.envs import ExplorationEnv
+from maexp.envs.choices import CLASSICAL, rank_by_utility
 from maexp.envs.nav_grid import build_nav_grid, open_cells
-from maexp.envs.targets import LEAST_GAIN, Scene, TargetTracker, keyed_uniform, plan_in_turn, value_targets
-from maexp.kernels.assignment import FORBIDDEN, assign_targets
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.envs.targets import Scene, TargetTracker, keyed_uniform
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.types import REGIONS
-
-FAR = 1e5  # longer than any way [m]: puts targets that a robot takes for want of better ones behind all others
-
-
-def rank_nearest(scene: Scene) -> torch.Tensor:
-    """Each robot its nearest target (Yamauchi 1997)."""
-    return _rank(scene, -scene.travel, _worthwhile(scene))
-
-
-def rank_by_utility(scene: Scene) -> torch.Tensor:
-    """Unknown area around the target against the way there; a target taken lowers what others near it offer."""
-    return _rank_in_turn(scene, scene.gain, value_targets(scene), scene.travel.isfinite())
-
-
-def rank_by_tree(scene: Scene) -> torch.Tensor:
-    """Of the frontiers that random trees come upon, the best revenue (Umari and Mukhopadhyay 2017)."""
-    nav = scene.nav
-    found = scene.of_blocks(scene.spread(nav.grow_trees(RRT_SAMPLES, 0.5 * nav.radar_range)))
-    found = found & scene.travel.isfinite()
-    found = found | ~found.any(-1, keepdim=True)  # no tree of the team found any: all frontiers count
-    near = (scene.points - nav.centers().unsqueeze(2)).norm(dim=-1) <= nav.radar_range
-    gain = scene.gain * torch.where(near, RRT_HYSTERESIS, 1.0)
-    return _rank_in_turn(scene, gain, value_targets(scene) + gain - scene.gain, found)
-
-
-def _rank_in_turn(scene: Scene, gain: torch.Tensor, value: torch.Tensor, among: torch.Tensor) -> torch.Tensor:
-    """The values of the targets `among` all when it is their robot's turn, in a team in which everyone knows what the
-    others choose (`plan_in_turn`)."""
-    hears = torch.ones((*scene.alive.shape, scene.alive.shape[1]), dtype=torch.bool, device=gain.device)
-    value = torch.where(among, value, -torch.inf)
-    return _rank(scene, plan_in_turn(gain, value, scene.points / scene.nav.radar_range, hears)[0], among)
-
-
-def rank_by_area(scene: Scene) -> torch.Tensor:
-    """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
-    worth = _worthwhile(scene)
-    travel = torch.where(worth & scene.alive.unsqueeze(-1), scene.travel, torch.inf)
-    own = travel.argmin(1, keepdim=True) == torch.arange(travel.shape[1], device=travel.device).view(1, -1, 1)
-    mine = own & travel.isfinite()
-    mine = mine | ~mine.any(-1, keepdim=True)
-    return _rank(scene, torch.where(mine, -travel, -FAR - travel), worth)
-
-
-def rank_by_assignment(scene: Scene) -> torch.Tensor:
-    """All robots different targets with the least total way (Hungarian method); surplus robots the nearest."""
-    worth = _worthwhile(scene)
-    scale = 100.0 / scene.nav.cell_of_env().view(-1, 1, 1)  # hundredths of a cell
-    cost = torch.where(worth, (scene.travel * scale).clamp(max=FORBIDDEN - 1), FORBIDDEN).to(torch.int32)
-    match = assign_targets(cost).unsqueeze(-1)
-    matched = torch.arange(cost.shape[-1], device=cost.device) == match
-    return _rank(scene, torch.where(matched, FAR, -scene.travel), worth)
-
-
-def rank_by_force(scene: Scene) -> torch.Tensor:
-    """The target whose way starts off closest to the force: pulls along the ways, pushes between robots.
-
-    As in MMPF (Yu et al. 2021) a target pulls with its frontier cells over the way to it, around the walls.
-    """
-    nav, worth = scene.nav, _worthwhile(scene)
-    at = nav.centers()
-    ways = nav.points_on_way(scene.cells(), 3.0) - at.unsqueeze(2)
-    ways = ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    cell = nav.cell_of_env().view(-1, 1, 1)
-    pull = torch.where(worth, scene.size / (scene.travel / cell).clamp_min(1.0) ** DECAY, 0.0)
-    force = scene.to_blocks(pull.unsqueeze(-1) * ways).sum(2)
-    apart = at.unsqueeze(2) - at.unsqueeze(1)
-    gap = apart.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    push = REPULSION * (1.0 - gap / nav.radar_range).clamp_min(0.0) * scene.alive[:, None, :, None]
-    force = force + scene.to_blocks(pull).sum(-1, keepdim=True) * (push * apart / gap).sum(2)
-    along = (ways * force.unsqueeze(2)).sum(-1) / force.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-    return _rank(scene, pull * (1.0 + along), worth)
-
-
-def _worthwhile(scene: Scene) -> torch.Tensor:
-    """Targets in reach, bool [E, N, K]; those that offer little only for robots that get to none that offers more."""
-    reached = scene.travel.isfinite()
-    worth = reached & (scene.gain >= LEAST_GAIN)
-    return torch.where(worth.any(-1, keepdim=True), worth, reached)
-
-
-def _rank(scene: Scene, score: torch.Tensor, among: torch.Tensor) -> torch.Tensor:
-    """Targets by their `score` where they are `among` those that count, the others in reach behind, -inf the rest."""
-    reached = scene.travel.isfinite()
-    return torch.where(among & reached, score, torch.where(reached, -2.0 * FAR - scene.travel, -torch.inf))
 
 
 class FrontierPlanner:
@@ -189,17 +104,6 @@ def _plan_ahead(env: ExplorationEnv, true_world: bool = False) -> Callable:
 
     return LookaheadPlanner(env, true_world=true_world)
 
-
-CLASSICAL: dict[str, Callable[[Scene], torch.Tensor]] = {
-    "nearest_frontier": rank_nearest,
-    "cost_utility": rank_by_utility,
-    "potential_field": rank_by_force,
-    "rrt_frontiers": rank_by_tree,
-    "voronoi": rank_by_area,
-    "hungarian": rank_by_assignment,
-}
-"""The classical planners: name -> what robots think of targets, for many teams at once;
-`maexp.agents.runtime.CHOICES` are the same for one team in NumPy."""
 
 POLICIES: dict[str, Callable[[ExplorationEnv], TensorDictModule]] = {
     "random": partial(as_module, RandomPolicy),

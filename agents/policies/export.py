@@ -18,23 +18,12 @@ from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.runtime.folder import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
+from maexp.envs.features import FEATURES, TABLE
 from maexp.envs.scenarios import Scenario, find_scenario
-from maexp.envs.target_view import FEATURES
 from maexp.kernels.types import DT
 
 OPSET = 18
 MOST = {"batch": 4096, "robots": 64, "candidates": 1024}
-RANGES, DISCS, COSINE, SINE = "radar ranges", "radar discs", "cosine, from the heading", "sine, left of the heading"
-UNITS = {
-    "score": DISCS, "value": DISCS, "planned": "0 or 1", "claimed": "share", "plan_gap": RANGES,
-    "travel": "log(1 + radar ranges)", "nearness": "1 / (1 + radar ranges)", "distance": RANGES, "detour": "ratio - 1",
-    "gain": DISCS, "size": "10 cells", "worth": "0 or 1", "gain_near": DISCS, "gain_around": "4 radar discs",
-    "ahead": COSINE, "aside": SINE, "way_ahead": COSINE, "way_aside": SINE,
-    "unknown_ahead": COSINE, "unknown_aside": SINE, "unknown_far": RANGES,
-    "rival": RANGES, "lead": RANGES, "nearest": "0 or 1", "own_last": RANGES, "mates_last": RANGES,
-    "count": "10 candidates", "speed": "of max_speed", "drive": RANGES, "time_left": "share of the whole time",
-    "known": "log(1 + radar discs)", "mates": "4 robots",
-}  # fmt: skip
 TEAM = ["batch", "robots"]
 INPUTS = {
     "features": {"shape": [*TEAM, "candidates", len(FEATURES)], "type": "float32", "is": "see features and units"},
@@ -101,7 +90,7 @@ def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: di
         "inputs": INPUTS,
         "outputs": OUTPUTS,
         "features": list(FEATURES),
-        "units": UNITS,
+        "units": {feature: row.unit for feature, row in TABLE.items()},
         "frames": "distances and bearings are the same in every frame; bearings are taken from a robot's heading",
         "candidates": env.observation_config.targets,
         "model": {

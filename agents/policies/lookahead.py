@@ -14,7 +14,8 @@ from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner, rank_by_
 from maexp.agents.policies.rollouts import ROLLOUT_POLICY, Rollouts, check_rollout_policy, pick_places
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
-from maexp.envs.targets import Scene, plan_in_turn, value_targets
+from maexp.envs.choices import value_targets
+from maexp.envs.targets import Scene, plan_in_turn
 
 
 class LookaheadPlanner(FrontierPlanner):

@@ -7,8 +7,10 @@ import math
 import numpy as np
 from scipy.ndimage import label
 
-from .grid import FREE, OBSTACLE, KnownGrid
-from .ways import MARGIN_CELLS, gap_squares
+from maexp.kernels.constants import FREE, MARGIN_CELLS, OBSTACLE
+
+from .grid import KnownGrid
+from .ways import gap_squares
 
 MANY_CELLS = 250_000  # a grid of more is planned on in coarser cells
 CELLS_PER_RADIUS = 2.0  # of the smallest robot, at least

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from .choices import rank
-from .features import FEATURES, Candidates, Motion, list_candidates
+from maexp.envs.choices import rank
+from maexp.envs.features import FEATURES
+
+from .features import Candidates, Motion, list_candidates
 from .scene import Scene
 from .shipped import CONTRACT
 

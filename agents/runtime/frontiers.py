@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .grid import FREE, OBSTACLE, UNKNOWN, KnownGrid
+from maexp.kernels.constants import BLOCKS_PER_RANGE, FREE, OBSTACLE, RAYS, UNKNOWN
 
-RAYS = 48  # rays that look around from a target
-BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
+from .grid import KnownGrid
+
 LOOKED_AT_ONCE = 4_000_000  # cells of rays in one go: bounds the memory
 STRIDE = 1 << 20  # more blocks than a row has
 WALL, UNSEEN = 1, 2  # bits of a cell: obstacle, unknown; then a bit for each way to come diagonally between two walls

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-UNKNOWN, FREE, OBSTACLE = 0, 1, 2
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
+
 MAX_CELLS = 36_000_000
 
 

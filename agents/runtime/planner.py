@@ -12,17 +12,19 @@ from typing import Literal
 
 import numpy as np
 
+from maexp.kernels.constants import FREE, UNREACHED
+
 from .choices import CHOICES
 from .coarse import coarsen
 from .features import Motion
 from .folder import Contract, LearnedChoice
-from .grid import FREE, MAX_CELLS, KnownGrid, read_grid
+from .grid import MAX_CELLS, KnownGrid, read_grid
 from .scene import Scene, look_at
 from .sharing import Shares
 from .shipped import find_policy
 from .team import Team, read_team
 from .watch import Watch
-from .ways import UNREACHED, is_clear, snap, trace
+from .ways import is_clear, snap, trace
 
 SPARE = ("wait", "home")
 LOG = logging.getLogger("maexp.runtime")

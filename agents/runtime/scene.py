@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import label
+from scipy.optimize import linear_sum_assignment
+
+from maexp.kernels.constants import MARGIN_CELLS, OBSTACLE, SNAP_CELLS, STRAIGHT, UNREACHED
 
 from .frontiers import Targets, block_side, list_targets, look_around, mark_frontier
-from .grid import OBSTACLE, KnownGrid
+from .grid import KnownGrid
+from .in_turn import plan_in_turn
 from .team import Team
-from .ways import MARGIN_CELLS, SNAP_CELLS, STRAIGHT, UNREACHED, flood, gap_squares, mark_passable, snap
+from .trees import grow_trees
+from .ways import cells_ahead, flood, gap_squares, mark_passable, snap
+
+UNREACHABLE = 1e12  # stands for no way where numbers must be finite [m]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What targets are chosen from: n robots that take part, K targets, lengths on the grid in metres.
+    """What targets are chosen from: n robots that take part, K targets, lengths on the grid in metres. Planners use it
+    as a `maexp.envs.choices.Scene`.
 
     Attributes:
         grid, radar_range: what the team knows, and how far robots see.
@@ -47,6 +56,45 @@ class Scene:
     middle: np.ndarray
     near: np.ndarray
     rng: np.random.Generator
+    xp: ClassVar = np
+
+    @property
+    def cell(self) -> float:
+        return self.grid.cell
+
+    @property
+    def alive(self) -> np.ndarray:
+        return np.ones(len(self.at), bool)
+
+    @property
+    def size(self) -> np.ndarray:
+        return self.targets.size
+
+    def ways_ahead(self, cells: float) -> np.ndarray:
+        return self.ways_to(np.tile(self.targets.cell, (len(self.at), 1)), cells)
+
+    def ways_to(self, targets: np.ndarray, cells: float) -> np.ndarray:
+        """`ways_ahead`, to cells, int64 [n, M]."""
+        first = cells_ahead(self.passable, self.distance, targets, cells)
+        return self.grid.centers(np.maximum(first, 0)) - self.at[:, None]
+
+    def total(self, values: np.ndarray) -> np.ndarray:
+        return values.sum(1)
+
+    def in_turn(self, gain: np.ndarray, value: np.ndarray) -> np.ndarray:
+        gain = np.broadcast_to(gain, value.shape).astype(np.float32)
+        points = np.broadcast_to(self.points / self.radar_range, (*value.shape, 2))
+        return plan_in_turn(gain, value.astype(np.float32), points)[0]
+
+    def match(self, among: np.ndarray) -> np.ndarray:
+        matched = np.zeros(among.shape, bool)
+        matched[linear_sum_assignment(np.where(among, self.travel, UNREACHABLE))] = True
+        return matched
+
+    def found_by_trees(self, samples: int, branch: float) -> np.ndarray:
+        ends = grow_trees(self, samples, branch)
+        block = self.targets.block_of(ends % self.grid.width, ends // self.grid.width)
+        return (self.targets.block[:, None] == block).all(-1).any(1)
 
     def of(self, rows: np.ndarray) -> Scene:
         """The scene for some of its robots, bool [n]."""

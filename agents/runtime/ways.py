@@ -13,15 +13,23 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from .grid import FREE, OBSTACLE, KnownGrid
+from maexp.kernels.constants import (
+    BLOCKED,
+    COMFORT,
+    DIAGONAL,
+    FREE,
+    MARGIN_CELLS,
+    OBSTACLE,
+    OPEN,
+    SNAP_CELLS,
+    STRAIGHT,
+    TIGHT,
+    TIGHT_FACTOR,
+    UNREACHED,
+)
 
-STRAIGHT, DIAGONAL = 10, 14
-TIGHT_FACTOR = 4
-BLOCKED, OPEN, TIGHT = 0, 1, 2
-UNREACHED = 1 << 30
-SNAP_CELLS = 4  # how far from a robot on a blocked cell its way may start, in cells along x and y
-MARGIN_CELLS = 0.5  # distance kept from obstacles beyond a robot's radius, in cells
-COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight
+from .grid import KnownGrid
+
 # East, north, west, south, then north-east, north-west, south-west, south-east: the first that fits counts.
 STEPS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (1, 1), (-1, 1), (-1, -1), (1, -1)])
 WEIGHTS = np.array([STRAIGHT] * 4 + [DIAGONAL] * 4)

@@ -32,7 +32,7 @@ from maexp.envs.importing.sources import GridSource
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, default_macro_steps, find_scenario, split
 from maexp.envs.targets import Scene, keyed_uniform
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 NEVER = 255  # a cell that does not get known
 LONGER = 2.0  # episodes go on for so many times the scenario's decisions: late beliefs count too

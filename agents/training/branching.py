@@ -34,8 +34,8 @@ from maexp.agents.policies.rollouts import Rollouts, pick_places
 from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.ranges import check_ranges, number, whole
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs.features import FEATURES
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
-from maexp.envs.target_view import FEATURES
 
 SHOWN = 24  # candidates that a policy sees
 DEPARTURE = 0.3  # random part of what a departing robot thinks of candidates [radar discs]

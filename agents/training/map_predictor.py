@@ -25,7 +25,7 @@ from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.map_predictor import MapPredictor
 from maexp.agents.settings.ranges import check_ranges, number, whole
 from maexp.agents.training.beliefs import Episode, load_groups
-from maexp.kernels.frontier import FREE, UNKNOWN
+from maexp.kernels.constants import FREE, UNKNOWN
 
 BAND = 2.0  # radar ranges from known free ground within which cells count
 EDGE = 8  # cells at the edge of a crop that do not count: what is known beyond is cut off

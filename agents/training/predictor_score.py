@@ -24,7 +24,7 @@ from maexp.agents.networks.map_predictor import load_predictor, predict, sample_
 from maexp.agents.settings.ranges import check_ranges, whole
 from maexp.agents.training.beliefs import Episode, load_groups
 from maexp.agents.training.map_predictor import BAND, matters
-from maexp.kernels.frontier import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 MOST_DISTANCE = 48  # cells; a histogram takes what lies farther as lying there
 BINS = 15  # of the expected calibration error

@@ -3,7 +3,7 @@
 Names are looked up on first use: the settings alone need neither torch nor Warp.
 """
 
-from maexp.envs.lazy import lazy_names
+from maexp.kernels.lazy import lazy_names
 
 _HOMES = {
     "ImportOptions": "options",

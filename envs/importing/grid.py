@@ -9,8 +9,8 @@ import numpy as np
 from scipy import ndimage
 
 from maexp.envs.map import MapError
+from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
-UNKNOWN, FREE, OBSTACLE = 0, 1, 2
 MAX_CELLS = 40_000_000
 EIGHT = np.ones((3, 3), dtype=bool)
 

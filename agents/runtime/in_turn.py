@@ -1,19 +1,8 @@
-"""What targets are worth, and how a team shares them out in turn: `maexp.envs.targets` in NumPy."""
+"""How a team takes targets in turn: `maexp.kernels.teamwork` in NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
-
-BETA = 0.03  # weight of a radar range of travel against a whole disc of unknown cells
-LEAST_GAIN = 0.3  # targets with less to see, as a share of the radar's disc, are hardly worth a way of their own
-
-
-def value_targets(gain: np.ndarray, travel: np.ndarray, radar_range: float) -> np.ndarray:
-    """What every target is worth to every robot by itself, in radar discs, float32 [n, K]; -inf: out of reach.
-
-    Unknown area against the way there (Burgard et al. 2005).
-    """
-    return (gain - BETA * travel / radar_range).astype(np.float32)
 
 
 def plan_in_turn(gain: np.ndarray, value: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

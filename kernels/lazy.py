@@ -1,4 +1,4 @@
-"""Names of a package that are looked up on first use, so that nobody waits for libraries that he does not need."""
+"""Names of a package that are looked up on first use: who imports one thing need not wait for the rest."""
 
 import importlib
 from collections.abc import Callable

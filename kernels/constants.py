@@ -1,0 +1,21 @@
+"""Numbers that the kernels share with what computes the same without Warp (`maexp.agents.runtime`).
+
+Imports nothing: robots' computers have neither Warp nor torch.
+"""
+
+# What is known of a cell.
+UNKNOWN, FREE, OBSTACLE = 0, 1, 2
+
+# Ways: distances are integers, a step weighs `STRAIGHT` or `DIAGONAL`.
+STRAIGHT = 10  # weight of a step to a straight neighbour; one cell of travel
+DIAGONAL = 14  # weight of a step to a diagonal neighbour
+BLOCKED, OPEN, TIGHT = 0, 1, 2  # states of a cell
+TIGHT_FACTOR = 4  # a step into a tight cell weighs so much more: it is taken where the way around is long
+UNREACHED = 1 << 30  # distance of cells that no source reaches; two of them still fit in int32
+MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshold, in cells
+COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
+SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells along x and y
+
+# Targets.
+BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
+RAYS = 48  # rays that look around from a target
