@@ -16,6 +16,18 @@ if os.environ.get("MAEXP_WARP_MODE"):  # `.ci/run` repeats the kernel tests with
 settings.register_profile("long")  # `--hypothesis-profile=long`: hours of fuzzing by hand (docs/reliability.md)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """`pytest` alone runs the quick set; files that are named, and `-m`, run what they say."""
+    alone = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if alone and not any(str(word).startswith("-m") for word in config.invocation_params.args):
+        config.option.markexpr = "not slow"
+
+
+def pytest_report_header(config: pytest.Config) -> str | None:
+    quick = config.option.markexpr == "not slow"
+    return "quick set: without the tests marked slow, which `pytest -m slow` runs" if quick else None
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of real scans and floor maps; tests that need it skip where it is absent."""

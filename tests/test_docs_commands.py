@@ -93,7 +93,8 @@ def shown() -> dict[str, list[str]]:
     return found
 
 
-COMMANDS = [line for line in shown() if line.startswith("maexp")]
+SHOWN = shown()
+COMMANDS = [line for line in SHOWN if line.startswith("maexp")]
 
 
 def small(line: str) -> list[str]:
@@ -204,19 +205,19 @@ def write_map(path: Path, world) -> None:
         left.unlink()
 
 
-def heavy(line: str) -> bool:
-    """Ray takes half a minute to start; the others need seconds."""
-    return "collector=ray" in line
-
-
 DIFFERENT = {tuple(small(line)): line for line in reversed(COMMANDS)}.values()  # small, some are the same command
-RUNS = [pytest.param(x, id=x, marks=[pytest.mark.slow] if heavy(x) else []) for x in COMMANDS if x in DIFFERENT]
+FIRST = {tuple(small(line)) for line in COMMANDS if "README.md" in SHOWN[line]}
+"""What a new reader tries: the other commands are slow tests, for there are many."""
+RUNS = [
+    pytest.param(line, id=line, marks=[] if tuple(small(line)) in FIRST else [pytest.mark.slow])
+    for line in COMMANDS if line in DIFFERENT
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("line", RUNS)
 def test_command(line, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
-    if heavy(line):
+    if "collector=ray" in line:
         pytest.importorskip("ray", reason="ray is absent")
     if "browser=true" in line:  # the page opens, and ends at once
         page = pytest.importorskip("maexp.envs.viewing.page", reason="viser is absent")
