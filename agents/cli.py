@@ -74,11 +74,12 @@ VERBS = {
         ("list", "show"),
     ),
     "maps": Verb(
-        "lists, makes, imports, checks and draws maps",
+        "lists, makes, imports, fetches, checks and draws maps",
         ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
-         "maexp maps import FOLDER", "maexp maps check floor.yaml", "maexp maps show map.npz"),
+         "maexp maps import FOLDER", "maexp maps fetch floors", "maexp maps check floor.yaml",
+         "maexp maps show map.npz"),
         ("task", "file"),
-        ("list", "make", "import", "check", "show"),
+        ("list", "make", "import", "fetch", "check", "show"),
     ),
     "irsim": Verb(
         "plays a team in another simulator, ir-sim, with lidars and a map of its own, beside the same team in ours",

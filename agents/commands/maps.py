@@ -1,10 +1,11 @@
-"""`maexp maps`: list scenarios, make and import maps, check, repair and draw them."""
+"""`maexp maps`: list scenarios, make, import and fetch maps, check, repair and draw them."""
 
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from maexp.agents.commands import maps_fetch
 from maexp.agents.commands.maps_folder import find_files
 from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
@@ -30,8 +31,8 @@ def prepare(overrides: list[str]) -> Recipe:
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
-    """A new folder, except for the list."""
-    return None if find_override(overrides, "task") == "list" else claim()
+    """A new folder, except for the list, and for sets of maps, which have their own."""
+    return None if find_override(overrides, "task") in ("list", "fetch") else claim()
 
 
 def check(cfg: MapsSettings) -> None:
@@ -41,7 +42,11 @@ def check(cfg: MapsSettings) -> None:
     if cfg.task == "list" and cfg.file:
         raise UserError(f"maexp maps list lists all scenarios and takes no file: leave {cfg.file} out.")
     if cfg.task != "list" and not cfg.file:
-        raise UserError(f"maexp maps {cfg.task} needs a {'scenario' if cfg.task == 'make' else 'file'} after it.")
+        what = {"make": "scenario", "fetch": f"set ({', '.join(maps_fetch.set_names())})"}.get(cfg.task, "file")
+        raise UserError(f"maexp maps {cfg.task} needs a {what} after it.")
+    if cfg.task == "fetch":
+        maps_fetch.check(cfg.file, cfg.mirror)
+        return
     if cfg.task == "make" and cfg.file not in SCENARIOS:
         raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(_generated())}.")
     if cfg.out and Path(cfg.out).exists():
@@ -79,6 +84,8 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
     if cfg.task == "list":
         print_scenarios()
         return 0
+    if cfg.task == "fetch":
+        return maps_fetch.run(cfg.file, cfg.out, cfg.mirror, import_options(cfg))
     if _is_folder(cfg):
         return run_folder(Path(cfg.file), where, import_options(cfg))
     with blame_input():
