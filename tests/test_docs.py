@@ -1,6 +1,7 @@
 """What the documentation shows works: its Python blocks run, its diffs apply, its links lead somewhere."""
 
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -106,6 +107,31 @@ def test_the_planner_of_the_arena_is_the_example_and_short():
     (code,) = blocks("docs/arena.md", "python")
     assert code == (ROOT / "docs" / "examples" / "policies" / "nearest.py").read_text()
     assert len([line for line in code.splitlines() if line.strip()]) <= 30
+
+
+def test_the_greedy_planner_weighs_distance_and_length_and_gives_up():
+    """A hall of 20 x 9 m whose walls have a gap of 1 m near the robot, on the left, and one of 5 m on the right."""
+    example = runpy.run_path(str(ROOT / "docs" / "examples" / "policies" / "greedy.py"))
+    grid = np.full((1, 11, 22), 100, np.int8)
+    grid[0, 1:-1, 1:-1] = 0
+    grid[0, 5, 0] = grid[0, 3:8, -1] = -1
+    seen = {"alive": [True], "grid": grid, "resolution": 1.0, "origin": (0.0, 0.0), "time": 0.0}
+    seen["poses"] = np.array([[[11.0, 5.5, 0.0]]])
+    episode = {"robot_radius": 0.0, "decision_seconds": 1.0, "radar_range": 10.0, "num_robots": 1}
+    planner = example["Greedy"]()
+    planner.reset(episode)
+    assert planner.act(seen).tolist() == [[20.5, 5.5]], "as far as the other, and longer"
+    seen["poses"][0, 0, 0] = 3.0
+    assert planner.act(seen).tolist() == [[1.5, 5.5]], "nearer counts more"
+    assert planner.act(seen | {"time": 29.0}).tolist() == [[1.5, 5.5]]
+    assert planner.act(seen | {"time": 31.0}).tolist() == [[20.5, 5.5]], "it got no nearer for 30 s"
+    planner.reset(episode | {"robot_radius": 0.5})
+    grid[0, 5, 0] = grid[0, 3:8, -1] = 100
+    assert np.isnan(planner.act(seen)).all(), "nothing is left to see"
+    grid[0, 3:8, -1] = -1
+    assert planner.act(seen).tolist() == [[20.5, 5.5]]
+    grid[0, :, 12] = 100
+    assert np.isnan(planner.act(seen)).all(), "behind a wall"
 
 
 def test_own_policies():

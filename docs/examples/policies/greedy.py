@@ -1,8 +1,9 @@
 """Each robot for itself to the frontier of least cost: the greedy planner of m-explore (explore_lite), written anew.
 
 A frontier is a group of connected unknown cells beside free ground that the robot can get to. Its cost grows with its
-distance and falls with its length; the robot goes to its centroid, and gives up frontiers that it does not get nearer
-to. Source: J. Hörner, Map-merging for multi-robot system (2016), and the parameters of its package explore_lite.
+distance and falls with its length; the robot goes to the free cell nearest to its centroid, and gives up frontiers that
+it does not get nearer to. Ground within the robot's radius of a wall is not free, as on a costmap. Source: J. Hörner,
+Map-merging for multi-robot system (2016), and the parameters of its package explore_lite.
 """
 
 import numpy as np
@@ -33,9 +34,9 @@ def reach(free, start):
             return reached
 
 
-def frontiers(grid, start):
+def frontiers(unknown, reached):
     """Frontiers as arrays of cells [n, 2] (y, x)."""
-    left = set(map(tuple, np.argwhere((grid == -1) & beside(reach(grid == 0, start))).tolist()))
+    left = set(map(tuple, np.argwhere(unknown & beside(reached)).tolist()))
     while left:
         found = [left.pop()]
         for y, x in found:  # grows while it is read
@@ -47,6 +48,7 @@ def frontiers(grid, start):
 
 class Greedy:
     def reset(self, episode):
+        self.radius = episode["robot_radius"]
         self.patience = max(PATIENCE, 5 * episode["decision_seconds"])
         self.shortest, self.same = SHORTEST * episode["radar_range"], SAME * episode["radar_range"]
         self.given_up = [[] for _ in range(episode["num_robots"])]
@@ -61,16 +63,21 @@ class Greedy:
     def choose(self, robot, observation):
         """The goal of a robot [m]; NaN: there is no frontier left."""
         own, cell = observation["poses"][robot, robot, :2], observation["resolution"]
-        corner = np.asarray(observation["origin"])
+        grid, corner = observation["grid"][robot], np.asarray(observation["origin"])
+        walls = grid == 100
+        for _ in range(int(np.ceil(self.radius / cell))):
+            walls |= beside(walls)
+        reached = reach((grid == 0) & ~walls, (own - corner)[::-1] / cell - 0.5)
+        free = corner + (np.argwhere(reached)[:, ::-1] + 0.5) * cell
         options = []
-        for cells in frontiers(observation["grid"][robot], (own - corner)[::-1] / cell - 0.5):
+        for cells in frontiers(grid == -1, reached):
             points, length = corner + (cells[:, ::-1] + 0.5) * cell, len(cells) * cell
             distance = np.hypot(*(points - own).T).min()
             if length >= self.shortest:
                 options.append((POTENTIAL * distance - GAIN * length, distance, points.mean(0)))
-        for _, distance, goal in sorted(options, key=lambda one: one[0]):
-            if self.is_worth(robot, goal, distance, observation["time"]):
-                return goal
+        for _, distance, centre in sorted(options, key=lambda one: one[0]):
+            if self.is_worth(robot, centre, distance, observation["time"]):
+                return free[np.hypot(*(free - centre).T).argmin()]
         return np.nan
 
     def is_worth(self, robot, goal, distance, time):
