@@ -116,11 +116,11 @@ def test_the_greedy_planner_weighs_distance_and_length_and_gives_up():
     grid[0, 1:-1, 1:-1] = 0
     grid[0, 5, 0] = grid[0, 3:8, -1] = -1
     seen = {"alive": [True], "grid": grid, "resolution": 1.0, "origin": (0.0, 0.0), "time": 0.0}
-    seen["poses"] = np.array([[[11.0, 5.5, 0.0]]])
+    seen["poses"] = np.array([[[10.5, 5.5, 0.0]]])
     episode = {"robot_radius": 0.0, "decision_seconds": 1.0, "radar_range": 10.0, "num_robots": 1}
     planner = example["Greedy"]()
     planner.reset(episode)
-    assert planner.act(seen).tolist() == [[20.5, 5.5]], "as far as the other, and longer"
+    assert planner.act(seen).tolist() == [[20.5, 5.5]], "a metre farther than the other, and longer"
     seen["poses"][0, 0, 0] = 3.0
     assert planner.act(seen).tolist() == [[1.5, 5.5]], "nearer counts more"
     assert planner.act(seen | {"time": 29.0}).tolist() == [[1.5, 5.5]]
