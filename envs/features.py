@@ -20,6 +20,7 @@ from maexp.envs.choices import LEAST_GAIN, Array
 
 FAR = 4.0  # lengths between targets and robots count up to so many radar ranges
 NEAR, AROUND = 1.0, 2.5  # radar ranges within which the gain of other candidates is added up
+EDGE = 1e-4  # added to these: many points of a grid are just so far apart, and rounding must not decide
 RANGES, DISCS, COSINE, SINE = "radar ranges", "radar discs", "cosine, from the heading", "sine, left of the heading"
 FLAG = "0 or 1"
 

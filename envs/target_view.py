@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from maexp.envs.choices import WAY_AHEAD, value_targets
-from maexp.envs.features import AROUND, FEATURES, NEAR, Moment
+from maexp.envs.features import AROUND, EDGE, FEATURES, NEAR, Moment
 from maexp.envs.targets import Scene, TargetTracker, plan_in_turn
 from maexp.kernels.teamwork import compare_with_others, gather_gain
 
@@ -104,7 +104,7 @@ class TargetView:
         plans, last = (where, some.any(-1)), (state["last"], state["has_last"])
         rival, *gaps = compare_with_others(point, best, ways, hears, plans, last)
         plan_gap, own_last, mates_last = (gap / reach for gap in gaps)
-        near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR, AROUND)
+        near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR + EDGE, AROUND + EDGE)
         speed, at = tracker.speed(), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
         left = 1.0 - nav.state["macro_step"].float() / env.macro_steps

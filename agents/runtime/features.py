@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from maexp.envs.choices import WAY_AHEAD, value_targets
-from maexp.envs.features import AROUND, NEAR, Moment, drive_until_next
+from maexp.envs.features import AROUND, EDGE, NEAR, Moment, drive_until_next
 from maexp.kernels.constants import UNKNOWN
 
 from .in_turn import plan_in_turn
@@ -93,8 +93,8 @@ def _moment(scene: Scene, target, mask, value, heading, speed, last, time_left: 
         way=scene.ways_to(scene.targets.cell[target], WAY_AHEAD),
         toward=scene.middle[target],
         gain=gain,
-        gain_near=((apart < NEAR) * shown).sum(-1),
-        gain_around=((apart < AROUND) * shown).sum(-1),
+        gain_near=((apart < NEAR + EDGE) * shown).sum(-1),
+        gain_around=((apart < AROUND + EDGE) * shown).sum(-1),
         size=scene.size[target],
         value=value,
         score=score,
