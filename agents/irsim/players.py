@@ -15,7 +15,7 @@ from maexp.agents.runtime import CHOICES, Plan, TeamPlanner
 from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.scene import find_ways
 from maexp.agents.runtime.team import read_team
-from maexp.agents.runtime.ways import trace
+from maexp.agents.runtime.ways import trace_from
 from maexp.agents.training.named import Player
 from maexp.envs import ExplorationEnv
 from maexp.kernels.constants import FREE, OBSTACLE, UNREACHED
@@ -107,8 +107,7 @@ class ForeignTeam:
                 continue
             gap = known.centers(reached) - known.from_map(goals[robot])
             end = reached[(gap**2).sum(-1).argmin()]
-            corners = known.to_map(known.centers(trace(passable[row], distance[row], end)))
-            ways[robot] = np.concatenate([team.at[robot][None], corners])
+            ways[robot] = trace_from(team.at[robot], known, passable[row], distance[row], end)
             ends[robot], active[robot] = ways[robot][-1], True
         waits = np.zeros(len(goals), bool)
         return Plan(team.names, ends, active, waits, ways, np.zeros((0, 2)), False, tuple(notes))

@@ -24,7 +24,7 @@ from .sharing import Shares
 from .shipped import find_policy
 from .team import Team, read_team
 from .watch import Watch
-from .ways import is_clear, snap, trace
+from .ways import snap, trace_from
 
 SPARE = ("wait", "home")
 LOG = logging.getLogger("maexp.runtime")
@@ -252,7 +252,7 @@ class TeamPlanner:
         near = np.linalg.norm(team.at[robot] - home) <= team.radius[robot]
         if near or cell < 0 or scene.distance[row].flat[cell] >= UNREACHED:
             return None
-        return _way(team, scene, row, cell)
+        return trace_from(team.at[robot], scene.grid, scene.passable[row], scene.distance[row], cell)
 
     def _finish(self, plan: Plan) -> Plan:
         """Log what has not been said in the call before."""
@@ -268,24 +268,11 @@ def _describe(team: Team, scene: Scene, chosen: np.ndarray, notes: list[str]) ->
     plan = _stay(team, notes)
     for row, robot in enumerate(scene.robots):
         if chosen[row] >= 0:
-            way = _way(team, scene, row, scene.targets.cell[chosen[row]])
+            end = scene.targets.cell[chosen[row]]
+            way = trace_from(team.at[robot], scene.grid, scene.passable[row], scene.distance[row], end)
             plan.ways[robot], plan.goals[robot], plan.active[robot] = way, way[-1], True
     done = len(scene.robots) > 0 and not plan.active.any()
     return replace(plan, targets=scene.grid.to_map(scene.points), done=done)
-
-
-def _way(team: Team, scene: Scene, row: int, end: int) -> np.ndarray:
-    """Corners of a robot's way to a cell, [k, 2], from where it stands.
-
-    The middle of the cell that it stands in is left out where the way to the next corner is clear: on a coarse grid it
-    would turn back to it in every call.
-    """
-    at = team.at[scene.robots[row]][None]
-    cells = trace(scene.passable[row], scene.distance[row], end)
-    corners = scene.grid.centers(cells)
-    if len(cells) > 1 and is_clear(scene.grid, scene.passable[row], scene.at[row], corners[1]):
-        corners = corners[1:]
-    return np.concatenate([at, scene.grid.to_map(corners)])
 
 
 def _stay(team: Team, notes: list[str]) -> Plan:

@@ -174,11 +174,17 @@ def _note(course: Course, plan: Plan, floor: Floor, now: float) -> None:
     course.reached[(share >= np.array(MARKS)) & np.isinf(course.reached)] = now
     course.waits += int(plan.waits.sum())
     course.notes += [f"{now:.0f} s: {one}" for one in plan.notes]
+    close, needless = count_close(plan, floor.radius)
+    course.close += close
+    course.needless += needless
+
+
+def count_close(plan: Plan, radius: float) -> tuple[int, int]:
+    """Pairs of robots with the same goal, or goals nearer than their bodies; the same while a target was left over."""
     goals = plan.goals[plan.active]
     if len(goals) < 2:
-        return
+        return 0, 0
     gaps = np.linalg.norm(goals[:, None] - goals, axis=-1)[np.triu_indices(len(goals), 1)]
-    close = int((gaps < 2.0 * floor.radius).sum())
+    close = int((gaps < 2.0 * radius).sum())
     left = np.linalg.norm(plan.targets[:, None] - goals, axis=-1).min(-1) > SPARE
-    course.close += close
-    course.needless += close * bool(left.any())
+    return close, close * bool(left.any())

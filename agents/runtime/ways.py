@@ -113,13 +113,6 @@ def _graph(passable: np.ndarray) -> csr_array:
     return csr_array((weights.ravel(), ends.ravel(), first), shape=(len(at),) * 2)
 
 
-def is_clear(grid: KnownGrid, passable: np.ndarray, start: np.ndarray, end: np.ndarray) -> bool:
-    """Whether the straight line between two points [m], in the grid's frame, leads over passable cells alone."""
-    count = int(np.ceil(4.0 * np.abs(end - start).max() / grid.cell)) + 1  # four points a cell
-    cells = grid.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-    return bool((cells >= 0).all() and (passable.ravel()[cells] != BLOCKED).all())
-
-
 def cells_ahead(passable: list[np.ndarray], distance: np.ndarray, cells: np.ndarray, ahead: float) -> np.ndarray:
     """The cell that lies `ahead` [cells] from each robot on its way to each of its cells, int64 [n, k]; -1 = no way.
 
@@ -149,6 +142,27 @@ def trace(passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     way = ways.leave(np.array(list(ways.follow(ways.enter(int(end), 0)))))[::-1]
     turn = np.diff(way)
     return way[np.concatenate([[True], turn[1:] != turn[:-1], [True]])] if len(way) > 1 else way
+
+
+def trace_from(
+    start: np.ndarray, grid: KnownGrid, passable: np.ndarray, distance: np.ndarray, end: int
+) -> np.ndarray:
+    """Corners of a way from where a robot stands to a reached cell, float64 [k, 2] [m], in the map's frame.
+
+    The middle of the robot's own cell is left out where the next corner lies in a clear line: on cells longer than what
+    it drives between two calls it would turn back there every time.
+    """
+    corners = grid.centers(trace(passable, distance, end))
+    if len(corners) > 1 and is_clear(grid, passable, grid.from_map(start), corners[1]):
+        corners = corners[1:]
+    return np.concatenate([start[None], grid.to_map(corners)])
+
+
+def is_clear(grid: KnownGrid, passable: np.ndarray, start: np.ndarray, end: np.ndarray) -> bool:
+    """Whether the straight line between two points [m], in the grid's frame, leads over passable cells alone."""
+    count = int(np.ceil(4.0 * np.abs(end - start).max() / grid.cell)) + 1  # four points a cell
+    cells = grid.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
+    return bool((cells >= 0).all() and (passable.ravel()[cells] != BLOCKED).all())
 
 
 class _WayBack:

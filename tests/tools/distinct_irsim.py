@@ -1,0 +1,57 @@
+"""Teams that start together in ir-sim, with distinct targets and without: one line for each trial.
+
+`python tests/tools/distinct_irsim.py FLOOR.yaml cost_utility 3 240` plays three starts of three robots, at most 240 s
+each. Needless duplicates are counted as in `python -m maexp.agents.runtime simulate`.
+"""
+
+import sys
+
+import numpy as np
+
+from maexp.agents.irsim.config import TrialConfig
+from maexp.agents.irsim.trial import Trial, run_trial
+from maexp.agents.runtime import TeamPlanner
+from maexp.agents.runtime.simulate import MARKS, count_close
+from maexp.envs import ExplorationEnv
+from maexp.envs.importing import import_map
+
+ROBOTS, RADIUS, REACH, SPEED, DT = 3, 0.3, 6.0, 0.6, 0.1
+
+
+class Counting(TeamPlanner):
+    """Counts what it gives away twice."""
+
+    needless = 0
+
+    def plan(self, *words, **settings):
+        plan = super().plan(*words, **settings)
+        self.needless += count_close(plan, RADIUS)[1]
+        return plan
+
+
+def play(world, policy: str, seed: int, seconds: float, distinct: bool) -> tuple[Trial, int]:
+    """A trial from a place of its own, and its needless duplicates."""
+    env = ExplorationEnv(world, 1, ROBOTS, seed=seed, starts="together", num_threads=1)
+    env.reset()
+    now = env.snapshot()
+    starts = np.concatenate([now["center"], now["pose"][:, 3:4]], axis=1).astype(float)
+    config = TrialConfig(seconds, REACH, SPEED, 1.0, RADIUS - 0.05, RADIUS, decide=1.0, seed=seed)
+    planner = Counting(policy, radar_range=REACH, robot_radius=RADIUS, max_speed=SPEED, seconds=1.0, distinct=distinct)
+    return run_trial(world, planner, starts, config), planner.needless
+
+
+def main(file: str, policy: str, runs: int, seconds: float) -> None:
+    """Print the trials."""
+    world = import_map(file, num_robots=ROBOTS)
+    for seed in range(runs):
+        for distinct in (True, False):
+            trial, needless = play(world, policy, seed, seconds, distinct)
+            seen = np.array(trial.coverage)
+            when = [f"{100 * m:g} % {DT * (seen >= m).argmax():.0f} s" for m in MARKS if (seen >= m).any()]
+            end = f"done at {trial.done_at} s, {100 * seen[-1]:.1f} % seen; {trial.path.sum():.0f} m driven"
+            print(f"{policy}, {'distinct' if distinct else 'shared'}, seed {seed}: {', '.join(when)}; {end}; needless "
+                  f"duplicates {needless}, robots lost {trial.collided.sum()}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))
