@@ -95,11 +95,11 @@ def draw_curves(runs, path, rival: str = "the best planner", ends: dict | None =
 
 
 def _moving(tables: list[dict], unit: str, factor: float, columns: list) -> list:
-    """The columns of a panel that are not flat; differences to a planner always count."""
+    """The columns of a panel that are not flat; the gain always counts."""
 
     def moves(name: str) -> bool:
         lines = [_smooth(factor * one[name][np.isfinite(one[name])]) for one in tables if _has_values(one, name)]
-        return name in PAIRED or any(np.ptp(line) > LEAST_CHANGE.get(unit, 0.0) for line in lines)
+        return name == PAIRED[0] or any(np.ptp(line) > LEAST_CHANGE.get(unit, 0.0) for line in lines)
 
     return [entry for entry in columns if moves(entry[0])]
 
