@@ -15,7 +15,7 @@ from maexp.agents.runtime.simulate import MARKS, count_close
 from maexp.envs import ExplorationEnv
 from maexp.envs.importing import import_map
 
-ROBOTS, RADIUS, REACH, SPEED, DT = 3, 0.3, 6.0, 0.6, 0.1
+ROBOTS, RADIUS, REACH, SPEED, DT = 3, 0.2, 4.0, 0.6, 0.1
 
 
 class Counting(TeamPlanner):
