@@ -1,10 +1,15 @@
 """Bad input never gets far: a sentence says what it is, or what was ignored; and no goal ever lies in a wall."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt, label
 
 from maexp.agents.runtime import CHOICES, TeamPlanner
+from maexp.agents.runtime.grid import KnownGrid
+from maexp.agents.runtime.ways import flood, trace, trace_from
+from maexp.kernels.constants import BLOCKED, OPEN, UNREACHED
 
 POSES = {"a": (1.0, 1.0, 0.0), "b": (1.5, 1.0, 0.0)}
 
@@ -201,6 +206,25 @@ def check_goals(grid: np.ndarray, cell: float, origin, radius: float, poses, pla
         np.testing.assert_array_equal(plan.ways[robot][-1], plan.goals[robot])
         np.testing.assert_array_equal(plan.ways[robot][0], poses[robot][:2])
     assert np.array_equal(plan.goals[~plan.active], np.asarray(poses)[~plan.active, :2], equal_nan=True)
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_a_way_leads_on_from_where_a_robot_stands(seed):
+    """Not by the middle of its own cell, and over passable cells alone; from a blocked cell to where its way starts."""
+    rng = np.random.default_rng(seed)
+    passable = np.where(rng.random((12, 15)) < 0.7, np.uint8(OPEN), np.uint8(BLOCKED))
+    grid = KnownGrid(np.zeros(passable.shape, np.int64), 0.7, (-4.0, 9.0))
+    source = int(rng.choice(np.flatnonzero(passable)))
+    distance = flood(passable, np.array([source]))[0]
+    for end in np.flatnonzero((distance < UNREACHED).ravel() & (distance.ravel() > 0)):
+        start = grid.to_map(grid.centers(source) + rng.uniform(-0.35, 0.35, 2))
+        way = trace_from(start, grid, passable, distance, end)
+        assert len(way) == len(trace(passable, distance, end)) and (way[0] == start).all()
+        points = np.concatenate([a + np.linspace(0.0, 1.0, 99)[:, None] * (b - a) for a, b in pairwise(way)])
+        assert passable.ravel()[grid.cells(grid.from_map(points))].all()
+        beside = grid.to_map(grid.centers(source) + (0.7, 0.0))
+        from_there = trace_from(beside, grid, passable, distance, end)
+        np.testing.assert_allclose(from_there[1], grid.to_map(grid.centers(source)))
 
 
 @pytest.mark.parametrize("seed", range(400))

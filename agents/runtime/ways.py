@@ -149,20 +149,13 @@ def trace_from(
 ) -> np.ndarray:
     """Corners of a way from where a robot stands to a reached cell, float64 [k, 2] [m], in the map's frame.
 
-    The middle of the robot's own cell is left out where the next corner lies in a clear line: on cells longer than what
-    it drives between two calls it would turn back there every time.
+    The middle of the robot's own cell is left out: on cells longer than what it drives between two calls it would turn
+    back there every time. The line to the next corner leads over cells of the way and those beside its diagonals alone.
     """
-    corners = grid.centers(trace(passable, distance, end))
-    if len(corners) > 1 and is_clear(grid, passable, grid.from_map(start), corners[1]):
-        corners = corners[1:]
-    return np.concatenate([start[None], grid.to_map(corners)])
-
-
-def is_clear(grid: KnownGrid, passable: np.ndarray, start: np.ndarray, end: np.ndarray) -> bool:
-    """Whether the straight line between two points [m], in the grid's frame, leads over passable cells alone."""
-    count = int(np.ceil(4.0 * np.abs(end - start).max() / grid.cell)) + 1  # four points a cell
-    cells = grid.cells(start + np.linspace(0.0, 1.0, count)[:, None] * (end - start))
-    return bool((cells >= 0).all() and (passable.ravel()[cells] != BLOCKED).all())
+    cells = trace(passable, distance, end)
+    if len(cells) > 1 and cells[0] == grid.cells(grid.from_map(start)):
+        cells = cells[1:]
+    return np.concatenate([start[None], grid.to_map(grid.centers(cells))])
 
 
 class _WayBack:
