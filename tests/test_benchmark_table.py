@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from maexp.agents.benchmark.cell import CellResult
-from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
+from maexp.agents.benchmark.differences import differences_markdown, differences_text, subtract
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.benchmark.table import (
     ROWS,
@@ -21,6 +20,8 @@ from maexp.agents.benchmark.table import (
     table_latex,
     table_markdown,
 )
+from maexp.agents.evaluation.comparison import find_best
+from maexp.agents.evaluation.evaluate import EvaluationResult
 
 
 def column(policy: str, seed: int = 0, **values: list[float]):
@@ -28,7 +29,7 @@ def column(policy: str, seed: int = 0, **values: list[float]):
     names = [row.metric for row in ROWS]
     episodes = {name: np.repeat(np.array(values.get(name, [0.5, 0.7]), dtype=float), 3) for name in names}
     episodes["path_length"] = np.arange(6.0)
-    return pool_column(policy, "held_out", [(seed, episodes)], [np.repeat(["a", "b"], 3)])
+    return pool_column("held_out", [(seed, EvaluationResult(policy, 3, episodes, 0.0, np.repeat(["a", "b"], 3)))])
 
 
 ZERO = {"mean": 0.0, "ci95": [0.0, 0.0]}
@@ -104,31 +105,33 @@ def test_the_terminals_table_fits_100_columns(tables):
 # Less the best classical planner
 
 
-def played(policy: str, coverage: list, seed: int = 0, maps: list = ("a", "b")) -> tuple[Cell, CellResult]:
+def played(policy: str, coverage: list, seed: int = 0, maps: list = ("a", "b")) -> tuple[Cell, EvaluationResult]:
     values = np.array(coverage)
     episodes = {"coverage_auc": values, "coverage_step_95_censored": -100 * values, "collisions": 0 * values}
-    return Cell("maze", policy, seed), CellResult(episodes, np.zeros(1), values[:, None], {}, np.array(maps))
+    cell = Cell("maze", policy, seed)
+    seeds = np.full(len(maps), seed) if cell.trains else None
+    return cell, EvaluationResult(policy, 3, episodes, 0.0, np.array(maps), trainings=seeds)
 
 
 def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training():
     maps = ["a", "a", "b", "b", "b"]
     planner = [played("voronoi", [0.1, 0.2, 0.6, 0.9, 0.8], seed, maps) for seed in (0, 1, 2)]
     alike = [played("ippo", [0.2, 0.3, 0.7, 1.0, 0.9], seed, maps) for seed in (2, 0)]
-    found = subtract("ippo", alike, planner)["coverage_auc"]
+    found = subtract(alike, planner)["coverage_auc"]
     assert (found["n"], found["mean"]) == (10, pytest.approx(0.1)) and found["ci95"] == [pytest.approx(0.1)] * 2
     unlike = [alike[1], played("ippo", [0.0, 0.1, 0.5, 0.8, 0.7], 1, maps)]
-    found = subtract("ippo", unlike, planner)["coverage_auc"]
+    found = subtract(unlike, planner)["coverage_auc"]
     assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
-    assert subtract("ippo", [played("ippo", [0.5, 0.5], 7)], planner) == {}
-    text = differences_markdown("voronoi", {"ippo": subtract("ippo", alike, planner)})
+    assert subtract([played("ippo", [0.5, 0.5], 7)], planner) == {}
+    text = differences_markdown("voronoi", {"ippo": subtract(alike, planner)})
     assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
 
 
 def test_copies_of_an_episode_are_told_and_give_no_interval():
     """Three seeds of a planner that draws nothing, from one start: nine episodes are one."""
     values = {name: np.full(3, 0.5) for name in (row.metric for row in ROWS)}
-    maps = [np.repeat("a", 3)] * 3
-    columns = [pool_column("voronoi", "held_out", [(seed, values) for seed in (0, 1, 2)], maps)]
+    played_thrice = [(seed, EvaluationResult("voronoi", 3, values, 0.0, np.repeat("a", 3))) for seed in (0, 1, 2)]
+    columns = [pool_column("held_out", played_thrice)]
     (told,) = evidence_of(columns)
     assert told == "Of 9 episodes 1 is distinct, the rest copies: too few for an interval, which takes 5."
     text = table_markdown({"maze": columns})
@@ -136,13 +139,15 @@ def test_copies_of_an_episode_are_told_and_give_no_interval():
     assert ",0.5,0,,,9,9," in table_csv({"maze": columns})
     means = {"one": 0.6, "two": 0.5}
     pairs = [[played(name, [mean] * 3, seed, ["a"] * 3) for seed in (0, 1)] for name, mean in means.items()]
-    text = differences_markdown("two", {"one": subtract("one", *pairs)})
+    text = differences_markdown("two", {"one": subtract(*pairs)})
     assert "| one | +10.0 | -10 | +0.00 |" in text
 
 
 def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():
     one, other = [played("voronoi", [0.5, 0.7])], [played("hungarian", [0.9, 0.1]), played("hungarian", [0.9, 0.4], 1)]
-    assert find_best({"voronoi": one, "hungarian": other, "rrt_frontiers": []}) == "voronoi" and find_best({}) is None
+    found = {"voronoi": one, "hungarian": other, "rrt_frontiers": []}
+    found = {name: [result for _, result in cells] for name, cells in found.items()}
+    assert find_best(found) == "voronoi" and find_best({}) is None
 
 
 def test_what_knows_the_map_is_never_the_best():

@@ -6,7 +6,6 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,14 @@ from maexp.agents.benchmark.plan import (
     cell_config,
     cell_folder,
     find_cell_player,
+    is_learned,
     training_cell,
     word_names,
 )
 from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.comparison import CHOOSING
-from maexp.agents.evaluation.evaluate import evaluate_recorded
+from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded
 from maexp.agents.evaluation.kept import FOLDER, Kept, identify
 from maexp.agents.evaluation.results import FORMAT, describe_run
 from maexp.agents.files import command, short, write_file, write_json
@@ -43,25 +43,6 @@ TRAINED = "training.json"
 """Written last where a training has come to its end."""
 VALIDATION = "validation"
 """Maps that a classical planner plays first: they say which one is the best."""
-
-
-@dataclass
-class CellResult:
-    """What a finished cell left for one set of maps.
-
-    Attributes:
-        episodes: each metric's value in each episode, NaN where an episode has none
-        seconds: times of the coverage curve [s], shape [records]
-        coverage: [episodes, records] in [0, 1]
-        run: what was run
-        maps: the map of each episode, names [episodes]
-    """
-
-    episodes: dict[str, np.ndarray]
-    seconds: np.ndarray
-    coverage: np.ndarray
-    run: dict
-    maps: np.ndarray
 
 
 class EnvShelf:
@@ -197,7 +178,7 @@ def write_result(folder: Path, suite: str, arrays: dict[str, np.ndarray], summar
     write_json(folder / f"{suite}.json", summary)
 
 
-def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
+def read_result(where: Path, cell: Cell, suite: str) -> EvaluationResult:
     """The result of a finished cell.
 
     Raises:
@@ -210,13 +191,17 @@ def read_result(where: Path, cell: Cell, suite: str) -> CellResult:
             raise ValueError(summary["run"]["format"])
         with np.load(folder / f"{suite}.npz", allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        seconds, coverage = (arrays.pop(name) for name in CURVE)
+        times, coverage = (arrays.pop(name) for name in CURVE)
         run = {name: summary["run"][name] for name in RUN} | summary["run"]
         maps = arrays.pop("maps")
         episodes = {name: arrays[name] for name in summary[cell.policy]} | arrays
+        team, wall, goal = (run[name] for name in ("num_robots", "seconds", "success_coverage"))
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
             f"{short(folder / suite)}.json and .npz cannot be read ({type(error).__name__}): remove the .json, and "
             f"{command('benchmark', f'resume={short(where)}')} plays {cell.name} again."
         ) from error
-    return CellResult(episodes, seconds, coverage, run, maps)
+    return EvaluationResult(
+        cell.policy, team, episodes, wall, maps, learned=is_learned(cell.policy), times=times, coverage=coverage,
+        success_coverage=goal, trainings=np.full(len(maps), cell.seed) if cell.trains else None, run=run,
+    )  # fmt: skip

@@ -1,45 +1,21 @@
 """How far the trained policies of a benchmark are ahead of the best classical planner, on the same episodes."""
 
-import numpy as np
-
-from maexp.agents.benchmark.cell import CellResult
 from maexp.agents.benchmark.plan import Cell
-from maexp.agents.benchmark.table import pool_episodes, weigh
-from maexp.agents.evaluation.comparison import DECIDES
+from maexp.agents.evaluation.evaluate import EvaluationResult, join
 from maexp.agents.evaluation.evidence import brackets
-from maexp.envs.metrics import in_reach, label_copies, summarise
+from maexp.envs.metrics import in_reach
 
-Played = list[tuple[Cell, CellResult]]
+Played = list[tuple[Cell, EvaluationResult]]
 SHOWN = (("coverage_auc", "AUC, points", 100, 1), ("coverage_step_95_censored", "to 95, steps", 1, 0),
          ("coverage_step_99_censored", "to 99, steps", 1, 0), ("collisions", "robots lost", 1, 2))  # fmt: skip
 """Metric, title, scale and digits of what is shown of a difference."""
 
 
-def subtract(policy: str, one: Played, other: Played) -> dict[str, dict]:
+def subtract(one: Played, other: Played) -> dict[str, dict]:
     """{metric: {mean, std, ci95, n}} of a policy's episodes less the same episodes of another; {}: they share none."""
     theirs = {(cell.seed, cell.map): result for cell, result in other}
-    pairs = [(cell.seed, mine, theirs[cell.seed, cell.map]) for cell, mine in one if (cell.seed, cell.map) in theirs]
-    if not pairs:
-        return {}
-    maps, counts = [mine.maps for _, mine, _ in pairs], [len(mine.coverage) for _, mine, _ in pairs]
-    ours, theirs = (pool_episodes([pair[k].episodes for pair in pairs]) for k in (1, 2))
-    copies = label_copies(np.concatenate(maps), ours, theirs)
-    weights = weigh(policy, [seed for seed, _, _ in pairs], counts, maps, copies)
-    return {name: summarise(values - theirs[name], weights, copies) for name, values in ours.items()}
-
-
-def find_best(played: dict[str, Played]) -> str | None:
-    """The policy that saw most over time; None where there is none.
-
-    Args:
-        played: policy -> what it played on validation maps
-    """
-    scores = {
-        policy: np.mean([result.episodes[DECIDES].mean() for _, result in cells])
-        for policy, cells in played.items()
-        if cells
-    }
-    return max(scores, key=scores.get, default=None)
+    pairs = [(mine, theirs[cell.seed, cell.map]) for cell, mine in one if (cell.seed, cell.map) in theirs]
+    return join([mine for mine, _ in pairs]).minus(join([same for _, same in pairs])) if pairs else {}
 
 
 def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:

@@ -5,24 +5,24 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.agents.benchmark.cell import VALIDATION, CellResult, finished, read_result
-from maexp.agents.benchmark.differences import differences_markdown, differences_text, find_best, subtract
+from maexp.agents.benchmark.cell import VALIDATION, finished, read_result
+from maexp.agents.benchmark.differences import differences_markdown, differences_text, subtract
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.agents.benchmark.plan import SUITES, Cell, as_list, is_learned, training_cell
 from maexp.agents.benchmark.table import (
     Column,
     pool_column,
-    pool_episodes,
     print_tables,
     table_csv,
     table_latex,
     table_markdown,
 )
+from maexp.agents.evaluation.comparison import find_best
+from maexp.agents.evaluation.evaluate import EvaluationResult, join, pool
 from maexp.agents.files import short, write_json, write_text
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.settings.schema import BenchmarkSettings
 from maexp.agents.versions import PACKAGES, find_commit
-from maexp.envs.metrics import label_copies
 
 Samples = dict[str, dict[str, np.ndarray]]  # policy -> scenario -> a number for each episode
 SMOKE = "Smoke shows that everything runs; policies are hardly trained, so its figures are no result."
@@ -40,7 +40,7 @@ class Report:
 
     def __init__(self, cfg: BenchmarkSettings, where: Path, cells: list[Cell], suites: list[str]):
         self.cfg, self.where, self.cells, self.suites = cfg, where, cells, suites
-        self._results: dict[tuple[Cell, str], CellResult] = {}
+        self._results: dict[tuple[Cell, str], EvaluationResult] = {}
         self._columns: dict[tuple, Column] = {}
         self._written: set[tuple[int, str]] = set()
 
@@ -83,7 +83,7 @@ class Report:
             print(SMOKE)
         print(f"Written to {short(self.where)}: {', '.join(written)}")
 
-    def results(self, scenario: str, policy: str, suite: str) -> list[tuple[Cell, CellResult]]:
+    def results(self, scenario: str, policy: str, suite: str) -> list[tuple[Cell, EvaluationResult]]:
         """The finished cells of a policy in a scenario."""
         found = []
         for cell in self.cells:
@@ -110,8 +110,7 @@ class Report:
             return None
         key = (scenario, policy, suite, *(cell for cell, _ in found))
         if key not in self._columns:
-            pairs = [(cell.seed, result.episodes) for cell, result in found]
-            self._columns[key] = pool_column(policy, suite, pairs, [result.maps for _, result in found])
+            self._columns[key] = pool_column(suite, [(cell.seed, result) for cell, result in found])
         return self._columns[key]
 
     def write_tables(self) -> dict[str, list[Column]]:
@@ -142,7 +141,8 @@ class Report:
     def _rival(self, scenario: str) -> str | None:
         """The best classical planner on the validation maps."""
         planners = [name for name in dict.fromkeys(one.policy for one in self.cells) if name in CLASSICAL]
-        return find_best({name: self.results(scenario, name, VALIDATION) for name in planners})
+        played = {name: self.results(scenario, name, VALIDATION) for name in planners}
+        return find_best({name: [result for _, result in cells] for name, cells in played.items()})
 
     def differences(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
         """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b on the same maps, for every a that is learned or one's own
@@ -151,7 +151,7 @@ class Report:
         for one in (one for one in columns if is_learned(one.policy)):
             for other in (other for other in columns if other is not one and other.suite == one.suite):
                 mine, theirs = (self.results(scenario, column.policy, one.suite) for column in (one, other))
-                if apart := subtract(one.policy, mine, theirs):
+                if apart := subtract(mine, theirs):
                     found.setdefault(one.name, {})[other.name] = apart
         return found
 
@@ -235,30 +235,22 @@ class Report:
         copies: Samples = {}
         for scenario, columns in played.items():
             for one in columns:
-                found = [result for _, result in self.results(scenario, one.policy, suite)]
-                pooled = pool_episodes([result.episodes for result in found])
-                values.setdefault(one.policy, {})[scenario] = pooled["exploration_ratio"]
-                labels = label_copies(np.concatenate([result.maps for result in found]), pooled)
-                copies.setdefault(one.policy, {})[scenario] = labels
+                pooled = join([result for _, result in self.results(scenario, one.policy, suite)])
+                values.setdefault(one.policy, {})[scenario] = pooled.episodes["exploration_ratio"]
+                copies.setdefault(one.policy, {})[scenario] = pooled.copies()
         return values, copies
 
     def _curves(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
-        """Panel -> policy -> `pool_curves` of its cells; `random` is in both panels, to compare with."""
+        """Panel -> policy -> times [s], coverage [episodes, times], maps [episodes]; `random` is in both panels."""
         curves = {}
         for one in columns:
-            curves[one.policy] = pool_curves([result for _, result in self.results(scenario, one.policy, one.suite)])
+            found = pool([result for _, result in self.results(scenario, one.policy, one.suite)])
+            curves[one.policy] = (found.times, found.coverage, found.maps)
         trained = {name: curve for name, curve in curves.items() if is_learned(name)}
         classical = {name: curve for name, curve in curves.items() if not is_learned(name)}
         if trained and "random" in classical:
             trained["random"] = classical["random"]
         return {"trained": trained, "classical": classical}
-
-
-def pool_curves(results: list[CellResult]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times [s], coverage [episodes, times] and maps [episodes] of several cells; what has ended keeps its coverage."""
-    times = np.unique(np.concatenate([one.seconds for one in results]))
-    coverage = [np.stack([np.interp(times, one.seconds, curve) for curve in one.coverage]) for one in results]
-    return times, np.concatenate(coverage), np.concatenate([one.maps for one in results])
 
 
 def against(apart: dict[str, dict], rival: str | None) -> dict[str, dict]:

@@ -10,10 +10,10 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from maexp.agents.algorithms.table import TRAININGS
 from maexp.agents.benchmark.paper_results import paper_value
+from maexp.agents.evaluation.evaluate import EvaluationResult, join
 from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence
-from maexp.envs.metrics import in_reach, label_copies, resample_weights, summarise
+from maexp.envs.metrics import in_reach
 
 
 @dataclass(frozen=True)
@@ -104,46 +104,15 @@ class Column:
         return self.evidence.episodes
 
 
-def pool_column(
-    policy: str,
-    suite: str,
-    cells: list[tuple[int, dict[str, np.ndarray]]],
-    maps: list[np.ndarray],
-) -> Column:
-    """The column of a policy from the (seed, episodes) of its cells, and the map of each episode."""
-    counts = [len(episodes["exploration_ratio"]) for _, episodes in cells]
-    metrics = list(cells[0][1])
-    pooled = pool_episodes([episodes for _, episodes in cells])
+def pool_column(suite: str, cells: list[tuple[int, EvaluationResult]]) -> Column:
+    """The column of a policy from the (seed, result) of its cells."""
+    pooled = join([result for _, result in cells])
     seeds: dict[int, dict[str, float]] = {}
     for seed in dict.fromkeys(seed for seed, _ in cells):
-        same = [episodes for one, episodes in cells if one == seed]
-        seeds[seed] = {name: _mean(np.concatenate([one[name] for one in same])) for name in metrics}
-    copies = label_copies(np.concatenate(maps), pooled)
-    weights = weigh(policy, [seed for seed, _ in cells], counts, maps, copies)
-    summary = {name: summarise(values, weights, copies) for name, values in pooled.items()}
-    distinct, places = len(np.unique(copies)), len(np.unique(np.concatenate(maps)))
-    evidence = Evidence(policy + SHORT[suite], len(copies), distinct, places)
-    return Column(policy, suite, summary, evidence, seeds)
-
-
-def pool_episodes(cells: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The metrics of the episodes of all cells."""
-    return {name: np.concatenate([episodes[name] for episodes in cells]) for name in cells[0]}
-
-
-def weigh(
-    policy: str, seeds: list[int], counts: list[int], maps: list[np.ndarray], copies: np.ndarray
-) -> np.ndarray:
-    """Resamples of maps, of the episodes on each and, where a policy was trained, of the seeds of its trainings.
-
-    Args:
-        policy: whose
-        seeds, counts: of each cell, and its episodes
-        maps: the map of each episode, for each cell
-        copies: of `label_copies`, of all cells
-    """
-    trainings = [np.repeat(seeds, counts)] if policy in TRAININGS else []
-    return resample_weights(np.concatenate(maps), *trainings, copies=copies)
+        same = join([result for one, result in cells if one == seed])
+        seeds[seed] = {name: _mean(values) for name, values in same.episodes.items()}
+    evidence = pooled.evidence._replace(policy=pooled.policy + SHORT[suite])
+    return Column(pooled.policy, suite, pooled.summary(), evidence, seeds)
 
 
 def _mean(values: np.ndarray) -> float:

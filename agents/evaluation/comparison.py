@@ -7,7 +7,6 @@ import numpy as np
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.evidence import brackets, verdict
-from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
@@ -34,12 +33,23 @@ def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num
 def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
     """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
-        settings = {"seed": seed, "advance": progress.advance}
-        played = [
-            play_once(name, env, lambda n=name: evaluate(POLICIES[n](env), env, count, name=n, **settings), count, seed)
+        played = {
+            name: [evaluate(POLICIES[name](env), env, count, name=name, seed=seed, advance=progress.advance)]
             for name in planners
-        ]
-    return max(played, key=lambda one: one.episodes[DECIDES].mean())
+        }
+    return played[find_best(played)][0]
+
+
+def find_best(played: dict[str, Sequence[EvaluationResult]]) -> str | None:
+    """The policy that saw most over time, the first of equals; None where there is none.
+
+    Args:
+        played: policy -> its results, each of the same weight, on validation maps.
+    """
+    scores = {
+        name: np.mean([one.episodes[DECIDES].mean() for one in results]) for name, results in played.items() if results
+    }
+    return max(scores, key=scores.get, default=None)
 
 
 def describe_differences(results: list[EvaluationResult], best: dict[int, str | None]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,9 @@ class EvaluationResult:
         times, coverage: coverage over time, [records] [s] and [episodes, records] in [0, 1]; None: not recorded
         shares: of each robot in what its team discovered, [episodes, robots]; None: not recorded
         success_coverage: share at which an episode was over: later marks tell nothing (`metrics.in_reach`)
+        trainings: the seed of the policy's training in each episode [episodes], where several are pooled: intervals
+            resample them as they do maps; None: one policy
+        run: what was run, as it is written
     """
 
     policy: str
@@ -46,6 +49,8 @@ class EvaluationResult:
     coverage: np.ndarray | None = None
     shares: np.ndarray | None = None
     success_coverage: float = 0.95
+    trainings: np.ndarray | None = None
+    run: dict = field(default_factory=dict)
 
     def copies(self, *others: "EvaluationResult") -> np.ndarray:
         """A number for each episode, the same for copies (`label_copies`); `others` played the same episodes."""
@@ -70,7 +75,8 @@ class EvaluationResult:
         return self._summarise(apart, self.copies(other))
 
     def _summarise(self, values: dict[str, np.ndarray], copies: np.ndarray) -> dict[str, dict]:
-        weights = resample_weights(self.maps, copies=copies)
+        trainings = [] if self.trainings is None else [self.trainings]
+        weights = resample_weights(self.maps, *trainings, copies=copies)
         return {name: summarise(one, weights, copies) for name, one in values.items()}
 
 
@@ -85,6 +91,8 @@ def join(parts: list[EvaluationResult]) -> EvaluationResult:
         times=None,
         coverage=None,
         shares=None,
+        trainings=None if parts[0].trainings is None else np.concatenate([one.trainings for one in parts]),
+        run={},
     )
 
 
@@ -92,7 +100,7 @@ def pool(parts: list[EvaluationResult]) -> EvaluationResult:
     """The episodes of several recorded results of one policy as one result."""
     times = np.unique(np.concatenate([one.times for one in parts]))
     lines = [np.interp(times, one.times, line) for one in parts for line in one.coverage]
-    shares = np.concatenate([one.shares for one in parts])
+    shares = None if parts[0].shares is None else np.concatenate([one.shares for one in parts])
     return replace(join(parts), times=times, coverage=np.stack(lines), shares=shares)
 
 
