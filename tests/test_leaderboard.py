@@ -194,6 +194,7 @@ def test_the_rows_of_this_project_are_of_its_suites_and_in_its_tables(tmp_path):
     kept = read_all(board)
     for row in kept:
         assert row["verified"] and row["suite"]["checksum"] == load_suite(row["suite"]["name"]).checksum
+    assert len(site.group(kept)) >= 4 and len({row["policy"] for row in kept}) >= 9
     site.write_site(tmp_path, kept)
     assert (tmp_path / site.TABLES).read_text() == (board / site.TABLES).read_text()
 
