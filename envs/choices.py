@@ -57,11 +57,16 @@ class Scene(Protocol):
         """Sum over the targets, [..., N, K, *] -> [..., N, *]."""
 
     def in_turn(self, gain: Array, value: Array) -> Array:
-        """[..., N, K], what targets are worth when it is their robot's turn, in a team in which everyone knows what the
-        others choose (`maexp.envs.targets.plan_in_turn`)."""
+        """[..., N, K], what targets are worth when it is their robot's turn, after those that it hears have chosen
+        (`maexp.envs.targets.plan_in_turn`)."""
 
     def match(self, among: Array) -> Array:
-        """bool [..., N, K]: different targets `among` those given for all robots, with the least total way."""
+        """bool [..., N, K]: different targets `among` those given for all robots, with the least total way; a robot
+        plans for those that it hears."""
+
+    def heard(self, values: Array, blank: Any) -> Array:
+        """Values [..., N, *] of the robots that each one hears, `blank` for the others, [..., N, N, *]; [..., 1, N, *]
+        where all hear all."""
 
     def found_by_trees(self, samples: int, branch: float) -> Array:
         """bool, to be broadcast to [..., N, K]: targets that random trees come upon, with branches of at most so many
@@ -100,9 +105,10 @@ def rank_by_area(scene: Scene) -> Array:
     """The nearest target that no other robot is nearer to; the nearest of all for robots without one (Voronoi)."""
     xp, worth = scene.xp, worthwhile(scene)
     travel = xp.where(worth & scene.alive[..., None], scene.travel, xp.inf)
-    least = travel == xp.amin(travel, axis=-2, keepdims=True)
+    heard = scene.heard(travel, xp.inf)
+    least = heard == xp.amin(heard, axis=-2, keepdims=True)
     first = least & (xp.cumsum(least, axis=-2) == 1)  # of robots equally near the first
-    mine = first & xp.isfinite(travel)
+    mine = of_each(xp, first) & xp.isfinite(travel)
     mine = mine | ~xp.any(mine, axis=-1, keepdims=True)
     return rank(scene, xp.where(mine, -travel, -FAR - travel), worth)
 
@@ -125,10 +131,16 @@ def rank_by_force(scene: Scene) -> Array:
     force = scene.total(pull[..., None] * ways)
     apart = scene.at[..., :, None, :] - scene.at[..., None, :, :]
     gap = _length(xp, apart)
-    push = REPULSION * xp.clip(1.0 - gap / scene.radar_range, 0.0, None) * scene.alive[..., None, :, None]
+    push = REPULSION * xp.clip(1.0 - gap / scene.radar_range, 0.0, None) * scene.heard(scene.alive[..., None], False)
     force = force + scene.total(pull)[..., None] * xp.sum(push * apart / gap, axis=-2)
     along = xp.sum(ways * force[..., None, :], axis=-1) / _length(xp, force)
     return rank(scene, pull * (1.0 + along), worth)
+
+
+def of_each(xp: Any, values: Array) -> Array:
+    """What is each robot's own of values in the team of those that it hears: `Scene.heard` -> [..., N, K]."""
+    index = xp.arange(values.shape[-2])
+    return values[..., 0, :, :] if values.shape[-3] == 1 else values[..., index, index, :]
 
 
 def _length(xp: Any, vectors: Array) -> Array:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 import warp as wp
 
+from maexp.envs.choices import of_each
 from maexp.envs.features import drive_until_next
 from maexp.envs.navigation import Navigation
 from maexp.kernels import goals, targets
@@ -96,13 +97,19 @@ class Scene:
         return self.to_blocks(values).sum(2)
 
     def in_turn(self, gain: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-        everyone = torch.ones((*self.alive.shape, self.alive.shape[1]), dtype=torch.bool, device=gain.device)
-        return plan_in_turn(gain, value, self.points / self.radar_range, everyone)[0]
+        return plan_in_turn(gain, value, self.points / self.radar_range, self.nav.state["comm"])[0]
 
     def match(self, among: torch.Tensor) -> torch.Tensor:
         cost = (self.travel * (100.0 / self.cell)).clamp(max=FORBIDDEN - 1)  # hundredths of a cell
-        match = assign_targets(torch.where(among, cost, FORBIDDEN).to(torch.int32)).unsqueeze(-1)
-        return torch.arange(cost.shape[-1], device=cost.device) == match
+        teams = self.heard(torch.where(among, cost, FORBIDDEN).to(torch.int32), FORBIDDEN)
+        match = assign_targets(teams.flatten(0, 1)).view(*teams.shape[:3], 1)
+        return of_each(torch, torch.arange(cost.shape[-1], device=cost.device) == match)
+
+    def heard(self, values: torch.Tensor, blank: float) -> torch.Tensor:
+        if self.nav.rows == 1:
+            return values.unsqueeze(1)
+        hears = self.nav.state["comm"].view(*self.alive.shape, -1, *[1] * (values.dim() - 2))
+        return torch.where(hears, values.unsqueeze(1), blank)
 
     def found_by_trees(self, samples: int, branch: float) -> torch.Tensor:
         return self.of_blocks(self.spread(self.nav.grow_trees(samples, branch)))

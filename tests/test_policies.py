@@ -57,6 +57,24 @@ def test_plain_dwa_and_limited_communication_and_one_robot(name):
         assert (coverage > 0.1).all()
 
 
+@pytest.mark.parametrize("name", [*CLASSICAL, "lookahead"])
+def test_robots_that_are_not_heard_change_no_choice(name):
+    """A robot alone chooses the same wherever the others are: it cannot know."""
+    env = make_env(12, comm=CommConfig(range=5.0))
+    env.step(POLICIES["nearest_frontier"](env)(env.reset()))
+    state, found = env.simulation.tensors, []
+    lonely = state["comm"][:, 0].sum(-1) == 1
+    for flags in (state["known_free"], state["known_boundary"]):  # what it knows: they find targets where it is, too
+        flags |= (flags & 1) * 0b110
+    for aside in ((2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)):
+        state["center"][:, 1:, :2] = state["center"][:, :1, :2] + torch.tensor(aside)
+        td = POLICIES[name](env)(env.observe())
+        found.append((td[REGION][lonely, 0], td[OFFSET][lonely, 0]))
+    assert lonely.sum() >= 4
+    for region, offset in found[1:]:
+        assert torch.equal(region, found[0][0]) and torch.equal(offset, found[0][1])
+
+
 def test_direct_controls_are_refused():
     with pytest.raises(ValueError, match="planner=direct"):
         POLICIES["voronoi"](make_env(1, planner="direct"))

@@ -15,7 +15,7 @@ from maexp.agents.policies.rollouts import ROLLOUT_POLICY, Rollouts, check_rollo
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.choices import value_targets
-from maexp.envs.targets import Scene, plan_in_turn
+from maexp.envs.targets import Scene
 
 
 class LookaheadPlanner(FrontierPlanner):
@@ -133,6 +133,5 @@ def list_candidates(preference: torch.Tensor, own: torch.Tensor, count: int) -> 
 
 def _value(scene: Scene) -> torch.Tensor:
     """What targets are worth to `cost_utility` when it is the robot's turn [radar discs], float32 [E, N, T]."""
-    hears = torch.ones((*scene.alive.shape, scene.alive.shape[1]), dtype=torch.bool, device=scene.gain.device)
     value = torch.where(scene.travel.isfinite(), value_targets(scene), -torch.inf)
-    return plan_in_turn(scene.gain, value, scene.points / scene.nav.radar_range, hears)[0]
+    return scene.in_turn(scene.gain, value)
