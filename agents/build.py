@@ -37,6 +37,7 @@ from maexp.agents.settings.schema import (
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PointCloudMap,
@@ -159,6 +160,7 @@ def make_env(
         reward=RewardConfig(**given(cfg.reward)),
         observation=ObservationConfig(**given(cfg.observation)),
         comm=CommConfig(**given(cfg.comm)),
+        faults=FaultsConfig(**given(cfg.faults)),
         targets=TargetsConfig(**given(cfg.targets)),
         lookahead=LookaheadConfig(**given(cfg.lookahead)),
         local_steps=scenario.local_steps,

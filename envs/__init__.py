@@ -8,6 +8,7 @@ from maexp.kernels.lazy import lazy_names
 _HOMES = {
     "SCENARIOS": "scenarios",
     "CommConfig": "config",
+    "FaultsConfig": "config",
     "ExplorationEnv": "environment",
     "MapError": "map",
     "ObservationConfig": "config",
@@ -29,6 +30,7 @@ _HOMES = {
 __all__ = [
     "SCENARIOS",
     "CommConfig",
+    "FaultsConfig",
     "ExplorationEnv",
     "MapError",
     "ObservationConfig",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import CommConfig
+from maexp.envs.config import CommConfig, FaultsConfig
 from maexp.kernels.state import STATE
 
 if TYPE_CHECKING:
@@ -32,9 +32,10 @@ def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig 
     """An env of `count` branches of teams of `env`, on other maps perhaps, that draws no pictures."""
     from maexp.envs.environment import ExplorationEnv
 
+    limited = env.settings.limited if comm is None else comm.limited
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
-        env.settings, num_envs=count, comm=comm,
+        env.settings, num_envs=count, comm=comm, faults=FaultsConfig(), limited=limited,  # nobody foresees a fault
         observation=replace(env.settings.observation, pictures=False),
     )  # fmt: skip
     made = ExplorationEnv.__new__(ExplorationEnv)
@@ -83,6 +84,8 @@ class Branches:
         rows = self.listed.repeat_interleave(self.copies)
         for theirs, ours in self._copied.values():
             ours[: len(rows)] = theirs[rows]
+        state = self.env.simulation.tensors
+        state["collided"][: len(rows)] |= state["failed"][: len(rows)]  # who has failed stands as a wreck does
         self._place(rows, robot)
         active = self.env.simulation.tensors["active"]
         active[: len(rows)] *= wanted.flatten().int()

@@ -136,10 +136,28 @@ class CommConfig:
         return self.base_station is not False
 
 
+@dataclass(frozen=True)
+class FaultsConfig:
+    """Robots that fail (docs/conditions.md): they stop, see nothing, say nothing and stand in the way.
+
+    Each fails with ``probability`` in an episode, at a moment drawn evenly over it; those of ``at``, pairs of a robot's
+    number and seconds into the episode, fail at that moment. ``duration`` [s] is how long; inf: for good.
+    """
+
+    probability: float = 0.0
+    at: tuple[tuple[int, float], ...] = ()
+    duration: float = math.inf
+
+    @property
+    def some(self) -> bool:
+        """Whether any robot may fail."""
+        return self.probability > 0.0 or bool(self.at)
+
+
 STRATEGIES = ("opportunistic", "rendezvous", "relay", "return_to_base", "pursuit")
 DONE = ("union", "base", "everyone")
 """Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
-station knows, or what every robot knows that has not collided."""
+station knows, or what every robot knows that has neither collided nor failed."""
 CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
 
@@ -340,6 +358,28 @@ def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:
     return float(place[0]), float(place[1])
 
 
+def check_faults(config: FaultsConfig, num_robots: int | None = None) -> FaultsConfig:
+    """Check every value, robots where it is known how many there are, and make the pairs tuples."""
+    _check_number("faults.probability", config.probability, "a share in [0, 1]", least=0.0, most=1.0)
+    _check_number("faults.duration", config.duration, "0.1 or more seconds (inf: for good)", least=0.1, finite=False)
+    pairs = config.at if isinstance(config.at, Sequence) and not isinstance(config.at, str) else [config.at]
+    found: dict[int, float] = {}
+    for pair in pairs:
+        if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
+            raise ValueError(f"faults.at={config.at!r} must be pairs of a robot and seconds, as [[0, 30], [2, 12.5]]")
+        robot, seconds = pair
+        if isinstance(robot, bool) or not isinstance(robot, int) or robot < 0:
+            raise ValueError(f"faults.at names robot {robot!r}: robots have numbers from 0 on")
+        if num_robots is not None and robot >= num_robots:
+            last = num_robots - 1
+            raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")
+        if robot in found:
+            raise ValueError(f"faults.at names robot {robot} twice: it fails once in an episode")
+        _check_number(f"faults.at: the moment of robot {robot}", seconds, "0 or more seconds", least=0.0)
+        found[robot] = float(seconds)
+    return replace(config, at=tuple(found.items()))
+
+
 def check_done(done: str, comm: CommConfig) -> str:
     """Whose coverage ends an episode must be known, and there."""
     _check_choice("done", done, DONE)
@@ -389,9 +429,11 @@ def one_config(what: str, config, kind: type):
     return config or kind()
 
 
-def _check_number(name: str, value, what: str, least: float = -math.inf, finite: bool = True) -> None:
+def _check_number(
+    name: str, value, what: str, least: float = -math.inf, most: float = math.inf, finite: bool = True
+) -> None:
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and value >= least and (math.isfinite(value) or (not finite and value == math.inf))):
+    if not (number and least <= value <= most and (math.isfinite(value) or (not finite and value == math.inf))):
         raise ValueError(f"{name}={value!r} must be {what}")
 
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 def describe(env: ExplorationEnv) -> tuple[type, list[PointCloudMap], dict[str, Any], dict[str, torch.Tensor]]:
     """What `rebuild` makes the same env of: its class, maps, settings and state."""
     settings = env.settings
-    chosen = {one.name: getattr(settings, one.name) for one in fields(settings) if one.name != "scenario"}
+    follows = ("scenario", "limited")  # from the others
+    chosen = {one.name: getattr(settings, one.name) for one in fields(settings) if one.name not in follows}
     chosen |= {"robot": chosen.pop("robots"), "radar": chosen.pop("radars"), "starts": env.starts}
     return type(env), env.maps, chosen, env.state_dict()
 

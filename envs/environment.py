@@ -12,6 +12,7 @@ from maexp.envs.bank import MapBank, build_bank
 from maexp.envs.config import (
     STARTS,
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
@@ -56,13 +57,13 @@ class ExplorationEnv(EnvBase):
         num_robots: robots in a team, N.
         device: "cpu" or "cuda".
         seed: key of all random numbers: env i's episode k depends on (seed, first_env + i, k) alone.
-        robot, radar, planner, reward, observation, comm, targets, lookahead: see `maexp.envs.config`.
+        robot, radar, planner, reward, observation, comm, faults, targets, lookahead: see `maexp.envs.config`.
         local_steps: control steps of 0.1 s in one ``env.step``.
         macro_steps: ``env.step`` calls in an episode before it is truncated.
         collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
         success_coverage: coverage that ends an episode as a success.
         done: whose coverage that is: "union", what the team has seen together; "base", what the base station knows;
-            "everyone", what every robot knows that has not collided.
+            "everyone", what every robot knows that has neither collided nor failed.
         num_threads: CPU threads of the simulation; results do not depend on it.
         first_env: number of the first env in the random keys, where several processes share one batch of envs.
         starts: "drawn" anew at every reset; "together": a place for the team is drawn at every reset, in which robots
@@ -107,6 +108,7 @@ class ExplorationEnv(EnvBase):
         reward: RewardConfig | None = None,
         observation: ObservationConfig | None = None,
         comm: CommConfig | None = None,
+        faults: FaultsConfig | None = None,
         targets: TargetsConfig | None = None,
         lookahead: LookaheadConfig | None = None,
         local_steps: int | None = None,
@@ -121,9 +123,9 @@ class ExplorationEnv(EnvBase):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
         settings = complete_settings(
             maps, num_envs, num_robots, device, seed, robot=robot, radar=radar, planner=planner, reward=reward,
-            observation=observation, comm=comm, targets=targets, lookahead=lookahead, local_steps=local_steps,
-            macro_steps=macro_steps, collision=collision, success_coverage=success_coverage, done=done,
-            num_threads=num_threads, first_env=first_env,
+            observation=observation, comm=comm, faults=faults, targets=targets, lookahead=lookahead,
+            local_steps=local_steps, macro_steps=macro_steps, collision=collision, success_coverage=success_coverage,
+            done=done, num_threads=num_threads, first_env=first_env,
         )  # fmt: skip
         for m in maps:
             check_room(m, [r.collision_threshold for r in settings.robots])
@@ -152,7 +154,7 @@ class ExplorationEnv(EnvBase):
         if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
             self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
-        info, pictures = info_shapes(settings.comm, settings.done), settings.observation.pictures
+        info, pictures = info_shapes(settings), settings.observation.pictures
         self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown)
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
@@ -260,7 +262,7 @@ class ExplorationEnv(EnvBase):
         observation = {
             "pose": pose, "grid": grid, "comm": state["comm"].clone(),
             "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
-            "alive": state["collided"] == 0,
+            "alive": (state["collided"] == 0) & (state["failed"] == 0),
         } | ({"map": picture} if pictures else {})  # fmt: skip
         if self.target_view is not None:
             seen = self.target_view.observe(mask)
@@ -297,7 +299,9 @@ class ExplorationEnv(EnvBase):
             info[f"path_length_{mark}"] = s["milestone_path"][:, :, k].clone()
         for k, term in enumerate(REWARD_TERMS):
             info[f"reward_{term}"] = s["terms"][:, :, k].clone()
-        return info | (self._radio_info(total) if self.comm_config.limited else {})
+        if self.settings.faults.some:
+            info["failed"] = s["failed"] != 0
+        return info | (self._radio_info(total) if self.settings.limited else {})
 
     def _radio_info(self, total: torch.Tensor) -> dict[str, torch.Tensor]:
         """Who knows how much; ``total`` is the weight of each team's map, int32 [E]."""

@@ -75,7 +75,7 @@ class Navigation:
         self.launch = launch_on(env.device)
         nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
         self.grids, cells = nav
-        limited = env.comm_config.limited
+        limited = env.settings.limited
         self.rows = self.num_robots if limited else 1
         names = ("map_id", "active", "collided", "macro_step", "seed", "env_id", "episode")
         self.arrays = {name: wp.from_torch(self._state[name]) for name in names}
@@ -278,7 +278,8 @@ class Navigation:
 
     def alive(self) -> torch.Tensor:
         """Robots that can still move: bool [E, N]."""
-        return (self.state["collided"] == 0) & (self.state["active"] != 0).unsqueeze(1)
+        stands = (self.state["collided"] != 0) | (self.state["failed"] != 0)
+        return ~stands & (self.state["active"] != 0).unsqueeze(1)
 
     def centers(self) -> torch.Tensor:
         """Centres of the bodies [m]: float32 [E, N, 2]."""

@@ -9,6 +9,7 @@ import torch
 
 from maexp.envs.config import (
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
@@ -18,6 +19,7 @@ from maexp.envs.config import (
     TargetsConfig,
     check_comm,
     check_done,
+    check_faults,
     check_lookahead,
     check_observation,
     check_reward,
@@ -56,6 +58,8 @@ class EnvSettings:
     reward: RewardConfig
     observation: ObservationConfig
     comm: CommConfig
+    faults: FaultsConfig
+    limited: bool  # whether robots may know different things
     targets: TargetsConfig
     lookahead: LookaheadConfig
 
@@ -78,6 +82,7 @@ def complete_settings(
     reward: RewardConfig | None,
     observation: ObservationConfig | None,
     comm: CommConfig | None,
+    faults: FaultsConfig | None,
     targets: TargetsConfig | None,
     lookahead: LookaheadConfig | None,
     local_steps: int | None,
@@ -129,6 +134,7 @@ def complete_settings(
     observation = one_config("observation", observation, ObservationConfig)
     check_observation(observation, planner)
     comm = check_comm(one_config("comm", comm, CommConfig))
+    faults = check_faults(one_config("faults", faults, FaultsConfig), num_robots)
     check_strategy(comm, num_robots, planner)
     check_base(maps, comm)
     targets = check_targets(one_config("targets", targets, TargetsConfig))
@@ -153,6 +159,8 @@ def complete_settings(
         reward=reward,
         observation=observation,
         comm=comm,
+        faults=faults,
+        limited=comm.limited or faults.some,
         targets=targets,
         lookahead=lookahead,
     )

@@ -16,7 +16,7 @@ from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
+from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, DT, OMNIDIRECTIONAL, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
 from maexp.kernels.wavefront import grid_memory_per_env
 
 KINDS = {
@@ -37,6 +37,7 @@ def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = Fals
         robots=robot_tensors(settings),
         weights=reward_weights(settings),
         radio=radio_struct(settings),
+        fault_at=fault_steps(settings),
         settings=step_settings(settings, together),
         sizes=sizes(settings, bank),
         device=settings.device,
@@ -99,6 +100,14 @@ def radio_struct(settings: EnvSettings) -> Radio:
     return radio
 
 
+def fault_steps(settings: EnvSettings) -> torch.Tensor:
+    """Local step in which each robot is to fail, int32 [N]; -1: none is given."""
+    steps = torch.full((settings.num_robots,), -1, dtype=torch.int32, device=settings.device)
+    for robot, seconds in settings.faults.at:
+        steps[robot] = round(seconds / DT)
+    return steps
+
+
 def open_ground(bank: MapBank) -> torch.Tensor:
     """Cells of the navigation grids of all maps, one after the other, uint8: 1 on free ground."""
     return torch.from_numpy(np.concatenate([open_cells(build_nav_grid(one)) for one in bank.maps]).astype(np.uint8))
@@ -106,7 +115,7 @@ def open_ground(bank: MapBank) -> torch.Tensor:
 
 def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
     """What a local step does."""
-    planner, comm = settings.planner, settings.comm
+    planner, comm, faults = settings.planner, settings.comm, settings.faults
     base = (math.inf, math.inf) if isinstance(comm.base_station, bool) else comm.base_station
     return Settings(
         planner=planner.name,
@@ -116,13 +125,17 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         clearance_weight=planner.clearance_weight,
         replan_steps=planner.replan_steps,
         footprint=settings.collision == "footprint",
-        limited=comm.limited,
+        limited=settings.limited,
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
         signal=comm.signal,
         base_x=base[0],
         base_y=base[1],
-        done=DONE.index(settings.done) if comm.limited else 0,  # else all know the same
+        faults=faults.some,
+        fault_probability=faults.probability,
+        fault_steps=max(1, round(min(faults.duration, 1e8) / DT)),
+        episode_steps=settings.episode_steps,
+        done=DONE.index(settings.done) if settings.limited else 0,  # else all know the same
         draw_known=settings.observation.map == "known",
         success_coverage=settings.success_coverage,
         together=together,
@@ -145,7 +158,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         occluders=bank.occluders_in_range + (outline if settings.num_robots > 1 else 0),
         nearby=bank.boundary_in_range,
         track=min(settings.episode_steps + 1, TRACK_LENGTH),
-        limited=settings.comm.limited,
+        limited=settings.limited,
         base_station=settings.comm.has_base,
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robots),
     )
@@ -169,7 +182,7 @@ def bytes_per_env(settings: EnvSettings, bank: MapBank) -> int:
 
 def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     """What `grid_memory_per_env` counts with."""
-    limited, robots = settings.comm.limited, settings.num_robots
+    limited, robots = settings.limited, settings.num_robots
     shapes = [grid_shape(one) for one in bank.maps]
     cells = max(width * height for width, height in shapes)
     return {

@@ -3,8 +3,8 @@
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
-from maexp.envs.config import CommConfig
 from maexp.envs.features import FEATURES
+from maexp.envs.settings import EnvSettings
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS
 from maexp.kernels.types import REGIONS
@@ -47,12 +47,15 @@ INFO_COUNTED = {"counted_coverage": torch.float32}
 OF_TEAM = INFO_ENV | INFO_RADIO | INFO_BASE | INFO_COUNTED
 
 
-def info_shapes(comm: CommConfig, done: str = "union") -> tuple[dict[str, torch.dtype], dict[str, torch.dtype]]:
+def info_shapes(settings: EnvSettings) -> tuple[dict[str, torch.dtype], dict[str, torch.dtype]]:
     """Entries of ``info`` of shape [E, 1] and [E, N]."""
     team, robot = dict(INFO_ENV), dict(INFO_ROBOT)
-    if comm.limited:
-        team |= INFO_RADIO | (INFO_BASE if comm.has_base else {}) | (INFO_COUNTED if done != "union" else {})
+    if settings.limited:
+        base, counted = settings.comm.has_base, settings.done != "union"
+        team |= INFO_RADIO | (INFO_BASE if base else {}) | (INFO_COUNTED if counted else {})
         robot["connected"] = torch.float32
+    if settings.faults.some:
+        robot["failed"] = torch.bool
     return team, robot
 
 

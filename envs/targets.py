@@ -297,8 +297,10 @@ class TargetTracker:
             float32 [E, N, T], `way`, infinite for targets given up.
         """
         nav, s = self.nav, self.state
-        if self.env.strategy is not None:  # who was sent elsewhere has not tried its target
-            s["chosen"] = s["chosen"].masked_fill(self.env.strategy.state["duty"].unsqueeze(-1), -1)
+        idle = self.env.simulation.tensors["failed"] != 0  # who has failed, or was sent elsewhere, has tried no target
+        if self.env.strategy is not None:
+            idle = idle | self.env.strategy.state["duty"]
+        s["chosen"] = s["chosen"].masked_fill(idle.unsqueeze(-1), -1)
         left, kept = torch.zeros(len(way), dtype=torch.int32, device=way.device), torch.empty_like(way)
         values = nav.values() | {name: view(one) for name, one in s.items() if name != "stood"} | {
             "stood": view(s["stood"], wp.vec2), "block": view(block), "way": view(way), "kept": view(kept),

@@ -122,6 +122,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     views, dim, lanes = zeros(1, 1, count), (1, 1), lanes_on(wp.device_from_torch(device), 4096)
     values = {
         "maps": maps, "map_id": ints(0), "robots": robots, "active": ints(1), "lanes": lanes,
+        "failed": wp.from_torch(zeros(1, 1)),
         "planar": int(not free[:, 2].any() and not occluders[:, 2].any()),
         "pose": wp.from_torch(pose, dtype=wp.vec4), "center": wp.from_torch(center, dtype=wp.vec3),
         "near": wp.from_torch(zeros(1, 1, 1)), "near_count": wp.from_torch(zeros(1, 1)),  # nobody else is there

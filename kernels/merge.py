@@ -128,6 +128,14 @@ def is_blocked(maps: Maps, m: int, a: wp.vec3, b: wp.vec3, width: float) -> bool
     return False
 
 
+@wp.func
+def works(e: int, k: int, failed: wp.array2d(dtype=wp.int32)) -> bool:
+    """Whether radio k works: the base station's always does."""
+    if k < failed.shape[1]:
+        return failed[e, k] == 0
+    return True
+
+
 @wp.kernel
 def _hear_robots(
     # Map:
@@ -138,13 +146,15 @@ def _hear_robots(
     line_of_sight: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    failed: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     base: wp.array(dtype=wp.vec3),  # [env]
     # State out:
     comm: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
     hears: wp.array3d(dtype=wp.int32),  # [env, radio, word]
 ):
-    """Decide whom radio (e, i) hears: itself, and radios in range (and in sight, if asked)."""
+    """Decide whom radio (e, i) hears: itself, and radios in range (and in sight, if asked); failed ones neither hear
+    nor are heard."""
     e, i = wp.tid()
     if active[e] == 0:
         return
@@ -155,7 +165,7 @@ def _hear_robots(
     for other in range(hears.shape[1]):
         a = radio_at(e, wp.min(i, other), center, base)
         b = radio_at(e, wp.max(i, other), center, base)
-        heard = wp.length(a - b) <= comm_range
+        heard = wp.length(a - b) <= comm_range and works(e, i, failed) and works(e, other, failed)
         if heard and line_of_sight != 0 and other != i:
             # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
             width = 0.70710678 * maps.resolution[m]

@@ -203,6 +203,7 @@ def _note_links(
     active: wp.array(dtype=wp.int32),  # [env]
     local_step: wp.array(dtype=wp.int32),  # [env]
     collided: wp.array2d(dtype=wp.int32),  # [env, robot]
+    failed: wp.array2d(dtype=wp.int32),  # [env, robot]
     hears: wp.array3d(dtype=wp.int32),  # [env, radio, word]
     known_weight: wp.array2d(dtype=wp.int32),  # [env, radio]
     # State in and out:
@@ -218,7 +219,7 @@ def _note_links(
     base station over any number of robots, or where there is none with another robot.
 
     ``counted`` is what may end the episode: what the base station knows, or the robot that knows least of those that
-    have not collided.
+    have neither collided nor failed.
     """
     e = wp.tid()
     if active[e] == 0:
@@ -230,7 +231,7 @@ def _note_links(
     standing = int(0)
     for i in range(robots):
         least = wp.min(least, known_weight[e, i])
-        if collided[e, i] == 0:
+        if collided[e, i] == 0 and failed[e, i] == 0:
             count = wp.min(count, known_weight[e, i])
             standing += 1
     if standing == 0:

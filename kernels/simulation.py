@@ -35,6 +35,10 @@ class Settings:
     signal: bool  # whether radios hear what arrives of a signal
     base_x: float  # where the base station is [m]; inf: where robot 0 starts
     base_y: float
+    faults: bool  # whether robots may fail
+    fault_probability: float  # of each robot in an episode
+    fault_steps: int  # how long that lasts
+    episode_steps: int  # local steps of an episode
     done: int  # whose coverage ends an episode (`radio.UNION`)
     draw_known: bool  # pictures show what robots know, not what they have seen
     success_coverage: float  # share at which an episode ends
@@ -51,6 +55,7 @@ class Simulation:
         robots: one [E, N] tensor per field of `Robots`.
         weights: reward coefficients.
         radio: parameters of the radios.
+        fault_at: int32 [N], local step in which each robot is to fail; -1: none.
         settings: what a step does.
         sizes: lengths of the axes (`kernels.state.axis_sizes`).
         device: where it runs.
@@ -67,6 +72,7 @@ class Simulation:
         robots: dict[str, torch.Tensor],
         weights: RewardWeights,
         radio: Radio,
+        fault_at: torch.Tensor,
         settings: Settings,
         sizes: dict[str, int],
         device: torch.device,
@@ -81,7 +87,7 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
-        self.radio = radio
+        self.radio, self.fault_at = radio, wp.from_torch(fault_at)
         self.open_cells = None if open_cells is None else wp.from_torch(open_cells)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["starts"].fill_(torch.inf)

@@ -90,18 +90,20 @@ STATE = {
 
     # Where the robots are and where they go.
     "pose": Field(wp.vec4, "E N", "m, m, m/s, rad", "x, y, speed forward, heading of the reference point (`dynamics`)",
-        "_place_team _move_robots _detect_collisions"),
+        "_place_team _fail_robots _move_robots _detect_collisions"),
     "slip": Field(wp.float32, "E N", "m/s", "speed to the left, of omnidirectional robots; 0 for the others",
-        "_clear_robots _move_robots _detect_collisions"),
+        "_clear_robots _fail_robots _move_robots _detect_collisions"),
     "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it",
         "_place_team _move_robots"),
     "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
     "waypoint": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
         "_clear_robots _set_goal _pick_waypoint _hold_back _hold_turns"),
     "control": Field(wp.vec2, "E N", "m/s^2, rad", "acceleration, then steering [rad], yaw rate [rad/s] or sideways"
-        " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct"),
+        " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct _fail_robots"),
     "collided": Field(wp.int32, "E N", "", "1 once the robot has collided: it stands for good",
         "_clear_robots _detect_collisions"),
+    "failed": Field(wp.int32, "E N", "", "1 while the robot has failed: it stands, sees nothing and says nothing",
+        "_fail_robots"),
     "path_length": Field(wp.float32, "E N", "m", "way driven in this episode", "_clear_robots _move_robots"),
     "track": Field(wp.int32, "E N T", "", "pixel of the body's centre after each local step (ix * 125 + iy)",
         "_record_track"),

@@ -7,6 +7,7 @@ import torch
 
 from maexp.kernels.collision import detect_collisions
 from maexp.kernels.dynamics import move_robots
+from maexp.kernels.faults import fail_robots
 from maexp.kernels.launches import Launch
 from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
@@ -21,10 +22,11 @@ from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 
 def local_step(launch: Launch, shard: Shard) -> None:
-    """Plan, move, collide, scan, merge, reward, terminate, in the envs that are active."""
+    """Plan, fail, move, collide, scan, merge, reward, terminate, in the envs that are active."""
     active = shard.view.active
     list_near(launch, shard, active)
     plan(launch, shard)
+    fail_robots(launch, shard, active)
     move_robots(launch, shard)
     detect_collisions(launch, shard)
     scan(launch, shard, active)
@@ -50,6 +52,7 @@ def reset(launch: Launch, shard: Shard) -> None:
     mask = shard.view.mask
     place_teams(launch, shard)
     place_base(launch, shard)
+    fail_robots(launch, shard, mask)
     list_near(launch, shard, mask)
     scan(launch, shard, mask)
     merge_scan(launch, shard, mask)

@@ -226,6 +226,7 @@ def _scan_free(
     lanes: int,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    failed: wp.array2d(dtype=wp.int32),  # [env, robot]
     pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # Scratch in:
@@ -244,7 +245,7 @@ def _scan_free(
 ):
     """List the free points that robot (e, i) sees now and count its view at each of them."""
     e, i, lane = wp.tid()
-    if active[e] == 0:
+    if active[e] == 0 or failed[e, i] != 0:
         return
     m = map_id[e]
     radius = robots.radar_range[e, i]

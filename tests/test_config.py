@@ -13,6 +13,7 @@ from maexp.agents.settings.overrides import find_override, make_overrides, quote
 from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
 from maexp.envs.config import (
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
@@ -94,8 +95,8 @@ def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
     whole = complete_planner(PlannerConfig(name=planner), row)
     assert complete_planner(PlannerConfig(**given(cfg.planner)), row) == whole, f"conf/planner/{planner}.yaml"
     kinds = {
-        "reward": RewardConfig, "observation": ObservationConfig, "comm": CommConfig, "targets": TargetsConfig,
-        "lookahead": LookaheadConfig,
+        "reward": RewardConfig, "observation": ObservationConfig, "comm": CommConfig, "faults": FaultsConfig,
+        "targets": TargetsConfig, "lookahead": LookaheadConfig,
     }  # fmt: skip
     for group, kind in kinds.items():
         assert given(cfg[group]) == asdict(kind()), f"conf/{group}"

@@ -10,7 +10,7 @@ from worlds import room
 import maexp.kernels as mk
 from maexp.agents.policies import POLICIES
 from maexp.agents.training.collect import make_collector
-from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig
+from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
 DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
@@ -58,6 +58,14 @@ def test_radios_agree(device):
     free, points = torch.rand(9, 12) < 0.8, 8.0 * torch.rand(2, 50, 2)
     found = [mk.received_power(free.to(one), *points, edge=0.9).cpu() for one in ("cpu", device)]
     torch.testing.assert_close(*found, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_failures_agree(device):
+    """Who fails when is drawn from the same keys."""
+    faults = FaultsConfig(probability=0.7, duration=0.8)
+    here, there = (play(one, "wavefront", faults=faults)["info"] for one in ("cpu", device))
+    assert torch.equal(there["failed"], here["failed"]) and 0.02 < here["failed"].float().mean() < 0.7
 
 
 @pytest.mark.parametrize("device", DEVICES)

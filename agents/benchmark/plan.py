@@ -31,7 +31,7 @@ SUITES = {
     "held_out": "held-out maps", "trained": "training maps", "held_out_together": "held-out maps, starts together"
 }  # fmt: skip
 SECTIONS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "targets", "lookahead", "model",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "targets", "lookahead", "model",
     "collector", "algorithm", "action", "tuning", "num_envs", "num_robots", "device", "total_frames",
     "checkpoint_every", "checkpoint_keep", "num_threads",
 )  # fmt: skip

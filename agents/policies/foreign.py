@@ -66,7 +66,7 @@ class TeamSight:
     def __init__(self, env: ExplorationEnv):
         self.env, sim = env, env.simulation
         grids, cells = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
-        limited = env.comm_config.limited
+        limited = env.settings.limited
         self.rows = env.num_robots if limited else 1
         kind = "known" if limited else "viewers"
         map_id, free, boundary = (

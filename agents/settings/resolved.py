@@ -15,6 +15,7 @@ from maexp.agents.settings.schema import CommonSettings, LearnerSettings, Scenar
 from maexp.envs.config import (
     BODY,
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
@@ -23,6 +24,7 @@ from maexp.envs.config import (
     RobotConfig,
     TargetsConfig,
     check_comm,
+    check_faults,
     check_lookahead,
     check_reward,
     check_targets,
@@ -78,6 +80,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         settings["reward"] = asdict(check_reward(RewardConfig(**given(cfg.reward))))
         settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
         settings["comm"] = asdict(check_comm(CommConfig(**given(cfg.comm))))
+        settings["faults"] = asdict(check_faults(FaultsConfig(**given(cfg.faults))))
         settings["targets"] = asdict(check_targets(TargetsConfig(**given(cfg.targets))))
         settings["lookahead"] = asdict(check_lookahead(LookaheadConfig(**given(cfg.lookahead))))
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings

@@ -21,6 +21,7 @@ from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.model import ModelConfig
 from maexp.envs.config import (
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
     PlannerConfig,
@@ -84,6 +85,7 @@ PlannerSettings = optional_settings(PlannerConfig)
 RewardSettings = optional_settings(RewardConfig)
 ObservationSettings = optional_settings(ObservationConfig)
 CommSettings = optional_settings(CommConfig)
+FaultsSettings = optional_settings(FaultsConfig)
 TargetsSettings = optional_settings(TargetsConfig)
 LookaheadSettings = optional_settings(LookaheadConfig)
 AlgorithmSettings = optional_settings(
@@ -166,6 +168,7 @@ class CommonSettings:
     reward: RewardSettings = field(default_factory=RewardSettings)
     observation: ObservationSettings = field(default_factory=ObservationSettings)
     comm: CommSettings = field(default_factory=CommSettings)
+    faults: FaultsSettings = field(default_factory=FaultsSettings)
     targets: TargetsSettings = field(default_factory=TargetsSettings)
     lookahead: LookaheadSettings = field(default_factory=LookaheadSettings)
     num_envs: int = setting(32, "teams simulated at once")
