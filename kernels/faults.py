@@ -32,7 +32,8 @@ def _fail_robots(
     fault_probability: float,
     fault_steps: int,
     episode_steps: int,
-    fault_at: wp.array(dtype=wp.int32),  # [robot], -1: at no given moment
+    # In:
+    fault_at: wp.array(dtype=wp.int32),  # [robot]
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     seed: wp.array(dtype=wp.int32),  # [1]
