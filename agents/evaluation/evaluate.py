@@ -70,8 +70,9 @@ class EvaluationResult:
         return self._summarise(self.episodes, self.copies())
 
     def minus(self, other: "EvaluationResult") -> dict[str, dict]:
-        """The same of the paired differences to another result on the same episodes."""
-        apart = {name: values - other.episodes[name] for name, values in self.episodes.items()}
+        """The same of the paired differences to another result on the same episodes, of the metrics that both have."""
+        both = [name for name in self.episodes if name in other.episodes]
+        apart = {name: self.episodes[name] - other.episodes[name] for name in both}
         return self._summarise(apart, self.copies(other))
 
     def _summarise(self, values: dict[str, np.ndarray], copies: np.ndarray) -> dict[str, dict]:

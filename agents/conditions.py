@@ -1,0 +1,220 @@
+"""`python -m maexp.agents.conditions out=FOLDER`: what radios and failures cost, as one table (docs/conditions.md).
+
+Every condition is an evaluation of its own (`maexp evaluate`) below `out`, of the same episodes. A command that was
+stopped goes on where it was when it is given again; more conditions, scenarios or teams may join.
+"""
+
+import json
+import sys
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from maexp.agents import cli
+from maexp.agents.errors import UserError
+from maexp.agents.evaluation.baseline import load_baseline
+from maexp.agents.evaluation.begun import is_begun
+from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.evidence import brackets
+from maexp.agents.files import write_json, write_text
+from maexp.agents.locking import lock
+from maexp.agents.settings.overrides import quote
+from maexp.agents.settings.ranges import check_ranges, whole
+
+IR2 = ("comm=ir2",)
+BASE = (*IR2, "comm.base_station=true")
+CONDITIONS = {
+    "perfect": (),
+    "range": ("comm.range=8", "comm.line_of_sight=true"),
+    "signal": ("comm=signal",),
+    "ir2": IR2,
+    "ir2_noise": (*IR2, "comm.noise=13"),
+    "faults": ("faults.probability=0.5",),
+    "base": BASE,
+    "base_return": (*BASE, "comm.strategy=return_to_base"),
+    "base_rendezvous": (*BASE, "comm.strategy=rendezvous"),
+    "base_relay": (*BASE, "comm.strategy=relay"),
+    "base_pursuit": (*BASE, "comm.strategy=pursuit"),
+    "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5"),
+}
+"""Name -> words of `maexp evaluate`; the others are compared with the first."""
+METRICS = {
+    "coverage_auc": ("over time", 100.0, 1),
+    "base_coverage_auc": ("base over time", 100.0, 1),
+    "worst_coverage_auc": ("worst over time", 100.0, 1),
+    "coverage_step_95_censored": ("steps to 95 %", 1.0, 0),
+    "told_step_95_censored": ("steps to all know 95 %", 1.0, 0),
+    "mutual_overlap_85": ("overlap [%]", 100.0, 0),
+    "connected": ("connected [%]", 100.0, 0),
+    "collisions": ("lost", 1.0, 2),
+}
+"""Metric -> column, factor and digits."""
+PLAN, TABLE, FORMAT = "conditions.json", "conditions.md", "maexp-conditions-1"
+
+
+@dataclass(frozen=True)
+class ConditionsConfig:
+    """What is played.
+
+    Attributes:
+        out: folder for the evaluations and the table.
+        conditions: some of `CONDITIONS`; the first of these joins them by itself.
+        scenarios: whose held-out maps are played.
+        teams: sizes.
+        policies: as `maexp evaluate policy=` takes them.
+        episodes: of each condition, scenario, size and policy.
+        num_envs: teams at once.
+        seed: of maps, starts and everything else.
+    """
+
+    out: str = "conditions"
+    conditions: list[str] = field(default_factory=lambda: list(CONDITIONS))
+    scenarios: list[str] = field(default_factory=lambda: ["indoor_medium", "indoor_large", "maze"])
+    teams: list[int] = field(default_factory=lambda: [3, 5])
+    policies: list[str] = field(default_factory=lambda: ["cost_utility", "hungarian", "universal"])
+    episodes: int = whole(64)
+    num_envs: int = whole(32)
+    seed: int = whole(0, least=0)
+
+
+KEPT = ("policies", "episodes", "num_envs", "seed")  # of a folder: the rest may grow
+
+
+def play(config: ConditionsConfig, scenario: str, team: int, condition: str) -> None:
+    """One evaluation, unless it is done; one that was stopped goes on.
+
+    Raises:
+        UserError: it came to no end; its own message has been printed.
+    """
+    where = place(config, scenario, team, condition)
+    if (where / "results.json").is_file() and not is_begun(where):
+        return
+    words = [f"resume={quote(str(where))}"]
+    if not is_begun(where):
+        words = [
+            f"policy=[{','.join(config.policies)}]", f"scenario={scenario}", f"num_robots={team}",
+            f"episodes={config.episodes}", f"num_envs={config.num_envs}", f"seed={config.seed}", "num_threads=1",
+            f"hydra.run.dir={quote(str(where))}", *CONDITIONS[condition],
+        ]  # fmt: skip
+    print(f"{scenario}, {team} robots: {condition}", flush=True)
+    if cli.main(["evaluate", *words]):
+        raise UserError(f"{scenario} with {team} robots stopped at {condition}. The same command goes on there.")
+
+
+def place(config: ConditionsConfig, scenario: str, team: int, condition: str) -> Path:
+    """Folder of an evaluation."""
+    return Path(config.out).absolute() / scenario / f"robots_{team}" / condition
+
+
+def write_table(config: ConditionsConfig) -> None:
+    """`TABLE`: means of every condition and policy, and how far coverage over time is from that of the first."""
+    parts = []
+    for scenario in config.scenarios:
+        for team in config.teams:
+            found = {name: read(config, scenario, team, name) for name in config.conditions}
+            parts.append(table(f"{scenario}, {team} robots", {name: one for name, one in found.items() if one}))
+    write_text(Path(config.out) / TABLE, "\n\n".join(parts) + "\n")
+
+
+def read(config: ConditionsConfig, scenario: str, team: int, condition: str) -> dict[str, EvaluationResult]:
+    """policy -> its episodes; nothing where they are not done."""
+    where = place(config, scenario, team, condition)
+    if not (where / "results.json").is_file():
+        return {}
+    return {policy: one for (policy, _), one in load_baseline(str(where)).results.items()}
+
+
+def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
+    """Markdown; `found`: condition -> policy -> its episodes, the first condition first."""
+    shown = [name for name in METRICS if any(name in one.episodes for row in found.values() for one in row.values())]
+    heads = ["condition", "policy", "to the first [points]", *(METRICS[name][0] for name in shown)]
+    lines = [f"**{title}**", "", _row(heads), _row(["---"] * len(heads))]
+    first = next(iter(found.values()), {})
+    for condition, row in found.items():
+        for policy, one in row.items():
+            apart = "" if row is first else _difference(one.minus(first[policy])["coverage_auc"])
+            summary = one.summary()
+            lines.append(_row([condition, f"`{policy}`", apart, *(_mean(name, summary) for name in shown)]))
+    return "\n".join(lines)
+
+
+def _row(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _difference(one: dict) -> str:
+    return f"{100.0 * one['mean']:+.1f}" + brackets(one, lambda end: f"{100.0 * end:+.1f}")
+
+
+def _mean(name: str, summary: dict[str, dict]) -> str:
+    _, factor, digits = METRICS[name]
+    return f"{factor * summary[name]['mean']:.{digits}f}" if name in summary and summary[name]["n"] else ""
+
+
+def read_config(words: list[str]) -> ConditionsConfig:
+    """The settings given as `name=value`.
+
+    Raises:
+        UserError: a name or value that is none.
+    """
+    try:
+        given = OmegaConf.merge(OmegaConf.structured(ConditionsConfig), OmegaConf.from_dotlist(words))
+        values = OmegaConf.to_container(given)
+        if wrong := [name for name in values["conditions"] if name not in CONDITIONS]:
+            raise ValueError(f"conditions={wrong[0]} is unknown: choose among {', '.join(CONDITIONS)}.")
+        for name in ("scenarios", "teams", "policies"):
+            if not values[name]:
+                raise ValueError(f"{name}=[] is empty: name at least one.")
+        chosen = {next(iter(CONDITIONS)), *values["conditions"]}
+        values["conditions"] = [name for name in CONDITIONS if name in chosen]
+        config = ConditionsConfig(**values)
+        check_ranges(config, "conditions")
+    except (OmegaConfBaseException, ValueError) as error:
+        raise UserError(" ".join(str(error).split())) from error
+    return config
+
+
+def keep_plan(config: ConditionsConfig) -> None:
+    """Write down what the folder's evaluations have in common, or see that it is still the same.
+
+    Raises:
+        UserError: it is not.
+    """
+    wanted = {"format": FORMAT} | {one.name: getattr(config, one.name) for one in fields(config) if one.name in KEPT}
+    path = Path(config.out) / PLAN
+    if not path.exists():
+        write_json(path, wanted)
+        return
+    try:
+        there = json.loads(path.read_text())
+    except ValueError:
+        there = {}
+    for name, value in wanted.items():
+        if there.get(name) != value:
+            was = f"was played with {name}={there.get(name)}, not {value}"
+            raise UserError(f"out={config.out} {was}: take another folder.")
+
+
+def main(words: list[str]) -> int:
+    """The command; see the head of this file."""
+    try:
+        config = read_config(words)
+        Path(config.out).mkdir(parents=True, exist_ok=True)
+        with lock(Path(config.out), "conditions"):
+            keep_plan(config)
+            for scenario in config.scenarios:
+                for team in config.teams:
+                    for condition in config.conditions:
+                        play(config, scenario, team, condition)
+                        write_table(config)
+    except UserError as error:
+        print(f"conditions: {error}", file=sys.stderr)
+        return 2
+    print(Path(config.out, TABLE).read_text())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
