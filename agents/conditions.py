@@ -1,7 +1,7 @@
 """`python -m maexp.agents.conditions out=FOLDER`: what radios and failures cost, as one table (docs/conditions.md).
 
 Every condition is an evaluation of its own (`maexp evaluate`) below `out`, of the same episodes. A command that was
-stopped goes on where it was when it is given again; more conditions, scenarios or teams may join.
+stopped goes on where it was when it is given again; more conditions, scenarios, teams or policies may join.
 """
 
 import json
@@ -63,7 +63,7 @@ class ConditionsConfig:
         conditions: some of `CONDITIONS`; the first of these joins them by itself.
         scenarios: whose held-out maps are played.
         teams: sizes.
-        policies: as `maexp evaluate policy=` takes them.
+        policies: each as `maexp evaluate policy=` takes it.
         episodes: of each condition, scenario, size and policy.
         num_envs: teams at once.
         seed: of maps, starts and everything else.
@@ -79,33 +79,33 @@ class ConditionsConfig:
     seed: int = whole(0, least=0)
 
 
-KEPT = ("policies", "episodes", "num_envs", "seed")  # of a folder: the rest may grow
+KEPT = ("episodes", "num_envs", "seed")  # of a folder: the rest may grow
 
 
-def play(config: ConditionsConfig, scenario: str, team: int, condition: str) -> None:
+def play(config: ConditionsConfig, scenario: str, team: int, condition: str, policy: str) -> None:
     """One evaluation, unless it is done; one that was stopped goes on.
 
     Raises:
         UserError: it came to no end; its own message has been printed.
     """
-    where = place(config, scenario, team, condition)
+    where = place(config, scenario, team, condition, policy)
     if (where / "results.json").is_file() and not is_begun(where):
         return
     words = [f"resume={quote(str(where))}"]
     if not is_begun(where):
         words = [
-            f"policy=[{','.join(config.policies)}]", f"scenario={scenario}", f"num_robots={team}",
+            f"policy={policy}", f"scenario={scenario}", f"num_robots={team}",
             f"episodes={config.episodes}", f"num_envs={config.num_envs}", f"seed={config.seed}", "num_threads=1",
             f"hydra.run.dir={quote(str(where))}", *CONDITIONS[condition],
         ]  # fmt: skip
-    print(f"{scenario}, {team} robots: {condition}", flush=True)
+    print(f"{scenario}, {team} robots: {condition}, {policy}", flush=True)
     if cli.main(["evaluate", *words]):
-        raise UserError(f"{scenario} with {team} robots stopped at {condition}. The same command goes on there.")
+        raise UserError(f"{scenario} with {team} robots stopped at {condition}, {policy}. The same command goes on there.")
 
 
-def place(config: ConditionsConfig, scenario: str, team: int, condition: str) -> Path:
+def place(config: ConditionsConfig, scenario: str, team: int, condition: str, policy: str) -> Path:
     """Folder of an evaluation."""
-    return Path(config.out).absolute() / scenario / f"robots_{team}" / condition
+    return Path(config.out).absolute() / scenario / f"robots_{team}" / condition / Path(policy).name
 
 
 def write_table(config: ConditionsConfig) -> None:
@@ -119,11 +119,10 @@ def write_table(config: ConditionsConfig) -> None:
 
 
 def read(config: ConditionsConfig, scenario: str, team: int, condition: str) -> dict[str, EvaluationResult]:
-    """policy -> its episodes; nothing where they are not done."""
-    where = place(config, scenario, team, condition)
-    if not (where / "results.json").is_file():
-        return {}
-    return {policy: one for (policy, _), one in load_baseline(str(where)).results.items()}
+    """policy -> its episodes, of those that are done."""
+    folders = {policy: place(config, scenario, team, condition, policy) for policy in config.policies}
+    done = {policy: where for policy, where in folders.items() if (where / "results.json").is_file()}
+    return {policy: next(iter(load_baseline(str(where)).results.values())) for policy, where in done.items()}
 
 
 def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
@@ -134,7 +133,7 @@ def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
     first = next(iter(found.values()), {})
     for condition, row in found.items():
         for policy, one in row.items():
-            apart = "" if row is first else _difference(one.minus(first[policy])["coverage_auc"])
+            apart = "" if row is first or policy not in first else _difference(one.minus(first[policy])["coverage_auc"])
             summary = one.summary()
             lines.append(_row([condition, f"`{policy}`", apart, *(_mean(name, summary) for name in shown)]))
     return "\n".join(lines)
@@ -207,8 +206,9 @@ def main(words: list[str]) -> int:
             for scenario in config.scenarios:
                 for team in config.teams:
                     for condition in config.conditions:
-                        play(config, scenario, team, condition)
-                        write_table(config)
+                        for policy in config.policies:
+                            play(config, scenario, team, condition, policy)
+                            write_table(config)
     except UserError as error:
         print(f"conditions: {error}", file=sys.stderr)
         return 2

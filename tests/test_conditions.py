@@ -1,0 +1,53 @@
+"""`python -m maexp.agents.conditions`: a table of conditions that goes on where it was stopped."""
+
+import shutil
+
+import pytest
+
+from maexp.agents import cli, conditions
+from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.resolved import resolve
+
+WORDS = ["scenarios=[maze_small]", "teams=[2]", "policies=[cost_utility]", "episodes=2", "num_envs=2",
+         "conditions=[base_return]"]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", conditions.CONDITIONS.values(), ids=list(conditions.CONDITIONS))
+def test_conditions_are_settings(words):
+    resolve(compose_config("evaluate", ["policy=cost_utility", *words]))
+
+
+def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):
+    words = [f"out={tmp_path}/it", *WORDS]
+    assert conditions.main(words) == 0
+    text = (tmp_path / "it" / "conditions.md").read_text()
+    rows = [line.split(" | ") for line in text.splitlines() if "`cost_utility`" in line]
+    assert [row[0] for row in rows] == ["| perfect", "| base_return"]
+    heads = next(line for line in text.splitlines() if line.startswith("| condition")).split(" | ")
+    base = heads.index("base over time")
+    assert rows[0][base] == "" and 5.0 < float(rows[1][base]) < float(rows[1][heads.index("over time")])
+    assert rows[0][2] == "" and rows[1][2].startswith(("+", "-"))
+    played = []
+    monkeypatch.setattr(cli, "main", lambda argv: played.append(argv) or 0)
+    shutil.rmtree(tmp_path / "it" / "maze_small" / "robots_2" / "base_return")
+    assert conditions.main(words) == 0
+    assert len(played) == 1 and "comm.strategy=return_to_base" in played[0], "only what was not there"
+    monkeypatch.setattr(cli, "main", lambda argv: 130)
+    assert conditions.main(words) == 2
+    assert "stopped at base_return, cost_utility. The same command goes on there" in capsys.readouterr().err
+    assert conditions.main([*words, "episodes=4"]) == 2
+    assert "was played with episodes=2, not 4: take another folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("conditions=[fog]", "conditions=fog is unknown: choose among perfect, range"),
+        ("episodes=0", "conditions.episodes=0 must be a whole number"),
+        ("policies=[]", "policies=[] is empty"),
+        ("weather=fog", "weather"),
+    ],
+)
+def test_bad_words_are_named(word, told, tmp_path, capsys):
+    assert conditions.main([f"out={tmp_path}/it", word]) == 2
+    assert told in capsys.readouterr().err

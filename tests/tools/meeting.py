@@ -1,0 +1,67 @@
+"""Two robots that part, meet and merge their maps: `python -m tests.tools.meeting docs/pictures/meeting.png`."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from torchrl.envs.utils import step_mdp
+
+from maexp.agents.evaluation.figures import COLOURS, panels
+from maexp.agents.policies import POLICIES
+from maexp.envs import CommConfig, ExplorationEnv, make_map
+from maexp.envs.files import whole_file
+from maexp.kernels import unpack_flags
+
+MAP, EPISODE = ("indoor_medium", 31), 0
+GREY, BOTH = "#C8C8C8", COLOURS[2]
+
+
+def play(env: ExplorationEnv) -> list[dict]:
+    """What two robots know, and where they are, after every decision."""
+    policy, s, seen = POLICIES["cost_utility"](env), env.simulation.tensors, []
+    td = env.reset()
+    while True:
+        known = unpack_flags(s["known_free"], 2)[0].numpy()
+        seen.append({"known": known, "at": s["center"][0, :, :2].numpy().copy(), "hears": bool(s["comm"][0, 0, 1]),
+                     "seconds": float(s["local_step"][0]) / 10})  # fmt: skip
+        if bool(td["done"].any()):
+            return seen
+        td = step_mdp(env.step(policy(td)), exclude_done=False)
+
+
+def choose(seen: list[dict]) -> list[tuple[str, dict]]:
+    """The moments shown: connected, long parted, the last step before they meet, and the one after."""
+    parted = [k for k, one in enumerate(seen) if not one["hears"]]
+    apart = [np.count_nonzero(one["known"][0] != one["known"][1]) for one in seen]
+    meets = [k for k in parted if k + 1 < len(seen) and seen[k + 1]["hears"]]
+    last = max(meets, key=lambda k: apart[k])
+    begin = max((k for k in range(last) if seen[k]["hears"]), default=0)
+    named = (("together", begin), ("parted", (begin + last + 1) // 2), ("before they meet", last), ("merged", last + 1))
+    return [(f"{what}, {seen[k]['seconds']:.0f} s", seen[k]) for what, k in named]
+
+
+def draw(path: Path) -> None:
+    """Write the picture."""
+    world = make_map(*MAP)
+    env = ExplorationEnv([world], 1, 2, comm=CommConfig(range=6.0, line_of_sight=True), num_threads=1, starts="together")
+    moments = choose(play(env))
+    figure, axes = panels(len(moments), height=3.2)
+    for ax, (title, one) in zip(axes, moments, strict=False):
+        ax.set_title(title, loc="left")
+        ax.plot(*world.boundary[:, :2].T, ".", color="black", markersize=1)
+        known = one["known"][:, : len(world.free)]
+        parts = ((~known[0] & ~known[1], GREY, None), (known[0] & ~known[1], COLOURS[0], "first alone"),
+                 (known[1] & ~known[0], COLOURS[1], "second alone"), (known[0] & known[1], BOTH, "both"))  # fmt: skip
+        for which, colour, label in parts:
+            ax.plot(*world.free[which][:, :2].T, "s", color=colour, markersize=1.2, label=label)
+        for (x, y), colour in zip(one["at"], COLOURS[:2], strict=True):
+            ax.plot(x, y, "o", color=colour, markeredgecolor="black", markersize=9)
+        ax.set_aspect("equal")
+        ax.set_axis_off()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=6, title="known to")
+    with whole_file(path) as file:
+        figure.savefig(file, format="png", dpi=90)
+
+
+if __name__ == "__main__":
+    draw(Path(sys.argv[1]))
