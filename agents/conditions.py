@@ -100,7 +100,8 @@ def play(config: ConditionsConfig, scenario: str, team: int, condition: str, pol
         ]  # fmt: skip
     print(f"{scenario}, {team} robots: {condition}, {policy}", flush=True)
     if cli.main(["evaluate", *words]):
-        raise UserError(f"{scenario} with {team} robots stopped at {condition}, {policy}. The same command goes on there.")
+        where = f"{scenario} with {team} robots stopped at {condition}, {policy}"
+        raise UserError(f"{where}. The same command goes on there.")
 
 
 def place(config: ConditionsConfig, scenario: str, team: int, condition: str, policy: str) -> Path:

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import torch
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.evaluation.figures import COLOURS, panels
@@ -12,8 +13,8 @@ from maexp.envs import CommConfig, ExplorationEnv, make_map
 from maexp.envs.files import whole_file
 from maexp.kernels import unpack_flags
 
-MAP, EPISODE = ("indoor_medium", 31), 0
-GREY, BOTH = "#C8C8C8", COLOURS[2]
+SCENARIO, MAPS, EPISODE = "indoor_medium", range(26, 38), 6
+GREY, BOTH = "#D8D8D8", COLOURS[2]
 
 
 def play(env: ExplorationEnv) -> list[dict]:
@@ -30,35 +31,39 @@ def play(env: ExplorationEnv) -> list[dict]:
 
 
 def choose(seen: list[dict]) -> list[tuple[str, dict]]:
-    """The moments shown: connected, long parted, the last step before they meet, and the one after."""
+    """The moments shown: parted, the last decision before they meet, and the one after."""
     parted = [k for k, one in enumerate(seen) if not one["hears"]]
     apart = [np.count_nonzero(one["known"][0] != one["known"][1]) for one in seen]
     meets = [k for k in parted if k + 1 < len(seen) and seen[k + 1]["hears"]]
     last = max(meets, key=lambda k: apart[k])
     begin = max((k for k in range(last) if seen[k]["hears"]), default=0)
-    named = (("together", begin), ("parted", (begin + last + 1) // 2), ("before they meet", last), ("merged", last + 1))
+    named = (("parted", (begin + last) // 2), ("before they meet", last), ("merged", last + 1))
     return [(f"{what}, {seen[k]['seconds']:.0f} s", seen[k]) for what, k in named]
 
 
 def draw(path: Path) -> None:
     """Write the picture."""
-    world = make_map(*MAP)
-    env = ExplorationEnv([world], 1, 2, comm=CommConfig(range=6.0, line_of_sight=True), num_threads=1, starts="together")
+    maps, comm = [make_map(SCENARIO, k) for k in MAPS], CommConfig(range=4.0, line_of_sight=True)
+    env = ExplorationEnv(maps, 1, 2, comm=comm, num_threads=1, starts="together")
+    env.set_episodes(torch.tensor([EPISODE]))
     moments = choose(play(env))
+    tensors, m = env.simulation.map_tensors, int(env.simulation.tensors["map_id"])
+    free = tensors["free"][tensors["free_begin"][m] : tensors["free_begin"][m + 1], :2].numpy()  # in the kernels' order
     figure, axes = panels(len(moments), height=3.2)
     for ax, (title, one) in zip(axes, moments, strict=False):
         ax.set_title(title, loc="left")
-        ax.plot(*world.boundary[:, :2].T, ".", color="black", markersize=1)
-        known = one["known"][:, : len(world.free)]
+        ax.plot(*maps[m].boundary[:, :2].T, ".", color="black", markersize=1)
+        known = one["known"][:, : len(free)]
         parts = ((~known[0] & ~known[1], GREY, None), (known[0] & ~known[1], COLOURS[0], "first alone"),
                  (known[1] & ~known[0], COLOURS[1], "second alone"), (known[0] & known[1], BOTH, "both"))  # fmt: skip
         for which, colour, label in parts:
-            ax.plot(*world.free[which][:, :2].T, "s", color=colour, markersize=1.2, label=label)
+            ax.plot(*free[which].T, "s", color=colour, markersize=2.2, label=label)
         for (x, y), colour in zip(one["at"], COLOURS[:2], strict=True):
             ax.plot(x, y, "o", color=colour, markeredgecolor="black", markersize=9)
         ax.set_aspect("equal")
         ax.set_axis_off()
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=6, title="known to")
+    shown = axes[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=3, markerscale=4, title="known to")
     with whole_file(path) as file:
         figure.savefig(file, format="png", dpi=90)
 
