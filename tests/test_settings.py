@@ -54,6 +54,13 @@ def test_nothing_is_null(scenario, planner):
     assert ("planner.replan_steps" in settings) == (planner == "wavefront")
 
 
+def test_places_and_moments_of_a_run_are_played():
+    """They are pairs in the env, lists in files."""
+    words = ["comm.base_station=[3,4]", "faults.at=[[0,30],[1,2.5]]"]
+    there = {"comm.base_station": [3.0, 4.0], "faults.at": [[0, 30.0], [1, 2.5]]}
+    assert there.items() <= play(save(*words)).items()
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_algorithm_shows_its_own_settings_and_no_others(algorithm):
     cfg = compose_config("train", [f"algorithm={algorithm}", "algorithm.lr=0.5", "model=paper"])

@@ -187,8 +187,13 @@ def _follows(cfg: DictConfig, group: str, name: str) -> bool:
 
 
 def _without_null(node: dict) -> dict:
-    clean = {name: _without_null(value) if isinstance(value, dict) else value for name, value in node.items()}
+    clean = {name: _without_null(value) if isinstance(value, dict) else _listed(value) for name, value in node.items()}
     return {name: value for name, value in clean.items() if value is not None and value != {}}
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists: YAML has no others."""
+    return [_listed(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def flatten(node: dict, prefix: str = "") -> dict[str, Any]:
