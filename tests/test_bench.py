@@ -14,6 +14,8 @@ from maexp.agents.speed.scale import large_maze
 from maexp.agents.speed.shared import spread, sweep_points
 from maexp.envs import ExplorationEnv, make_map
 
+pytestmark = pytest.mark.slow  # measurements of speed
+
 TINY = ["scenario=maze_small", "scenario.maps=[0]", "num_envs=2", "seconds=0.02"]
 
 

@@ -1,7 +1,10 @@
 """The radar's kernels beside a dense PyTorch version of the same filter: the same verdicts, and a ratio of times."""
 
+import pytest
 import torch
 from dense_radar import Scene, measure_ratio
+
+pytestmark = pytest.mark.slow  # measurements of speed
 
 RECORDED_RATIO = 210
 """Dense over kernels, processor time of one thread. To record it anew: `python tests/dense_radar.py`."""

@@ -26,6 +26,8 @@ from maexp.agents.errors import UserError
 from maexp.agents.locking import lock
 from maexp.agents.training.logs import read_metrics
 
+pytestmark = pytest.mark.slow  # trainings
+
 # Cells
 
 

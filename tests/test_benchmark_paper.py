@@ -8,6 +8,8 @@ import pytest
 
 from maexp.agents.benchmark.paper_results import COLUMNS, PAPER
 
+pytestmark = pytest.mark.slow  # trainings
+
 
 def paper_tex() -> str:
     default = Path(__file__).resolve().parents[2] / "shared" / "paper" / "maexp.tex"

@@ -13,6 +13,8 @@ from maexp.agents.commands.benchmark import prepare
 from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 
+pytestmark = pytest.mark.slow  # trainings
+
 WORDS = [
     "preset=smoke", "scenarios=maze_small,random_obstacles", "policies=cost_utility",
     "algorithms=mappo", "seeds=0", "episodes=2", "num_envs=4", "num_robots=2", "scenario.local_steps=3",

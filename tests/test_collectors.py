@@ -25,6 +25,8 @@ from maexp.agents.training.train import make_both
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.metrics import episode_metrics
 
+pytestmark = pytest.mark.slow  # processes, Ray
+
 ROBOTS, STEPS = 2, 5
 
 

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from test_docs import blocks, run_block
 
+pytestmark = pytest.mark.slow  # other libraries train
+
 PAGE = "docs/adapters.md"
 MISSING = "THE EXTRA maexp[sb3] IS NOT INSTALLED: Stable-Baselines3 on targets is not tested"
 

@@ -19,6 +19,8 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.compose import compose_config
 from maexp.envs import ExplorationEnv, make_map
 
+pytestmark = pytest.mark.slow  # evaluations that are stopped
+
 TINY = ["scenario.held_out=[70,71]", "scenario.macro_steps=3", "scenario.local_steps=10", "num_envs=3", "episodes=8",
         "device=cpu"]  # fmt: skip
 PLAYERS = "policy=random,cost_utility,universal"

@@ -19,6 +19,8 @@ from maexp.agents.training.branching import BranchingActor
 from maexp.envs import ExplorationEnv, ObservationConfig
 from maexp.envs.features import FEATURES
 
+pytestmark = pytest.mark.slow  # trainings
+
 WORDS = ("algorithm=expert_iteration", "action=targets", "algorithm.branch_horizon=1", "algorithm.candidates=3")
 ROW = TRAININGS["expert_iteration"]
 

@@ -28,6 +28,8 @@ from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import ExplorationEnv, MapError, PointCloudMap, make_map
 
+pytestmark = pytest.mark.slow  # full disks, files that cannot be read
+
 CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
 RUN = [

@@ -11,6 +11,8 @@ from maexp.agents.policies.foreign import ForeignPolicy, TeamSight, as_policy, r
 from maexp.envs import CommConfig, RobotConfig, make_map
 from maexp.envs.navigation import Navigation
 
+pytestmark = pytest.mark.slow  # processes
+
 
 def drive(env, steps: int) -> None:
     """A planner's first decisions."""

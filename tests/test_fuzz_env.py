@@ -32,6 +32,8 @@ from maexp.envs import (
     make_map,
 )
 
+pytestmark = pytest.mark.slow  # fuzzing
+
 REWARDS = [
     RewardConfig(overlap=0.01, charge_rest=True),
     RewardConfig(overlap=0.0, charge_rest=True, time_on="covered"),

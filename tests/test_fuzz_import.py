@@ -25,6 +25,8 @@ from test_import_clouds import scan_room, terrain, turn, write_pcd, write_ply, w
 
 from maexp.envs import MapError, import_map, make_map
 
+pytestmark = pytest.mark.slow  # fuzzing
+
 LONG = settings.get_current_profile_name() == "long"
 SECONDS = 60.0 * float(os.environ.get("MAEXP_FUZZ_MINUTES", 30))
 QUIET = settings(

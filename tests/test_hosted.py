@@ -28,6 +28,8 @@ from maexp.agents.suites.players import Player
 from maexp.envs import ObservationConfig, make_map
 from maexp.envs.navigation import Navigation
 
+pytestmark = pytest.mark.slow  # processes
+
 TESTS = Path(__file__).resolve().parent
 EXAMPLES = TESTS.parent / "docs" / "examples" / "policies"
 ENVS, STEPS = 4, 5

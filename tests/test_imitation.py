@@ -20,6 +20,8 @@ from maexp.agents.training.checkpoint import find_checkpoint, load_checkpoint
 from maexp.agents.training.imitation import imitate, negative_log_likelihood
 from maexp.agents.training.logs import read_metrics
 
+pytestmark = pytest.mark.slow  # trainings
+
 SMALL = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 WARM = [*TINY, "planner=wavefront", "warm_start=nearest_frontier", "warm_start_frames=12", "checkpoint_keep=9"]
 

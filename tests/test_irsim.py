@@ -20,6 +20,8 @@ from maexp.agents.irsim.people import Walkers
 from maexp.agents.irsim.simulator import Scan
 from maexp.agents.policies import POLICIES
 
+pytestmark = pytest.mark.slow  # another simulator
+
 ABSENT = "THE EXTRA maexp[irsim] IS NOT INSTALLED: no trial is run"
 ANGLES = np.linspace(-math.pi, math.pi, 180, endpoint=False)
 NOBODY = np.empty((0, 2))

@@ -26,6 +26,7 @@ def test_the_stages_of_the_step_are_found():
     assert stages <= {name.rsplit(".", 1)[1] for name in kernel_modules()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arch", [80, 90])
 def test_compiles_for_cuda_without_a_gpu(arch, tmp_path):
     for name in kernel_modules():

@@ -26,6 +26,7 @@ def played() -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_threads_run_in_another_order(played):
     """The patch of Warp's loop works: each order has another last thread."""
     last = played["last_thread"]

@@ -18,6 +18,8 @@ from maexp.agents.suites.rows import NOTHING, UNSEEN, WALL
 from maexp.agents.suites.suite import load_suite
 from maexp.envs import make_map
 
+pytestmark = pytest.mark.slow  # whole runs of suites
+
 PLAYED = ("nearest_frontier", "random")
 
 

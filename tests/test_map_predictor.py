@@ -35,6 +35,8 @@ from maexp.agents.training.predictor_export import Guess, predictor_to_onnx
 from maexp.envs import make_map
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 
+pytestmark = pytest.mark.slow  # trainings
+
 UNKNOWN, FREE, OBSTACLE = 0, 1, 2
 
 

@@ -14,6 +14,8 @@ from maexp.agents.suites.players import Player
 from maexp.agents.training.checkpoint import load_checkpoint
 from maexp.agents.training.named import find_player
 
+pytestmark = pytest.mark.slow  # trainings
+
 TINY = [
     "preset=smoke", "num_envs=2", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0]",
     "scenario.held_out=[70]", "device=cpu", "evaluate_every=0",

@@ -7,8 +7,10 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from conftest import pytest_configure
 from lonely import PLAN_WITH_A_POLICY, share_packages
 from packaging.requirements import Requirement
 
@@ -109,3 +111,16 @@ def test_the_wheel_plans_with_a_policy_that_ships_where_torch_is_not(wheel, tmp_
     (site / "shared.pth").write_text(f"{tmp_path / 'shared'}\n")
     done = subprocess.run([python, "-c", PLAN_WITH_A_POLICY], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0 and done.stdout.startswith(str(site)), done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [((), "not slow"), (("-x",), "not slow"), (("-m", ""), ""), (("-m", "slow"), ""), (("tests/test_map.py",), "")],
+)
+def test_pytest_alone_is_the_quick_set(words, wanted):
+    """What is asked for by a file or a mark is left as it is."""
+    sources = pytest.Config.ArgsSource
+    source = sources.ARGS if any(word.startswith("tests") for word in words) else sources.TESTPATHS
+    option, given = SimpleNamespace(markexpr=""), SimpleNamespace(args=words)
+    pytest_configure(SimpleNamespace(args_source=source, invocation_params=given, option=option))
+    assert option.markexpr == wanted

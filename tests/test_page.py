@@ -17,6 +17,8 @@ from maexp.envs.viewing.scene import Stage
 pytest.importorskip("viser", reason="THE EXTRA maexp[view] IS NOT INSTALLED: the page is not tested")
 from maexp.envs.viewing.page import TEAM, Page, _paint, write_page
 
+pytestmark = pytest.mark.slow  # a browser's page
+
 
 @pytest.fixture(scope="module")
 def episodes() -> list:

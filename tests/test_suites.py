@@ -22,6 +22,8 @@ from maexp.agents.suites.suite import load_suite, suite_names
 from maexp.agents.suites.verify import verify
 from maexp.envs import ObservationConfig
 
+pytestmark = pytest.mark.slow  # whole runs of suites
+
 
 @pytest.fixture(scope="session")
 def small(tmp_path_factory) -> Path:

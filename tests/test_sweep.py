@@ -19,6 +19,8 @@ from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.logs import MetricsLog, read_metrics
 from maexp.envs import ExplorationEnv, make_map
 
+pytestmark = pytest.mark.slow  # trainings
+
 SMALL = [
     "scenario.maps=[0]", "scenario.validation=[1]", "scenario.held_out=[70]", "num_envs=3", "scenario.macro_steps=2",
     "scenario.local_steps=3", "total_frames=6", "model.channels=4", "episodes=5", "evaluate_episodes=2", "device=cpu",

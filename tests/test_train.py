@@ -21,6 +21,8 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog, read_metrics
 
+pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands
+
 TINY = [
     "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
     "scenario.local_steps=5", "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",

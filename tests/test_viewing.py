@@ -19,6 +19,8 @@ from maexp.envs.viewing.paint import look_at, paint
 from maexp.envs.viewing.quads import make_quads
 from maexp.envs.viewing.scene import GROUND, WALL_SHARE, Stage
 
+pytestmark = pytest.mark.slow  # a browser's page
+
 SIZE = (600, 400)
 
 
