@@ -265,10 +265,10 @@ class TrainingRun:
 
     def keep(self, row: dict[str, float], log: MetricsLog, last: bool) -> None:
         """Save when it is time to, or when the validation is the best so far."""
-        score = row[self.scored_by]
-        best = score > self.best  # false where the score is NaN
-        validated = best and bool(self.cfg.evaluate_every)
-        if last or validated or self.iteration % self.cfg.checkpoint_every == 0:
+        score, due = row[self.scored_by], self.iteration % self.cfg.checkpoint_every == 0
+        validated = bool(self.cfg.evaluate_every)
+        best = (validated or due) and score > self.best  # never where a run happens to stop; false for NaN
+        if last or due or (best and validated):
             log.sync()
             self.best = score if best else self.best
             self.save(best)
