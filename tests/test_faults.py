@@ -78,7 +78,8 @@ def write(what: str, number: int) -> None:
         arrays["maps"] = np.full(3, "a")
         write_result(folder, "held_out", arrays, {
             "random": {"coverage_step_85": {}},
-            "run": {"format": FORMAT, "maps": [], "commit": None, "seconds": 1.0, "numbers": [number] * 20_000},
+            "run": {"format": FORMAT, "maps": [], "commit": None, "seconds": 1.0, "num_robots": 3,
+                    "success_coverage": 0.95, "numbers": [number] * 20_000},
         })  # fmt: skip
     else:
         save_checkpoint(Path("."), state(number), number, keep=2, best=True)
@@ -91,7 +92,7 @@ def read_back(what: str) -> None:
         assert len(json.loads(Path("file.json").read_text())["one"]) == 20_000
     elif what == "cell":
         result = read_result(Path("."), CELL, "held_out")
-        for values in (result.seconds, result.coverage, *result.episodes.values()):
+        for values in (result.times, result.coverage, *result.episodes.values()):
             assert values.shape == (50_000,) and (values == values[0]).all()
         assert len(set(result.run["numbers"])) == 1
     else:

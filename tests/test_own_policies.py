@@ -90,6 +90,7 @@ def module(tmp_path, monkeypatch):
     (tmp_path / "my_robots.py").write_text(MODULE)
     (tmp_path / "broken_robots.py").write_text("import does_not_exist_either\n")
     (tmp_path / "raising_robots.py").write_text("raise ValueError('two\\nlines')\n")
+    sys.modules.pop("my_robots", None)  # of another test
     yield tmp_path
     for name in ("my_robots", "broken_robots", "raising_robots"):
         sys.modules.pop(name, None)

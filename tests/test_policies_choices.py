@@ -46,10 +46,11 @@ def test_goals_under_dwa_are_in_sight_and_in_reach():
 class Places:
     """Stands in for a `Navigation` where a choice needs only the robots' places."""
 
-    radar_range = 10.0
+    radar_range, rows = 10.0, 1  # all hear each other
 
     def __init__(self, at, ways=None):
         self.at, self.ways = torch.tensor(at), ways
+        self.state = {"comm": torch.ones(*self.at.shape[:2], self.at.shape[1], dtype=torch.bool)}
 
     def centers(self):
         return self.at

@@ -7,6 +7,7 @@ import numpy as np
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.evidence import brackets, verdict
+from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
@@ -33,10 +34,12 @@ def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num
 def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
     """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
-        played = {
-            name: [evaluate(POLICIES[name](env), env, count, name=name, seed=seed, advance=progress.advance)]
-            for name in planners
-        }
+        settings = {"seed": seed, "advance": progress.advance}
+
+        def play(name: str) -> EvaluationResult:
+            return evaluate(POLICIES[name](env), env, count, name=name, **settings)
+
+        played = {name: [play_once(name, env, lambda n=name: play(n), count, seed)] for name in planners}
     return played[find_best(played)][0]
 
 
