@@ -65,7 +65,7 @@ def test_conf_algorithm_holds_the_defaults(algorithm):
 def test_conf_reference_holds_the_originals(algorithm):
     row = ALGORITHMS[algorithm]
     tuned = compose_config("train", [f"algorithm={algorithm}", "action=targets", "tuning=reference"])
-    assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_reference/reference_{algorithm}.yaml"
+    assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_tuning/reference_{algorithm}.yaml"
 
 
 def test_conf_model_holds_the_presets():
@@ -155,8 +155,9 @@ def test_without_drops_groups_and_their_values():
 
 
 def test_settings_reach_the_env_and_the_networks():
-    words = ["num_envs=2", "radar.range=7", "robot.max_speed=3", "planner=dwa", "reward.collision=5"]
+    words = ["scenario=maze_small", "num_envs=2", "radar.range=7", "robot.max_speed=3", "planner=dwa"]
     words += ["scenario.macro_steps=4", "scenario.maps=[3]", "model.channels=8", "algorithm.lr=0.5", "comm.range=9"]
+    words += ["reward.collision=5"]
     cfg = compose_config("train", words)
     maps = load_maps(cfg.scenario)
     assert [one.name for one in maps.train] == ["maze_small_3"]
@@ -170,7 +171,8 @@ def test_settings_reach_the_env_and_the_networks():
 
 
 def test_a_team_of_different_robots():
-    cfg = compose_config("train", ["robot.team=[{kind: differential, radar: {range: 3}},{max_speed: 1}]"])
+    team = "robot.team=[{kind: differential, radar: {range: 3}},{max_speed: 1}]"
+    cfg = compose_config("train", ["scenario=maze_small", team])
     robots, radars = team_configs(cfg, 3)
     assert [one.kind for one in robots] == ["differential", "ackermann", "differential"]
     assert [one.range for one in radars] == [3, 10.0, 3]
@@ -179,7 +181,7 @@ def test_a_team_of_different_robots():
 
 
 def indices(*words: str) -> tuple[list[int], list[int], list[int]]:
-    return map_indices(compose_config("train", list(words)).scenario)
+    return map_indices(compose_config("train", ["scenario=maze_small", *words]).scenario)
 
 
 def test_maps_that_choose_are_neither_trained_on_nor_held_out():
@@ -197,9 +199,9 @@ def test_no_validation_maps_as_before_there_were_any():
     """The maps trained on choose, as with maps of one's own."""
     assert indices("scenario.validation=[]") == ([*range(64)], [], [*range(64, 80)])
     suite = load_maps(compose_config("train", ["scenario.validation=[]", "scenario.maps=[1,0]"]).scenario)
-    assert [one.name for one in suite.validation] == ["maze_small_1", "maze_small_0"]
+    assert [one.name for one in suite.validation] == ["indoor_medium_1", "indoor_medium_0"]
     suite = load_maps(compose_config("train", ["scenario.validation=[7]", "scenario.maps=[1,0]"]).scenario)
-    assert [one.name for one in suite.validation] == ["maze_small_7"]
+    assert [one.name for one in suite.validation] == ["indoor_medium_7"]
 
 
 def test_more_held_out_maps_than_the_table_has():

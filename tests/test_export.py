@@ -217,7 +217,8 @@ def test_weights_are_kept_without_pickle(policy, folder):
 
 def test_from_a_run_to_a_plan(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = ("scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]", "scenario.held_out=[1]")
+    small = ("scenario=maze_small", "scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]",
+             "scenario.held_out=[1]")  # fmt: skip
     train = ("total_frames=8", "num_envs=2", "episodes=2", "evaluate_every=0", "classical=[]", "device=cpu",
              "hydra.run.dir=run")  # fmt: skip
     assert main(["train", "action=targets", *small, *train]) == 0

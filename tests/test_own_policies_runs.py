@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow  # trainings
 
 TINY = [
     "preset=smoke", "num_envs=2", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0]",
-    "scenario.held_out=[70]", "device=cpu", "evaluate_every=0",
+    "scenario=maze_small", "scenario.held_out=[70]", "device=cpu", "evaluate_every=0",
 ]  # fmt: skip
 TEACHER = '''
 import torch
@@ -130,7 +130,7 @@ def test_what_stands_beside_a_training_may_be_ones_own(capsys):
     words = [*TINY, "total_frames=6", "episodes=2", "classical=[voronoi,universal,teachers:regions]"]
     assert main(["train", *words, "hydra.run.dir=beside_training"]) == 0
     summary = json.loads(Path("beside_training/summary.json").read_text())
-    assert list(summary)[:5] == ["trained", "random", "voronoi", "universal", "teachers.regions"]
+    assert list(summary)[:6] == ["trained", "untrained", "random", "voronoi", "universal", "teachers.regions"]
     assert summary["voronoi"] == summary["teachers.regions"]
 
 

@@ -65,7 +65,10 @@ def test_every_size_of_a_network_has_its_range(name):
     [
         (["algorithm.lr=nan"], "algorithm.lr=nan must be a finite number above 0."),
         (["algorithm.gamma=2"], "algorithm.gamma=2.0 must be a number from 0 to 1."),
-        (["algorithm.clip_epsilon=-1"], "algorithm.clip_epsilon=-1.0 must be a number above 0 and below 1."),
+        (
+            ["algorithm=mappo", "algorithm.clip_epsilon=-1"],
+            "algorithm.clip_epsilon=-1.0 must be a number above 0 and below 1.",
+        ),
         (["algorithm.minibatch_size=0"], "algorithm.minibatch_size=0 must be a whole number, 1 or more."),
         (["algorithm=vdppo", "algorithm.mixer=sum"], "algorithm.mixer='sum' must be one of qmix, vdn."),
         (["model.channels=0"], "model.channels=0 must be a whole number from 1 to 4096."),

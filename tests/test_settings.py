@@ -81,7 +81,7 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
     learner = make_learner(cfg, env)
-    assert {"name": "mappo"} | asdict(learner.updater.settings) == shown["algorithm"]
+    assert {"name": "expert_iteration"} | asdict(learner.updater.settings) == shown["algorithm"]
 
 
 def test_a_map_of_ones_own_tells_its_scenario_and_the_length_of_an_episode(tmp_path):
@@ -106,8 +106,8 @@ def test_yaml_holds_the_same_values():
     settings |= {"resume": " ".join(["a run"] * 30)}  # more than a line
     written = to_yaml(settings, "train")
     assert OmegaConf.to_container(OmegaConf.create(written)) == settings
-    assert "  range: 10.0  # [m]\n" in written and "  lr: 0.002  # learning rate of the policy\n" in written
-    assert "num_robots: 3  # robots in a team" in written and "  max_speed: 8.0  # [m/s]\n" in written
+    assert "  range: 1.0  # [m]\n" in written and "  lr: 0.002  # learning rate\n" in written
+    assert "num_robots: 3  # robots in a team" in written and "  max_speed: 0.6  # [m/s]\n" in written
 
 
 # A checkpoint and new words
@@ -158,7 +158,7 @@ def test_a_group_chosen_anew_is_todays():
 def test_what_a_scenario_supplies_can_be_set_there():
     saved = save(radar__range=99.0)
     assert play(saved, "scenario.max_speed=3", "scenario.radar_range=5").items() >= {
-        "robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 1.5}.items()  # fmt: skip
+        "robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 0.15}.items()  # fmt: skip
 
 
 def test_the_wheelbase_follows_the_body():
@@ -210,7 +210,7 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     assert main(["train", *words, "total_frames=6", "hydra.run.dir=run"]) == 0
     path, saved = find_checkpoint("run")
     written = OmegaConf.to_container(OmegaConf.load("run/config.yaml"))
-    maps = [make_map("maze_small", index) for index in (0, 64)]
+    maps = [make_map("indoor_medium", index) for index in (0, 64)]
     assert written.pop("map_checksums") == saved["maps"] == checksums(maps)
     assert saved["settings"] == written
     assert "null" not in Path("run/config.yaml").read_text()
@@ -221,10 +221,10 @@ def test_run_evaluate_resume(tmp_path, monkeypatch, capsys):
     assert "changed" not in capsys.readouterr().err
     played = OmegaConf.load("played/config.yaml")
     assert (played.reward.explore, played.robot.max_speed, played.scenario.macro_steps) == (0.0, 1.0, 3)
-    torch.save(saved | {"maps": saved["maps"] | {"maze_small_0": "0123"}}, path)  # as if it had been another then
+    torch.save(saved | {"maps": saved["maps"] | {"indoor_medium_0": "0123"}}, path)  # as if it had been another then
     assert main(["train", "resume=run", "total_frames=12"]) == 2
     told = capsys.readouterr().err.splitlines()[-1]
-    assert "maze_small_0 has changed since the run was started, so that it cannot go on" in told
+    assert "indoor_medium_0 has changed since the run was started, so that it cannot go on" in told
     anew = shlex.split(told.partition("has learned: ")[2])
     assert anew[-1] == "warm_start=run" and main([*anew[1:], "hydra.run.dir=anew", "warm_start_frames=12"]) == 0
     torch.save(saved, path)

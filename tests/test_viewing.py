@@ -246,7 +246,8 @@ def test_view_plays_a_policy_on_the_map_that_is_given(tmp_path, capsys, monkeypa
 def test_view_of_a_run_plays_its_policy(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny = ["scenario.maps=[0]", "scenario.held_out=[70]", "num_envs=2", "scenario.macro_steps=2", "num_robots=2"]
-    words = ["collector.steps=2", "total_frames=4", "episodes=0", "evaluate_every=0", "hydra.run.dir=run"]
+    words = ["scenario=maze_small", "collector.steps=2", "total_frames=4", "episodes=0", "evaluate_every=0"]
+    words += ["checkpoint_every=1", "hydra.run.dir=run"]
     assert main(["train", *tiny, *words]) == 0
     printed = view(capsys, "run", "hydra.run.dir=v", "size=300")
     assert "maze_small_70, trained, 2 robots" in printed

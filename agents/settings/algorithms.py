@@ -150,6 +150,7 @@ class ExpertSettings(Settings):
         weight_decay: of the weights, as in AdamW
     """
 
+    minibatch_size: int = whole(64)
     candidates: int = whole(5, 2, 24)
     branch_horizon: int = whole(4, 1, 100)
     branch_share: float = number(0.5, 0.01, 1.0)

@@ -54,6 +54,17 @@ def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
     return cfg
 
 
+WITHOUT_BRANCHES = {"action=regions", "tuning=reference", "preset=paper"}
+"""What expert iteration, the default algorithm of these verbs, does not go with."""
+LEARNED = ("train", "evaluate", "export", "view")
+
+
+def _default_algorithm(verb: str, overrides: list[str]) -> list[str]:
+    """Words for another algorithm than the default where that does not fit; a word of the user's still decides."""
+    chosen = any(word.startswith("algorithm=") for word in overrides)
+    return ["algorithm=mappo"] if verb in LEARNED and not chosen and WITHOUT_BRANCHES & {*overrides} else []
+
+
 def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictConfig:
     """The composed settings of a verb, with Hydra's own under `hydra`.
 
@@ -69,7 +80,7 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
     GlobalHydra.instance().clear()
     try:
         with initialize_config_module("maexp.conf", version_base="1.3"):
-            cfg = compose(verb, overrides, return_hydra_config=True)
+            cfg = compose(verb, [*_default_algorithm(verb, overrides), *overrides], return_hydra_config=True)
             missing = sorted(OmegaConf.missing_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])))
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error, verb)) from error

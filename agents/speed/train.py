@@ -15,6 +15,7 @@ from maexp.agents.settings.schema import BenchSettings, TrainSettings
 from maexp.agents.speed.shared import describe_point, print_table, spread, sweep_points, write_report
 from maexp.agents.training.checkpoint import seed_everything
 from maexp.agents.training.collect import Stopwatch, TeamCollector, make_collector
+from maexp.agents.training.train import make_actor
 from maexp.envs import ExplorationEnv
 
 TEAM_SIZES = [3]
@@ -39,7 +40,8 @@ class Trainee:
         env = make_env(cfg, load_maps(cfg.scenario).train, cfg.num_robots)
         check_batch_memory(env, set_steps(cfg, env))
         learner = make_learner(cfg, env)
-        return cls(cfg, env, learner, make_collector(env, learner.policy, cfg.collector.steps))
+        actor = make_actor(cfg, learner.policy, env)
+        return cls(cfg, env, learner, make_collector(env, actor, cfg.collector.steps))
 
     def iterate(self) -> None:
         """Collect a batch and learn from it, as in training."""
