@@ -1,6 +1,7 @@
 """Who did better on the same episodes: differences, the best classical planner, and a plain sentence."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -34,12 +35,11 @@ def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num
 def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
     """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
-        settings = {"seed": seed, "advance": progress.advance}
 
         def play(name: str) -> EvaluationResult:
-            return evaluate(POLICIES[name](env), env, count, name=name, **settings)
+            return evaluate(POLICIES[name](env), env, count, name=name, seed=seed, advance=progress.advance)
 
-        played = {name: [play_once(name, env, lambda n=name: play(n), count, seed)] for name in planners}
+        played = {name: [play_once(name, env, partial(play, name), count, seed)] for name in planners}
     return played[find_best(played)][0]
 
 

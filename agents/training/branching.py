@@ -96,7 +96,6 @@ class BranchPlayer:
         Args:
             features: float32 [E, N, M, F], what the teams see now.
             preference: float32 [E, N, M], as for `TargetView.take`.
-
             among: bool [E], teams that try; None: all.
 
         Returns:
