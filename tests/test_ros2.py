@@ -1,4 +1,4 @@
-"""The ROS 2 package: its messages against the real definitions, its node against stand-ins for rclpy, tf and nav2."""
+"""The ROS 2 package: its messages against the real definitions, its node against stand-ins for rclpy and nav2."""
 
 import ast
 import importlib
@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import yaml
 
-from maexp.agents.runtime import TeamPlanner
+from maexp.agents.runtime import TeamPlanner, frames
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
-from bag_writer import GRID, STORE, grid, transforms
+from bag_writer import GRID, STORE, TF, grid, transforms
 from rosbags.interfaces import Nodetype
 
 PACKAGE = Path(__file__).resolve().parents[1] / "docs" / "ros2" / "maexp_ros"
@@ -72,40 +72,61 @@ def conversion(monkeypatch):
         del sys.modules[name]
 
 
-def test_grids_and_poses(conversion):
+def test_maps_and_poses():
     values = floor()
-    read = conversion.read_grid(passed_on(grid(values, 0.1, (-2.0, 3.0), yaw=0.4)))
+    read = frames.read_map(passed_on(grid(values, 0.1, (-2.0, 3.0), yaw=0.4)))
     assert np.array_equal(read.values, values) and read.resolution == 0.1
     assert read.origin == pytest.approx((-2.0, 3.0, 0.4))
-    stamped = passed_on(transforms([("map", "robot1/base_link", 3.0, (1.0, 2.0, 0.0), -2.5)])).transforms[0]
-    assert conversion.read_pose(stamped.transform) == pytest.approx((1.0, 2.0, -2.5))
-    placed = conversion.place_grid(read, (5.0, 1.0, np.pi / 2))
+    tree = frames.Frames()
+    tree.take(passed_on(transforms([("map", "robot1/base_link", 3.0, (1.0, 2.0, 0.0), -2.5)])))
+    root, pose, time = tree.find("robot1/base_link", {"map"})
+    assert (root, time) == ("map", 3.0) and pose == pytest.approx((1.0, 2.0, -2.5))
+    placed = frames.place_grid(read, (5.0, 1.0, np.pi / 2))
     assert placed.origin == pytest.approx((5.0 - 3.0, 1.0 - 2.0, 0.4 + np.pi / 2))
+    message = grid(values, 0.1)
+    message.data = message.data[:-1]
+    with pytest.raises(ValueError, match="a map of 100 x 60 cells came with 5999 of them"):
+        frames.read_map(message)
 
 
-def test_grids_of_several_robots_are_merged(conversion):
+def test_frames_hang_from_each_other():
+    tree = frames.Frames()
+    tree.take(transforms([("map", "/odom", 9.0, (1.0, 0.0, 0.0), np.pi / 2)]))
+    tree.take(transforms([("odom", "base_footprint", 5.0, (2.0, 0.0, 0.0), 0.0)]))
+    tree.take(transforms([("base_footprint", "base_link", 0.0, (0.0, 0.5, 0.0), 0.0)]), still=True)
+    root, pose, time = tree.find("base_footprint", {"map"})
+    assert pose == pytest.approx((1.0, 2.0, np.pi / 2)) and time == 5.0
+    assert tree.find("base_link", {"map"})[1] == pytest.approx((0.5, 2.0, np.pi / 2))
+    assert tree.find("base_link", {"odom", "map"})[0] == "odom"
+    assert tree.find("base_link", {"world"}) is None and tree.find("map", {"map"})[1] == (0.0, 0.0, 0.0)
+    tree.put("map", "base_link", (0.0, 0.0, 0.0), 0.0)  # a ring
+    assert tree.find("base_link", {"world"}) is None
+
+
+def test_grids_of_several_robots_are_merged():
     values = floor()
     left, right = values.copy(), values.copy()
     left[:, 40:], right[:, :30] = -1, -1
-    part = conversion.Grid(right[:, 30:], 0.1, (3.0, 0.0, 0.0))
-    merged = conversion.merge_grids([conversion.Grid(left, 0.1, (0.0, 0.0, 0.0)), part])
+    part = frames.Grid(right[:, 30:], 0.1, (3.0, 0.0, 0.0))
+    merged = frames.merge_grids([frames.Grid(left, 0.1, (0.0, 0.0, 0.0)), part])
     assert np.array_equal(merged.values, values) and merged.origin == pytest.approx((0.0, 0.0, 0.0))
-    turned = conversion.Grid(np.rot90(values, k=-1).copy(), 0.1, (0.0, 6.0, -np.pi / 2))  # the same seen from its side
-    again = conversion.merge_grids([turned, conversion.Grid(np.full((1, 1), -1, np.int8), 0.1, (0.0, 0.0, 0.0))])
+    turned = frames.Grid(np.rot90(values, k=-1).copy(), 0.1, (0.0, 6.0, -np.pi / 2))  # the same seen from its side
+    again = frames.merge_grids([turned, frames.Grid(np.full((1, 1), -1, np.int8), 0.1, (0.0, 0.0, 0.0))])
     assert np.array_equal(again.values, values)
-    walls = conversion.Grid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
-    over = conversion.merge_grids([conversion.Grid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
+    walls = frames.Grid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
+    over = frames.merge_grids([frames.Grid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
     assert (over[10:12, 10:12] == 100).all() and (over == 100).sum() == (values == 100).sum() + 4
-    assert conversion.merge_grids([walls]) is walls
+    alike = frames.merge_grids([frames.Grid(one, 0.07, (0.03, 0.01, 0.0)) for one in (left, right)])
+    assert np.array_equal(alike.values, values) and alike.origin == (0.03, 0.01, 0.0)
 
 
 def test_goals_and_markers_are_real_messages(conversion):
     way = np.array([[1.0, 1.0], [2.0, 1.0], [2.0, 3.0]])
     pose = blank("geometry_msgs/msg/PoseStamped")
-    conversion.fill_pose(pose.pose, *way[-1], conversion.heading_of(way))
+    frames.fill_pose(pose.pose, *way[-1], frames.heading_of(way))
     got = passed_on(pose).pose
     assert (got.position.x, got.position.y) == (2.0, 3.0)
-    assert conversion.read_yaw(got.orientation) == pytest.approx(np.pi / 2)
+    assert frames.read_yaw(got.orientation) == pytest.approx(np.pi / 2)
     point, array = made("geometry_msgs/msg/Point"), blank("visualization_msgs/msg/MarkerArray")
     array.markers = [blank("visualization_msgs/msg/Marker") for _ in range(3)]
     conversion.fill_way(array.markers[0], point, 1, way)
@@ -118,38 +139,29 @@ def test_goals_and_markers_are_real_messages(conversion):
 
 
 class Moment:
-    """rclpy.time.Time and Duration [s]."""
+    """rclpy.time.Time [s]."""
 
     def __init__(self, seconds: float = 0.0):
         self.nanoseconds = int(seconds * 1e9)
-
-    def __sub__(self, other):
-        return Moment((self.nanoseconds - other.nanoseconds) * 1e-9)
-
-    def __gt__(self, other):
-        return self.nanoseconds > other.nanoseconds
 
     def to_msg(self):
         time = blank("builtin_interfaces/msg/Time")
         time.sec, time.nanosec = divmod(self.nanoseconds, 10**9)
         return time
 
-    @classmethod
-    def from_msg(cls, stamp):
-        return cls(stamp.sec + 1e-9 * stamp.nanosec)
-
 
 class StandIn:
-    """What the node sees of ROS: parameters, topics, tf, actions; `told` is its log."""
+    """What the node sees of ROS: parameters, topics, actions; `told` is its log."""
 
     def __init__(self, **parameters):
         self.parameters, self.now, self.told = parameters, 100.0, []
-        self.topics, self.tf, self.sent, self.published = {}, {}, [], []
+        self.topics, self.sent, self.published, self.cancelled = {}, [], [], []
         self.waiting, self.ready, self.accepts = [], True, True
 
     def place(self, name: str, x: float, y: float, yaw: float = 0.0) -> None:
+        """As one localisation for the whole team tells it."""
         entry = ("map", f"{name}/base_link", self.now, (x, y, 0.0), yaw)
-        self.tf[f"{name}/base_link"] = passed_on(transforms([entry])).transforms[0]
+        self.topics["/tf"](passed_on(transforms([entry])))
 
     def node_class(ros):
         class Node:
@@ -196,22 +208,13 @@ class StandIn:
             def send_goal_async(self, message):
                 ros.sent.append((self.name, message))
                 ended = SimpleNamespace(add_done_callback=ros.waiting.append)
-                handle = SimpleNamespace(accepted=ros.accepts, get_result_async=lambda: ended)
+                handle = SimpleNamespace(
+                    accepted=ros.accepts, get_result_async=lambda: ended,
+                    cancel_goal_async=lambda: ros.cancelled.append(self.name),
+                )  # fmt: skip
                 return SimpleNamespace(add_done_callback=lambda call: call(SimpleNamespace(result=lambda: handle)))
 
         return ActionClient
-
-    def buffer_class(ros):
-        class Buffer:
-            def lookup_transform(self, target, source, time):
-                if source not in ros.tf:
-                    raise ros.TransformError(f"{source} does not exist")
-                return ros.tf[source]
-
-        return Buffer
-
-    class TransformError(Exception):
-        pass
 
     def modules(self) -> dict[str, ModuleType]:
         def module(**names):
@@ -224,15 +227,11 @@ class StandIn:
         return {
             "rclpy": module(init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None),
             "rclpy.action": module(ActionClient=self.action_class()),
-            "rclpy.duration": module(Duration=lambda seconds: Moment(seconds)),
             "rclpy.node": module(Node=self.node_class()),
             "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
-            "rclpy.time": module(Time=Moment),
-            "tf2_ros": module(
-                Buffer=self.buffer_class(), TransformException=self.TransformError, TransformListener=lambda *_: None
-            ),
+            "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
-            "nav_msgs.msg": module(OccupancyGrid=STORE.types[GRID]),
+            "nav_msgs.msg": module(OccupancyGrid=STORE.types[GRID], Odometry=made("nav_msgs/msg/Odometry")),
             "nav2_msgs.action": module(NavigateToPose=goal),
             "visualization_msgs.msg": module(
                 Marker=made("visualization_msgs/msg/Marker"), MarkerArray=made("visualization_msgs/msg/MarkerArray")
@@ -243,7 +242,7 @@ class StandIn:
 @pytest.fixture()
 def team(conversion, monkeypatch):
     """A node of two robots, and what it sees of ROS."""
-    ros = StandIn(robots=["a", "b"], radar_range=3.0, robot_radius=0.2)
+    ros = StandIn(robots=["a", "b"], radar_range=3.0, robot_radius=[0.2])
     for name, stand_in in ros.modules().items():
         monkeypatch.setitem(sys.modules, name, stand_in)
     return importlib.import_module("maexp_ros.team_node").TeamNode(), ros
@@ -259,7 +258,7 @@ def test_the_node_sends_goals(team):
     node.decide()
     assert {name for name, _ in ros.sent} <= {"/a/navigate_to_pose", "/b/navigate_to_pose"} and ros.sent
     expected = TeamPlanner("cost_utility", radar_range=3.0, robot_radius=0.2, occupied=65.0).plan(
-        floor(), 0.1, (0.0, 0.0, 0.0), {"a": (1.0, 1.5, 0.0), "b": (1.0, 4.0, 0.0)}, now=100.0
+        floor(), 0.1, (0.0, 0.0, 0.0), {"a": (1.0, 1.5, 0.0), "b": (1.0, 4.0, 0.0)}, now=0.0
     )
     for name, message in ros.sent:
         at = message.pose.pose.position
@@ -282,17 +281,34 @@ def test_what_is_missing_is_said(team):
     ros.place("a", 1.0, 1.5)
     node.decide()
     assert [name for name, _ in ros.sent] == ["/a/navigate_to_pose"]
-    assert any("b/base_link does not exist" in one for one in ros.told)
+    assert any("b: tf does not say where b/base_link is in map" in one for one in ros.told)
     ros.now += 10.0
     node.decide()
-    assert any("a/base_link: its pose is too old" in one for one in ros.told)
+    assert any("a: its pose is too old" in one for one in ros.told)
+    assert ros.cancelled == ["/a/navigate_to_pose"], "nobody knows where it drives"
     ros.place("a", 1.0, 1.5)
-    ros.ready, node.goals = False, {}
+    ros.ready = False
     node.decide()
     assert "a: nav2 is not there yet" in ros.told and len(ros.sent) == 1
     ros.ready, ros.accepts = True, False
     node.decide()
-    assert len(ros.sent) == 2 and not node.goals  # refused: may be sent again
+    assert len(ros.sent) == 2 and not node.driver.goals  # refused: may be sent again
+
+
+def test_goals_are_cancelled_once_nothing_is_left(team):
+    node, ros = team
+    ros.topics["/map"](grid(floor(), 0.1))
+    ros.place("a", 1.0, 1.5)
+    ros.place("b", 1.0, 4.0)
+    node.decide()
+    driving = [name for name, _ in ros.sent]
+    values = floor()
+    values[25:35, 60:64] = 100
+    ros.topics["/map"](grid(values, 0.1))
+    node.decide()
+    assert driving and ros.cancelled == driving and not node.driver.goals
+    node.decide()
+    assert ros.cancelled == driving
 
 
 def test_done_is_said_once(team):
@@ -304,18 +320,6 @@ def test_done_is_said_once(team):
     ros.place("b", 1.0, 4.0)
     node.decide(), node.decide()
     assert not ros.sent and sum("done: nothing" in one for one in ros.told) == 1
-
-
-def test_maps_of_two_robots_whose_frames_tf_knows(team):
-    node, ros = team
-    values = floor()
-    for name, part, shift in (("a", values[:30], 0.0), ("b", values[30:], 3.0)):
-        message = grid(part, 0.1)
-        message.header.frame_id = f"{name}/map"
-        node.grids[name] = message
-        entry = ("map", f"{name}/map", 0.0, (0.0, shift, 0.0), 0.0)  # old, but maps stand still
-        ros.tf[f"{name}/map"] = transforms([entry]).transforms[0]
-    assert np.array_equal(node._grid().values, values)
 
 
 def test_the_package_is_whole():
@@ -330,7 +334,7 @@ def test_the_package_is_whole():
     for name in ("maexp_ros/team_node.py", "launch/team.launch.py"):
         tree = ast.parse((PACKAGE / name).read_text())
         modules = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-        ours = {"__future__", "functools", "pathlib", "maexp"}
+        ours = {"__future__", "dataclasses", "functools", "pathlib", "maexp"}
         assert {module.split(".")[0] for module in modules} - ours <= wanted, name
     yaml.safe_load((PACKAGE / "rviz" / "team.rviz").read_text())
 

@@ -29,14 +29,7 @@ class TeamAgent:
     def reset(self, episode: dict[str, Any]) -> None:
         """Begin with a planner that remembers nothing."""
         self.episode = episode
-        self.planners = [
-            TeamPlanner(
-                self.policy, radar_range=episode["radar_range"], robot_radius=episode["robot_radius"], bounded=True,
-                least_area=0.0, max_speed=episode["max_speed"], max_accel=episode["max_accel"],
-                seconds=episode["decision_seconds"], seed=episode["seed"], patience=3.0 * episode["decision_seconds"],
-            )
-            for _ in range(episode["num_robots"])
-        ]  # fmt: skip
+        self.planners = [TeamPlanner(self.policy, **planner_options(episode)) for _ in range(episode["num_robots"])]
 
     def act(self, observation: dict[str, Any]) -> np.ndarray:
         """Where each robot goes, float64 [N, 2] [m]; NaN where it stays.
@@ -57,21 +50,42 @@ class TeamAgent:
             velocities=np.nan_to_num(observation["velocities"][robot]), time_left=observation["time_left"],
             now=observation["time"],
         )  # fmt: skip
-        return np.where(plan.active[:, None], self._go_beyond(plan, observation, robot), np.nan)
-
-    def _go_beyond(self, plan: Plan, observation: dict[str, Any], robot: int) -> np.ndarray:
-        """Goals beyond targets that are near, toward what is to be seen from there, as far as a robot still gets.
-
-        One that stopped at its target would stand there until the next decision (as `TargetTracker` in the simulator).
-        """
-        told, goals, notes = self.episode, plan.goals.copy(), []
-        grid = read_grid(observation["grid"][robot], observation["resolution"], observation["origin"], 50.0, notes)
+        grid = observation["grid"][robot], observation["resolution"], observation["origin"]
         at, speed = observation["poses"][robot, :, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
-        seconds = told["decision_seconds"]
-        drive = np.minimum(speed * seconds + 0.5 * told["max_accel"] * seconds**2, told["max_speed"] * seconds)
-        rows = np.flatnonzero(plan.active)
-        if len(rows):
-            _, middle = look_around(grid, grid.cells(grid.from_map(goals[rows])), told["radar_range"], True)
-            left = np.maximum(drive[rows] - np.linalg.norm(goals[rows] - at[rows], axis=-1), 0.0)
-            goals[rows] += middle * (left / np.maximum(np.linalg.norm(middle, axis=-1), 1e-6))[:, None]
-        return goals
+        return np.where(plan.active[:, None], go_beyond(plan, grid, at, speed, self.episode), np.nan)
+
+
+def planner_options(episode: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of a `TeamPlanner` for an episode of the arena."""
+    return {
+        "radar_range": episode["radar_range"],
+        "robot_radius": episode["robot_radius"],
+        "bounded": True,
+        "least_area": 0.0,
+        "max_speed": episode["max_speed"],
+        "max_accel": episode["max_accel"],
+        "seconds": episode["decision_seconds"],
+        "seed": episode["seed"],
+        "patience": 3.0 * episode["decision_seconds"],
+    }
+
+
+def go_beyond(plan: Plan, grid: tuple, at: np.ndarray, speed: np.ndarray, episode: dict[str, Any]) -> np.ndarray:
+    """Goals beyond targets that are near, toward what is to be seen from there, as far as a robot still gets, [N, 2].
+
+    One that stopped at its target would stand there until the next decision (as `TargetTracker` in the simulator).
+
+    Args:
+        grid: values [H, W], resolution [m] and origin [m] of what the plan was made on.
+        at, speed: of the robots, [N, 2] [m] and [N] [m/s].
+    """
+    goals, rows, seconds = plan.goals.copy(), np.flatnonzero(plan.active), episode["decision_seconds"]
+    if len(rows):
+        known = read_grid(*grid, 50.0, [])
+        drive = np.minimum(
+            speed * seconds + 0.5 * episode["max_accel"] * seconds**2, episode["max_speed"] * seconds
+        )[rows]
+        _, middle = look_around(known, known.cells(known.from_map(goals[rows])), episode["radar_range"], True)
+        left = np.maximum(drive - np.linalg.norm(goals[rows] - at[rows], axis=-1), 0.0)
+        goals[rows] += middle * (left / np.maximum(np.linalg.norm(middle, axis=-1), 1e-6))[:, None]
+    return goals

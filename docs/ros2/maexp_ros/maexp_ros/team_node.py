@@ -1,32 +1,35 @@
-"""The node: grids and poses in, goals for nav2 out. All thinking is in maexp.agents.runtime."""
+"""The node: maps and frames in, goals for nav2 out. All thinking is in maexp.agents.runtime."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 
-import numpy as np
 import rclpy
 from geometry_msgs.msg import Point
 from nav2_msgs.action import NavigateToPose
-from nav_msgs.msg import OccupancyGrid
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.action import ActionClient
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
-from tf2_ros import Buffer, TransformException, TransformListener
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maexp.agents.runtime import TeamPlanner
+from maexp.agents.runtime.driver import DriverSettings, Order, TeamDriver, read_settings
+from maexp.agents.runtime.frames import fill_pose
 
 from . import conversion
 
+OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
 PARAMETERS = {
-    "robots": ["robot1"], "policy": "cost_utility", "map_topics": ["/map"], "global_frame": "map",
-    "base_frame": "base_link", "action": "navigate_to_pose", "period": 2.0, "radar_range": 5.0, "robot_radius": 0.3,
-    "occupied": 65.0, "bounded": False, "pose_age": 2.0, "goal_change": 0.5,
-}  # fmt: skip
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()
+} | {"action": "navigate_to_pose"}
+
+
+def latched(depth: int) -> QoSProfile:
+    """Who comes later gets the last ones."""
+    kept = {"reliability": ReliabilityPolicy.RELIABLE, "durability": DurabilityPolicy.TRANSIENT_LOCAL}
+    return QoSProfile(depth=depth, **kept)
 
 
 class TeamNode(Node):
@@ -36,101 +39,72 @@ class TeamNode(Node):
         super().__init__("team")
         for name, default in PARAMETERS.items():
             self.declare_parameter(name, default)
-        self.robots = list(self._get("robots"))
-        self.frame = self._get("global_frame")
-        self.planner = TeamPlanner(
-            self._get("policy"), radar_range=self._get("radar_range"), robot_radius=self._get("robot_radius"),
-            occupied=self._get("occupied"), bounded=self._get("bounded"),
-        )  # fmt: skip
-        self.grids: dict[str, OccupancyGrid] = {}
-        for topic in self._get("map_topics"):
-            self.create_subscription(OccupancyGrid, topic, partial(self.grids.__setitem__, topic), LATCHED)
-        self.buffer = Buffer()
-        self.listener = TransformListener(self.buffer, self)
-        action = self._get("action")
-        self.clients_of = {name: ActionClient(self, NavigateToPose, f"/{name}/{action}") for name in self.robots}
-        self.goals: dict[str, np.ndarray] = {}  # that nav2 is driving to
+        values = {name: self.get_parameter(name).value for name in PARAMETERS}
+        action = values.pop("action")
+        self.driver = driver = TeamDriver(read_settings(values))
+        self.frame = driver.settings.global_frame
+        for topic in driver.topics:
+            self.create_subscription(OccupancyGrid, topic, partial(driver.take_map, topic), latched(1))
+        for robot in (None, *driver.robots):
+            place = "" if robot is None else f"/{robot}"
+            moving, still = (partial(driver.take_frames, robot=robot, still=one) for one in (False, True))
+            self.create_subscription(TFMessage, f"{place}/tf", moving, QoSProfile(depth=100))
+            self.create_subscription(TFMessage, f"{place}/tf_static", still, latched(100))
+        for robot in driver.robots:
+            take = partial(driver.take_odometry, robot)
+            self.create_subscription(Odometry, f"/{robot}/odom", take, QoSProfile(depth=10))
+        self.clients_of = {name: ActionClient(self, NavigateToPose, f"/{name}/{action}") for name in driver.robots}
+        self.handles: dict[str, object] = {}  # of goals that nav2 has accepted
         self.markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self.finished = False
-        self.create_timer(self._get("period"), self.decide)
-
-    def _get(self, name: str):
-        return self.get_parameter(name).value
+        self.create_timer(driver.settings.period, self.decide)
 
     def decide(self) -> None:
         """Plan for all and send each robot its goal, where that has changed."""
-        grid = self._grid()
-        if grid is None:
-            return
-        poses = {name: self._look_up(f"{name}/{self._get('base_frame')}") for name in self.robots}
-        seconds = self.get_clock().now().nanoseconds * 1e-9
         try:
-            plan = self.planner.plan(grid.values, grid.resolution, grid.origin, poses, now=seconds)
+            decision = self.driver.decide(self.get_clock().now().nanoseconds * 1e-9)
         except ValueError as error:
-            self.get_logger().error(f"no plan: {error}")
+            self.get_logger().error(f"no plan: {error}", throttle_duration_sec=10.0)
             return
-        for note in plan.notes:
+        for note in decision.notes:
             self.get_logger().info(note, throttle_duration_sec=10.0)
-        for name, goal, way, active, waits in zip(
-            plan.names, plan.goals, plan.ways, plan.active, plan.waits, strict=True
-        ):
-            if active or (waits and name in self.goals):  # who waits is to stop where it is
-                self._send(name, goal, way)
-        self._draw(plan)
-        if plan.done and not self.finished:
-            self.get_logger().info("done: nothing that a robot could get to is left to be seen")
-        self.finished = plan.done
-
-    def _grid(self) -> conversion.Grid | None:
-        """The team's grid in the global frame; None until there is one."""
-        placed = []
-        for message in self.grids.values():
-            pose = self._look_up(message.header.frame_id, still=True)
-            if pose is not None:
-                placed.append(conversion.place_grid(conversion.read_grid(message), pose))
-        return conversion.merge_grids(placed) if placed else None
-
-    def _look_up(self, frame: str, still: bool = False) -> tuple[float, float, float] | None:
-        """Where a frame is in the global one; None where tf does not know, or has not for `pose_age`."""
-        if frame == self.frame:
-            return 0.0, 0.0, 0.0
-        try:
-            found = self.buffer.lookup_transform(self.frame, frame, Time())
-        except TransformException as error:
-            self.get_logger().warning(f"{frame}: {error}", throttle_duration_sec=10.0)
-            return None
-        age = self.get_clock().now() - Time.from_msg(found.header.stamp)
-        if not still and age > Duration(seconds=self._get("pose_age")):
-            self.get_logger().warning(f"{frame}: its pose is too old", throttle_duration_sec=10.0)
-            return None
-        return conversion.read_pose(found.transform)
-
-    def _send(self, name: str, goal: np.ndarray, way: np.ndarray) -> None:
-        """A goal for one robot's nav2, unless it drives there already."""
-        last = self.goals.get(name)
-        if last is not None and np.linalg.norm(last - goal) < self._get("goal_change"):
+        for order in decision.orders:
+            (self._cancel if order.stop else self._send)(order)
+        if decision.plan is None:
             return
-        if not self.clients_of[name].server_is_ready():
-            self.get_logger().warning(f"{name}: nav2 is not there yet", throttle_duration_sec=10.0)
+        self._draw(decision.plan)
+        if decision.plan.done and not self.finished:
+            self.get_logger().info("done: nothing that a robot could get to is left to be seen")
+        self.finished = decision.plan.done
+
+    def _send(self, order: Order) -> None:
+        """A goal for one robot's nav2."""
+        client = self.clients_of[order.name]
+        if not client.server_is_ready():
+            self.driver.forget(order.name, order.goal)
+            self.get_logger().warning(f"{order.name}: nav2 is not there yet", throttle_duration_sec=10.0)
             return
         message = NavigateToPose.Goal()
         message.pose.header.frame_id = self.frame
         message.pose.header.stamp = self.get_clock().now().to_msg()
-        conversion.fill_pose(message.pose.pose, goal[0], goal[1], conversion.heading_of(way))
-        self.goals[name] = goal.copy()
-        self.clients_of[name].send_goal_async(message).add_done_callback(partial(self._answered, name, goal))
+        fill_pose(message.pose.pose, order.goal[0], order.goal[1], order.heading)
+        client.send_goal_async(message).add_done_callback(partial(self._answered, order))
 
-    def _answered(self, name: str, goal: np.ndarray, future) -> None:
+    def _answered(self, order: Order, future) -> None:
         handle = future.result()
-        if handle.accepted:
-            handle.get_result_async().add_done_callback(lambda _: self._forget(name, goal))
+        if not handle.accepted:
+            self.driver.forget(order.name, order.goal)
+        elif order.name not in self.driver.goals:  # it was cancelled in the meantime
+            handle.cancel_goal_async()
         else:
-            self._forget(name, goal)
+            self.handles[order.name] = handle
+            handle.get_result_async().add_done_callback(lambda _: self.driver.forget(order.name, order.goal))
 
-    def _forget(self, name: str, goal: np.ndarray) -> None:
-        """Reached, given up or refused: the next decision may send the same goal again."""
-        if np.array_equal(self.goals.get(name), goal):
-            del self.goals[name]
+    def _cancel(self, order: Order) -> None:
+        """Stop a robot that has nothing to do any more, or is lost."""
+        handle = self.handles.pop(order.name, None)
+        if handle is not None:
+            handle.cancel_goal_async()
 
     def _draw(self, plan) -> None:
         """Goals, ways and targets for RViz."""

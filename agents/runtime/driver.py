@@ -1,0 +1,283 @@
+"""A ROS 2 team from its messages to the goals of its robots: what the node of `docs/ros2` and `maexp ros2 team` do.
+
+Needs neither ROS nor DDS: whoever uses it hands over the messages, and sends the orders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from .agent import go_beyond, planner_options
+from .frames import (
+    NOWHERE,
+    Frames,
+    Grid,
+    Pose,
+    compose,
+    heading_of,
+    merge_grids,
+    place_grid,
+    read_map,
+    read_pose,
+    read_time,
+)
+from .planner import Plan, TeamPlanner
+
+ODOMETRY = "odometry of "
+SERVED_AGE = 0.05  # seconds; an arena tells everything of one moment
+
+
+def _setting(default: Any, text: str) -> Any:
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
+
+    robots: tuple[str, ...] = _setting((), "namespaces of the robots: a,b,c")
+    policy: str = _setting("cost_utility", "a planner, a trained policy that ships, or the folder of one")
+    map_topics: tuple[str, ...] = _setting((), "the team's map, or one of each robot; default: /NAME/map of each")
+    global_frame: str = _setting("map", "all maps and poses are brought into this frame")
+    base_frame: str = _setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")
+    offsets: tuple[float, ...] = _setting((), "x, y, yaw of each robot's map in the team's frame; zeros: they are one")
+    period: float = _setting(2.0, "between two decisions [s]")
+    radar_range: float | None = _setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
+    robot_radius: tuple[float, ...] = _setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
+    clearance_factor: float = _setting(2.0, "radii that ways keep from obstacles twice over, where there is room")
+    occupied: float = _setting(65.0, "cells with so many percent and more are obstacles")
+    bounded: bool = _setting(False, "the map shows the whole place")
+    patience: float = _setting(10.0, "how long a robot may stand still on its way [s]")
+    pause: float = _setting(60.0, "how long a target is given up [s]")
+    max_speed: float | None = _setting(None, "of the robots [m/s], told to trained policies; default: as trained")
+    time_limit: float | None = _setting(None, "for the whole exploration [s]; policies are told what is left of it")
+    pose_age: float = _setting(2.0, "a pose older than this is not believed [s]")
+    goal_change: float = _setting(0.5, "a goal is sent again when it has moved farther than this [m]")
+    resend: float | None = _setting(None, "a goal is sent again after so long [s]; default: never")
+
+
+@dataclass(frozen=True)
+class Order:
+    """What one robot is to do.
+
+    Attributes:
+        goal: float64 [2] in the team's frame [m]; where the robot is to stop if `stop`.
+        heading: at the goal [rad].
+        stop: its goal is cancelled.
+    """
+
+    name: str
+    goal: np.ndarray
+    heading: float
+    stop: bool = False
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What came of a look at the team.
+
+    Attributes:
+        plan: None where no map can be placed yet.
+        notes: what is missing or was given up, a sentence each.
+    """
+
+    orders: list[Order]
+    plan: Plan | None
+    notes: list[str]
+
+
+class TeamDriver:
+    """Takes what a team publishes, and decides where each robot goes.
+
+    Args:
+        settings: of the team.
+
+    Raises:
+        ValueError: a setting is out of range, or the policy unknown.
+    """
+
+    def __init__(self, settings: DriverSettings):
+        self.settings = settings
+        self.robots, count = settings.robots, len(settings.robots)
+        if not count or len(set(self.robots)) < count or not all(self.robots):
+            raise ValueError(f"robots={','.join(self.robots)} must name the robots of the team, each once")
+        self.topics = settings.map_topics or tuple(f"/{name}/map" for name in self.robots)
+        if len(self.topics) not in (1, count):
+            raise ValueError(f"map_topics={','.join(self.topics)} must be one for the team, or one for each robot")
+        for name, sizes in (("offsets", (0, 3 * len(self.topics))), ("robot_radius", (0, 1, count))):
+            if len(getattr(settings, name)) not in sizes:
+                wanted = " or ".join(map(str, sizes[1:]))
+                raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
+        self.begin()
+
+    def begin(self, episode: dict[str, Any] | None = None) -> None:
+        """Forget everything; `episode`: what an arena tells of the one that begins, instead of settings not given."""
+        self.episode = episode
+        self.planner = TeamPlanner(self.settings.policy, **self._options())
+        self.maps: dict[str, Any] = {}
+        self.shared, self.own = Frames(), {name: Frames() for name in self.robots}
+        self.speeds: dict[str, float] = {}
+        self.goals: dict[str, np.ndarray] = {}  # that robots drive to
+        self.sent: dict[str, float] = {}  # when [s]
+        self.places: dict[str, np.ndarray] = {}  # where robots were seen last
+        self.begun: float | None = None
+
+    def _options(self) -> dict[str, Any]:
+        given, own = self.settings, {} if self.episode is None else planner_options(self.episode)
+        for name in ("clearance_factor", "occupied", "bounded", "patience", "pause"):
+            own.setdefault(name, getattr(given, name))
+        own |= {name: value for name in ("radar_range", "max_speed") if (value := getattr(given, name)) is not None}
+        if radius := given.robot_radius:
+            each = radius if len(radius) > 1 else radius * len(self.robots)
+            own["robot_radius"] = dict(zip(self.robots, each, strict=True))
+        return own
+
+    def take_map(self, topic: str, message) -> None:
+        """A nav_msgs/OccupancyGrid."""
+        self.maps[topic] = message
+
+    def take_frames(self, message, robot: str | None = None, still: bool = False) -> None:
+        """A tf2_msgs/TFMessage of /tf, or of `robot`'s own /NAME/tf; `still`: of tf_static."""
+        (self.shared if robot is None else self.own[robot]).take(message, still)
+
+    def take_odometry(self, robot: str, message) -> None:
+        """A nav_msgs/Odometry; its pose counts where tf says nothing of the robot's body."""
+        speed = message.twist.twist.linear
+        self.speeds[robot] = float(np.hypot(speed.x, speed.y))
+        body = message.child_frame_id.lstrip("/")
+        if body not in self.shared and body not in self.own[robot]:
+            pose, time = read_pose(message.pose.pose), read_time(message.header.stamp)
+            self.own[robot].put(ODOMETRY + body, message.header.frame_id, pose, time)
+
+    def forget(self, name: str, goal: np.ndarray) -> None:
+        """A goal was reached, given up or refused: the next decision may send the same again."""
+        if np.array_equal(self.goals.get(name), goal):
+            del self.goals[name]
+
+    def decide(self, now: float) -> Decision:
+        """Plan for all; the orders are for those robots whose goal has changed.
+
+        Args:
+            now: time of ROS [s].
+
+        Raises:
+            ValueError: several maps claim one frame and their offsets are not known, or a map is none.
+        """
+        self.begun = now if self.begun is None else self.begun
+        notes: list[str] = []
+        grid = self._merge(notes)
+        if grid is None:
+            return Decision([], None, notes)
+        poses = {name: self._find(name, now, notes) for name in self.robots}
+        self.places |= {name: np.array(pose[:2]) for name, pose in poses.items() if pose is not None}
+        what = grid.values, grid.resolution, grid.origin
+        plan = self.planner.plan(
+            *what, poses, velocities=[self.speeds.get(name, 0.0) for name in self.robots],
+            time_left=self._time_left(now), now=round(now - self.begun, 6),
+        )  # fmt: skip
+        goals = plan.goals if self.episode is None else self._go_beyond(plan, what, poses)
+        return Decision(self._give_orders(plan, goals, now), plan, [*notes, *plan.notes])
+
+    def _time_left(self, now: float) -> float:
+        limit = self.settings.time_limit if self.episode is None else self.episode["seconds"]
+        return 1.0 if limit is None else max(1.0 - round(now - self.begun, 6) / limit, 0.0)
+
+    def _go_beyond(self, plan: Plan, grid: tuple, poses: dict[str, Pose | None]) -> np.ndarray:
+        at = np.array([(np.nan, np.nan) if pose is None else pose[:2] for pose in poses.values()])
+        speed = np.array([self.speeds.get(name, 0.0) for name in self.robots])
+        return go_beyond(plan, grid, at, speed, self.episode)
+
+    def _merge(self, notes: list[str]) -> Grid | None:
+        """The team's map in its frame; None until there is one."""
+        self._check_frames()
+        placed = []
+        for topic, message in self.maps.items():
+            pose = self._place(message.header.frame_id.lstrip("/"), topic)
+            if pose is None:
+                notes.append(f"{topic}: tf does not say where {message.header.frame_id} is in {self._root}")
+            else:
+                placed.append(place_grid(read_map(message), pose))
+        return merge_grids(placed) if placed else None
+
+    @property
+    def _root(self) -> str:
+        return self.settings.global_frame
+
+    def _check_frames(self) -> None:
+        """Maps that robots make alone begin wherever each robot began, and are all called `map`."""
+        frames = [message.header.frame_id for message in self.maps.values()]
+        if len(set(frames)) < len(frames) and not self.settings.offsets:
+            both = [topic for topic, message in self.maps.items() if frames.count(message.header.frame_id) > 1]
+            raise ValueError(
+                f"{' and '.join(both)} are both in a frame called {self.maps[both[0]].header.frame_id}, and where they "
+                "lie to each other is not known: give offsets=x,y,yaw,x,y,yaw,... of each (zeros if they are aligned)"
+            )
+
+    def _place(self, frame: str, topic: str) -> Pose | None:
+        """Where the frame of a map stands in the team's; None: unknown."""
+        if self.settings.offsets:
+            row = 3 * self.topics.index(topic)
+            return tuple(self.settings.offsets[row : row + 3])
+        if frame == self._root:
+            return NOWHERE
+        found = self.shared.find(frame, (self._root,))
+        return None if found is None else found[1]
+
+    def _find(self, name: str, now: float, notes: list[str]) -> Pose | None:
+        """Where a robot is in the team's frame; None: unknown, or not known since `pose_age`."""
+        topic = self.topics[0] if len(self.topics) == 1 else self.topics[self.robots.index(name)]
+        message = self.maps.get(topic)
+        frame = self._root if message is None else message.header.frame_id.lstrip("/")
+        found = self._chain(name, {frame, self._root} if not self.settings.offsets else {frame})
+        if found is None:
+            notes.append(f"{name}: tf does not say where {name}/{self.settings.base_frame} is in {frame}")
+            return None
+        root, pose, time = found
+        if time < now - (self.settings.pose_age if self.episode is None else SERVED_AGE):
+            notes.append(f"{name}: its pose is too old")
+            return None
+        place = self._place(root, topic)
+        return None if place is None else compose(place, pose)
+
+    def _chain(self, name: str, roots: set[str]) -> tuple[str, Pose, float] | None:
+        """A robot's pose in one of these frames: by its own tf, by the shared one, by its odometry."""
+        base, own = self.settings.base_frame, self.own[name]
+        tree = Frames()
+        tree.parents = self.shared.parents | own.parents
+        measured = [frame for frame in own.parents if frame.startswith(ODOMETRY)]
+        for body in [f"{name}/{base}", *[base] * (base in own), *measured]:
+            if found := tree.find(body, roots):
+                return found
+        return None
+
+    def _give_orders(self, plan: Plan, goals: np.ndarray, now: float) -> list[Order]:
+        """New goals for robots that have others than before, and a stop for those that have none any more."""
+        orders = []
+        for k, name in enumerate(self.robots):
+            if plan.active[k]:
+                if self._is_new(name, goals[k], now):
+                    self.goals[name], self.sent[name] = goals[k].copy(), now
+                    orders.append(Order(name, self.goals[name], heading_of(plan.ways[k])))
+            elif name in self.places and (self.goals.pop(name, None) is not None or self.episode is not None):
+                orders.append(Order(name, self.places[name], 0.0, stop=True))
+        return orders
+
+    def _is_new(self, name: str, goal: np.ndarray, now: float) -> bool:
+        last, resend = self.goals.get(name), self.settings.resend
+        if last is None or self.episode is not None or np.linalg.norm(last - goal) >= self.settings.goal_change:
+            return True
+        return resend is not None and now - self.sent[name] >= resend
+
+
+def read_settings(values: dict[str, Any]) -> DriverSettings:
+    """Of parameters by their names. ROS has none without a value: 0.0, "" and [0.0] stand for what is not given."""
+    known, found = {one.name: one.default for one in fields(DriverSettings)}, {}
+    for name, value in values.items():
+        if isinstance(known[name], tuple):
+            found[name] = () if list(value) == [0.0] else tuple(value)
+        else:
+            found[name] = None if known[name] is None and not value else value
+    return DriverSettings(**found)

@@ -1,0 +1,159 @@
+"""Frames and maps as ROS has them, from messages to arrays; imports nothing of ROS.
+
+Messages are read by the names of their fields, so those of rclpy, of DDS and of recordings do alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container
+from dataclasses import dataclass
+
+import numpy as np
+
+Pose = tuple[float, float, float]
+"""x, y [m] and yaw [rad]."""
+NOWHERE: Pose = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """An occupancy grid.
+
+    Attributes:
+        values: int8 [rows along y, columns along x], -1 unknown, 0 free to 100 occupied.
+        resolution: side of a cell [m].
+        origin: its lower left corner.
+    """
+
+    values: np.ndarray
+    resolution: float
+    origin: Pose
+
+
+def read_map(message) -> Grid:
+    """The grid of a nav_msgs/OccupancyGrid.
+
+    Raises:
+        ValueError: it has not as many cells as it says.
+    """
+    info = message.info
+    values = np.asarray(message.data, dtype=np.int8)
+    if values.size != info.height * info.width:
+        raise ValueError(f"a map of {info.width} x {info.height} cells came with {values.size} of them")
+    place = info.origin.position
+    origin = (place.x, place.y, read_yaw(info.origin.orientation))
+    return Grid(values.reshape(info.height, info.width), float(f"{info.resolution:.7g}"), origin)
+
+
+def read_time(stamp) -> float:
+    """Seconds of a builtin_interfaces/Time."""
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def read_yaw(turn) -> float:
+    """Angle about z [rad] of a geometry_msgs/Quaternion."""
+    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+
+
+def read_pose(pose) -> Pose:
+    """Of a geometry_msgs/Pose."""
+    return pose.position.x, pose.position.y, read_yaw(pose.orientation)
+
+
+def fill_pose(pose, x: float, y: float, yaw: float) -> None:
+    """Writes a place into a geometry_msgs/Pose."""
+    pose.position.x, pose.position.y, pose.position.z = float(x), float(y), 0.0
+    fill_turn(pose.orientation, yaw)
+
+
+def fill_turn(turn, yaw: float) -> None:
+    """Writes an angle about z [rad] into a geometry_msgs/Quaternion."""
+    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+def compose(pose: Pose, inner: Pose) -> Pose:
+    """`inner`, given in a frame that stands at `pose`, in the frame of `pose`."""
+    x, y, yaw = pose
+    c, s = math.cos(yaw), math.sin(yaw)
+    return x + c * inner[0] - s * inner[1], y + s * inner[0] + c * inner[1], yaw + inner[2]
+
+
+class Frames:
+    """Where frames stand in their parents, as was told last. There is no interpolation: robots are slow."""
+
+    def __init__(self):
+        self.parents: dict[str, tuple[str, Pose, float]] = {}
+
+    def __contains__(self, frame: str) -> bool:
+        return frame in self.parents
+
+    def take(self, message, still: bool = False) -> None:
+        """A tf2_msgs/TFMessage; `still`: it is of /tf_static, whose frames stay where they are."""
+        for one in message.transforms:
+            move = one.transform
+            pose = (move.translation.x, move.translation.y, read_yaw(move.rotation))
+            time = math.inf if still else read_time(one.header.stamp)
+            self.put(one.child_frame_id, one.header.frame_id, pose, time)
+
+    def put(self, frame: str, parent: str, pose: Pose, time: float) -> None:
+        """Where a frame stands since `time` [s]; names may begin with a slash, as in ROS 1."""
+        self.parents[frame.lstrip("/")] = (parent.lstrip("/"), pose, time)
+
+    def find(self, frame: str, roots: Container[str]) -> tuple[str, Pose, float] | None:
+        """The first of `roots` that a frame hangs from, its pose there, and the time of its own message [s]; None: it
+        hangs from none. Parents may be older: localisation is silent where a robot stands still."""
+        pose, time = NOWHERE, None
+        for _ in range(len(self.parents) + 1):
+            if frame in roots:
+                return frame, pose, math.inf if time is None else time
+            if frame not in self.parents:
+                return None
+            frame, place, told = self.parents[frame]
+            pose, time = compose(place, pose), told if time is None else time
+        return None
+
+
+def place_grid(grid: Grid, pose: Pose) -> Grid:
+    """The grid in the frame in which its own frame stands at `pose`."""
+    return grid if pose == NOWHERE else Grid(grid.values, grid.resolution, compose(pose, grid.origin))
+
+
+def merge_grids(grids: list[Grid]) -> Grid:
+    """One grid of several in one frame: occupied where any is, free where any is and none occupied.
+
+    It has the finest resolution and lies along the frame's axes. Grids that lie alike, or one alone, stay as they are.
+    """
+    first = grids[0]
+    alike = (first.resolution, first.origin, first.values.shape)
+    if all((grid.resolution, grid.origin, grid.values.shape) == alike for grid in grids):
+        return Grid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
+    cell = min(grid.resolution for grid in grids)
+    corners = np.concatenate([_corners(grid) for grid in grids])
+    low = np.floor(corners.min(axis=0) / cell) * cell
+    columns, rows = np.ceil((corners.max(axis=0) - low) / cell - 1e-6).astype(int)
+    x, y = np.meshgrid(low[0] + (np.arange(columns) + 0.5) * cell, low[1] + (np.arange(rows) + 0.5) * cell)
+    merged = np.full((rows, columns), -1, dtype=np.int8)
+    for grid in grids:
+        gx, gy, yaw = grid.origin
+        c, s = math.cos(yaw), math.sin(yaw)
+        column = np.floor((c * (x - gx) + s * (y - gy)) / grid.resolution).astype(int)
+        row = np.floor((c * (y - gy) - s * (x - gx)) / grid.resolution).astype(int)
+        height, width = grid.values.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        merged[inside] = np.maximum(merged[inside], grid.values[row[inside], column[inside]])
+    return Grid(merged, cell, (float(low[0]), float(low[1]), 0.0))
+
+
+def _corners(grid: Grid) -> np.ndarray:
+    height, width = grid.values.shape
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    local = grid.resolution * np.array([[0, 0], [width, 0], [0, height], [width, height]])
+    return local @ np.array([[c, s], [-s, c]]) + (x, y)
+
+
+def heading_of(way: np.ndarray) -> float:
+    """The direction [rad] in which a robot comes to the end of its way [m], [k, 2]."""
+    step = way[-1] - way[-2] if len(way) > 1 else np.array([1.0, 0.0])
+    return math.atan2(step[1], step[0])
