@@ -108,6 +108,8 @@ class CommConfig:
     the cells that the signal's model counts [m], "auto" an 80th of the greatest radar range, as in IR2, where a sensor
     reaches 80 cells. ``noise`` [dB] is how much each part of the loss fades at most, drawn for every pair and moment.
 
+    ``loss`` is the probability that two radios miss what they say to each other in a local step.
+
     ``base_station`` is a radio with a map of its own: True stands where robot 0 starts, or it is a place (x, y) [m].
 
     ``strategy`` is what robots do to tell others what they know, whatever their policy (`maexp.envs.strategy`):
@@ -121,6 +123,7 @@ class CommConfig:
     threshold: float = -70.0
     cell: float | Literal["auto"] = "auto"
     noise: float = 0.0
+    loss: float = 0.0
     base_station: bool | tuple[float, float] = False
     strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = "opportunistic"
     period: int = 8
@@ -128,7 +131,7 @@ class CommConfig:
     @property
     def limited(self) -> bool:
         """Whether robots may know different things."""
-        return self.line_of_sight or math.isfinite(self.range) or self.signal or self.has_base
+        return self.line_of_sight or math.isfinite(self.range) or self.signal or self.loss > 0.0 or self.has_base
 
     @property
     def has_base(self) -> bool:
@@ -316,6 +319,7 @@ def check_comm(config: CommConfig) -> CommConfig:
             raise ValueError(f"comm.{name}={getattr(config, name)!r} must be true or false")
     _check_number("comm.power", config.power, "a finite number of dBm")
     _check_number("comm.threshold", config.threshold, "a finite number of dBm")
+    _check_number("comm.loss", config.loss, "a share from 0 to 1 (comm.range=0 parts all)", least=0.0, most=1.0)
     _check_number("comm.noise", config.noise, "a finite number of dB, 0 or more", least=0.0)
     if config.signal and config.threshold >= config.power - SIGNAL_LOSS:
         raise ValueError(

@@ -128,6 +128,7 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         limited=settings.limited,
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
+        loss=comm.loss,
         signal=comm.signal,
         base_x=base[0],
         base_y=base[1],

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.geometry import segment_distance
+from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.radio import radio_at, receive_signals
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
+
+LOSS_KEY = 3 << 24  # apart from other random numbers
 
 
 @wp.kernel
@@ -144,8 +147,13 @@ def _hear_robots(
     # Settings:
     comm_range: float,
     line_of_sight: int,
+    loss: float,
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
+    seed: wp.array(dtype=wp.int32),  # [1]
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
+    local_step: wp.array(dtype=wp.int32),  # [env]
     failed: wp.array2d(dtype=wp.int32),  # [env, robot]
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     base: wp.array(dtype=wp.vec3),  # [env]
@@ -154,7 +162,7 @@ def _hear_robots(
     hears: wp.array3d(dtype=wp.int32),  # [env, radio, word]
 ):
     """Decide whom radio (e, i) hears: itself, and radios in range (and in sight, if asked); failed ones neither hear
-    nor are heard."""
+    nor are heard. Messages are lost by (seed, env, episode, step, pair)."""
     e, i = wp.tid()
     if active[e] == 0:
         return
@@ -163,14 +171,19 @@ def _hear_robots(
         hears[e, i, w] = 0
     robots = center.shape[1]
     for other in range(hears.shape[1]):
-        a = radio_at(e, wp.min(i, other), center, base)
-        b = radio_at(e, wp.max(i, other), center, base)
+        low = wp.min(i, other)
+        high = wp.max(i, other)
+        a = radio_at(e, low, center, base)
+        b = radio_at(e, high, center, base)
         heard = wp.length(a - b) <= comm_range and works(e, i, failed) and works(e, other, failed)
         if heard and line_of_sight != 0 and other != i:
             # walls block whatever the radar's obstacle radius: half a diagonal of the spacing closes them
             width = 0.70710678 * maps.resolution[m]
             # one direction for both, lest rounding let only one hear the other
             heard = not is_blocked(maps, m, a, b, width)
+        if heard and loss > 0.0:
+            key = LOSS_KEY + low * hears.shape[1] + high
+            heard = keyed_uniform(seed[0], env_id[e], episode[e], local_step[e], key) >= loss
         if other == i:
             heard = True
         if i < robots and other < robots:

@@ -32,6 +32,7 @@ class Settings:
     limited: bool  # whether communication is
     comm_range: float  # [m]
     line_of_sight: bool  # whether walls block communication
+    loss: float  # probability that two radios miss each other in a local step
     signal: bool  # whether radios hear what arrives of a signal
     base_x: float  # where the base station is [m]; inf: where robot 0 starts
     base_y: float

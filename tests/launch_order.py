@@ -100,7 +100,7 @@ def setups() -> dict:
     from maexp.envs import CommConfig, FaultsConfig, ObservationConfig, PlannerConfig, RobotConfig
 
     near, sight = CommConfig(range=9.0), CommConfig(range=20.0, line_of_sight=True)
-    base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, base_station=True)
+    base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, loss=0.2, base_station=True)
     kinds = [RobotConfig(kind=kind) for kind in ("ackermann", "differential", "omnidirectional", "ackermann")]
     dwa, wavefront = (PlannerConfig(name=name) for name in ("dwa", "wavefront"))
     return {

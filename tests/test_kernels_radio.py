@@ -10,6 +10,7 @@ import maexp.kernels as mk
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.kernels import unpack_flags
+from maexp.kernels.merge import LOSS_KEY
 from maexp.kernels.radio import FADING_KEY
 
 pytestmark = pytest.mark.kernels
@@ -93,6 +94,25 @@ def test_links_are_those_of_the_oracle(noise):
                         checked, heard = checked + 1, heard + found[e, i, j]
         td = env.step(act(env, generator).update(td.select("done", "terminated")))["next"]
     assert checked > 200 and 0.1 * checked < heard < 0.9 * checked
+
+
+def test_messages_are_lost_by_their_key():
+    """Both ways alike, a share of the pairs in reach in every local step."""
+    env, lost = make(6, comm=CommConfig(loss=0.3, base_station=True)), []
+
+    def compare(env):
+        s = env.simulation.tensors
+        step = max(int(s["local_step"][0]) - 1, 0)
+        for e, found in enumerate(links(env)):
+            draw = {(i, j): radio.uniform(5, e, int(s["episode"][e]), step, LOSS_KEY + 7 * i + j)
+                    for i in range(7) for j in range(i + 1, 7)}  # fmt: skip
+            wanted = [[i == j or draw[min(i, j), max(i, j)] >= 0.3 for j in range(7)] for i in range(7)]
+            assert found.tolist() == wanted
+            lost.append(1.0 - (found.sum() - 7) / 42)
+
+    env.set_step_hook(compare)
+    play(env, 3)
+    assert len(lost) == 39 and 0.25 < np.mean(lost) < 0.35
 
 
 def play(env: ExplorationEnv, steps: int):
