@@ -3,6 +3,7 @@
 from typing import Literal
 
 from maexp.agents import build
+from maexp.agents.commands.evaluate import find_teams
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_recipe
@@ -10,6 +11,7 @@ from maexp.agents.settings.overrides import find_override, make_overrides
 from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
+from maexp.agents.training.named import suit_observation
 from maexp.envs import ExplorationEnv
 
 RUNS = {"train": "resume", "evaluate": "checkpoint"}
@@ -25,7 +27,7 @@ def make_env(
 
     Args:
         words: settings as on the command line, "scenario=maze_small", "num_envs=64"; with "resume=RUN" (evaluate:
-            "checkpoint=RUN") those of a run come first.
+            "checkpoint=RUN") those of a run come first; evaluate: with "policy=NAME" it shows what that looks at.
         verb: whose defaults.
         split: maps that are trained on, that choose between checkpoints and planners, or that are held out; None: those
             that the verb plays first, "train" or "held_out".
@@ -50,6 +52,8 @@ def make_env(
         if split not in ("train", "validation", "held_out"):
             raise UserError(f"split={split} is unknown: choose train, validation or held_out.")
         others = {}
+        if verb == "evaluate" and (teams := find_teams(cfg)):
+            suit_observation(cfg, teams)
         if verb == "train":
             others["device"] = build.choose_device(cfg, "sample_device" if split == "train" else "train_device")
         return build.make_env(cfg, getattr(suite, split), sizes[0], **others)

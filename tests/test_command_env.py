@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from maexp.agents import make_env
+from maexp.agents import make_env, make_policy
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import evaluate_all
 from maexp.agents.errors import UserError
@@ -80,6 +80,16 @@ def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
 def test_mistakes_are_told_in_a_sentence(words, options, told):
     with pytest.raises(UserError, match=told):
         make_env(*words, **options)
+
+
+def test_the_env_of_an_evaluation_shows_what_its_policy_looks_at():
+    env = make_env("policy=universal", *WORDS, verb="evaluate")
+    assert env.observation_config.targets == 24 and not env.observation_config.pictures
+    make_policy("universal", env)
+    blind = make_env("policy=voronoi", *WORDS, verb="evaluate")
+    assert blind.observation_config.targets == 0
+    with pytest.raises(UserError, match=r"looks at 24 targets, and the env shows 0: .* observation\.targets=24"):
+        make_policy("universal", blind)
 
 
 def test_a_map_of_ones_own(tmp_path):

@@ -96,9 +96,7 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         maps = suite.held_out
         places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
-        players = find_players(words_of(cfg.policy))
-        if cfg.checkpoint is not None:
-            players.insert(0, find_trained(cfg))
+        players = find_teams(cfg)
         suit_observation(cfg, players)
         envs = [[make_env(cfg, place, size, count) for place in places] for size in team_sizes(cfg.num_robots)]
         for player in players:
@@ -129,6 +127,12 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     if cfg.render:
         print(f"Next: {command('view', short(where), 'browser=true')}")
     return 0
+
+
+def find_teams(cfg: EvaluateSettings) -> list[Player]:
+    """Who is evaluated: the policy of `checkpoint`, then those of `policy`."""
+    trained = [] if cfg.checkpoint is None else [find_trained(cfg)]
+    return trained + find_players(words_of(cfg.policy))
 
 
 def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> Player:

@@ -77,7 +77,8 @@ class Player:
         if self.targets not in (None, shown.targets):
             raise UserError(
                 f"policy {self.name} looks at {self.targets} targets, and the env shows {shown.targets}: "
-                f"make it with observation=ObservationConfig(targets={self.targets})."
+                f"make it with observation=ObservationConfig(targets={self.targets}), as a word "
+                f"observation.targets={self.targets}."
             )
         check_planner(env.planner_config.name, [self])
         return self.build(env)

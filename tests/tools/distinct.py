@@ -46,7 +46,7 @@ def watch(tracker, needless: np.ndarray, over: torch.Tensor) -> None:
 
 def play(policy: str, scenario: str, episodes: int, distinct: bool) -> EvaluationResult:
     """The episodes of a planner, with what `ROWS` wants."""
-    words = (f"scenario={scenario}", f"num_envs={episodes}", f"targets.distinct={str(distinct).lower()}", *WORDS)
+    words = (f"policy={policy}", f"scenario={scenario}", f"num_envs={episodes}", f"targets.distinct={distinct}", *WORDS)
     env = make_env(*words, verb="evaluate")
     chooser = make_policy(policy, env)
     needless, over = np.zeros(episodes), torch.zeros(episodes, dtype=torch.bool)

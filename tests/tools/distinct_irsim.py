@@ -1,7 +1,8 @@
-"""Teams that start together in ir-sim, with distinct targets and without: one line for each trial.
+"""Teams that start together in ir-sim, with distinct targets and without: a table, one row for each trial.
 
 `python tests/tools/distinct_irsim.py FLOOR.yaml cost_utility 3 240` plays three starts of three robots, at most 240 s
-each. Needless duplicates are counted as in `python -m maexp.agents.runtime simulate`.
+each. Before is without distinct targets. Needless duplicates are counted as in
+`python -m maexp.agents.runtime simulate`.
 """
 
 import sys
@@ -12,7 +13,7 @@ from maexp.agents.irsim.config import TrialConfig
 from maexp.agents.irsim.trial import Trial, run_trial
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime.simulate import MARKS, count_close
-from maexp.envs import ExplorationEnv
+from maexp.envs import ExplorationEnv, RobotConfig
 from maexp.envs.importing import import_map
 
 ROBOTS, RADIUS, REACH, SPEED, DT = 3, 0.2, 4.0, 0.6, 0.1
@@ -31,7 +32,8 @@ class Counting(TeamPlanner):
 
 def play(world, policy: str, seed: int, seconds: float, distinct: bool) -> tuple[Trial, int]:
     """A trial from a place of its own, and its needless duplicates."""
-    env = ExplorationEnv(world, 1, ROBOTS, seed=seed, starts="together", num_threads=1)
+    robot = RobotConfig("differential", radius=RADIUS)
+    env = ExplorationEnv(world, 1, ROBOTS, robot=robot, seed=seed, starts="together", num_threads=1)
     env.reset()
     now = env.snapshot()
     starts = np.concatenate([now["center"], now["pose"][:, 3:4]], axis=1).astype(float)
@@ -40,17 +42,24 @@ def play(world, policy: str, seed: int, seconds: float, distinct: bool) -> tuple
     return run_trial(world, planner, starts, config), planner.needless
 
 
+def row(policy: str, seed: int, distinct: bool, trial: Trial, needless: int) -> str:
+    """A trial as a row of the table."""
+    seen = np.array(trial.coverage)
+    when = [f"{DT * (seen >= mark).argmax():.0f}" if (seen >= mark).any() else "" for mark in MARKS]
+    done = "" if trial.done_at is None else f"{trial.done_at:.0f}"
+    end = [f"{100 * seen[-1]:.1f}", f"{trial.path.sum():.0f}", needless, trial.collided.sum()]
+    return " | ".join(map(str, [f"| {policy}", seed, "after" if distinct else "before", *when, done, *end])) + " |"
+
+
 def main(file: str, policy: str, runs: int, seconds: float) -> None:
-    """Print the trials."""
-    world = import_map(file, num_robots=ROBOTS)
+    """Print the table."""
+    world = import_map(file, num_robots=ROBOTS, robot_radius=RADIUS)
+    names = ["| policy", "seed", "targets", *(f"{100 * mark:g} % [s]" for mark in MARKS), "done [s]", "seen [%]"]
+    print(" | ".join([*names, "driven [m]", "needless duplicates", "robots lost |"]))
+    print("|" + 10 * " --- |")
     for seed in range(runs):
-        for distinct in (True, False):
-            trial, needless = play(world, policy, seed, seconds, distinct)
-            seen = np.array(trial.coverage)
-            when = [f"{100 * m:g} % {DT * (seen >= m).argmax():.0f} s" for m in MARKS if (seen >= m).any()]
-            end = f"done at {trial.done_at} s, {100 * seen[-1]:.1f} % seen; {trial.path.sum():.0f} m driven"
-            print(f"{policy}, {'distinct' if distinct else 'shared'}, seed {seed}: {', '.join(when)}; {end}; needless "
-                  f"duplicates {needless}, robots lost {trial.collided.sum()}", flush=True)  # fmt: skip
+        for distinct in (False, True):
+            print(row(policy, seed, distinct, *play(world, policy, seed, seconds, distinct)), flush=True)
 
 
 if __name__ == "__main__":
