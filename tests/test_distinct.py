@@ -1,10 +1,13 @@
 """While there are targets to spare, robots that hear each other go to different places, whoever chooses."""
 
+import numpy as np
 import pytest
 import torch
 from mazes import MAPS
 from tensordict.nn import InteractionType
+from tools.distinct import steps_to
 
+from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.policies.load import load_policy_folder
@@ -164,3 +167,10 @@ def test_robots_for_which_no_target_is_left(spare):
 def test_wrong_settings_are_named(name, value):
     with pytest.raises(ValueError, match=f"targets.{name}='{value}'"):
         make_env(targets=TargetsConfig(**{name: value}))
+
+
+def test_the_table_counts_steps_however_early_all_episodes_end():
+    """Curves end with the last episode: their length is no limit."""
+    curves = np.array([[0.1, 0.5, 0.996, 0.996], [0.1, 0.2, 0.3, 0.995], [0.1, 0.2, 0.2, 0.2]])
+    result = EvaluationResult("p", 3, {}, 0.0, np.array(["m"] * 3), times=np.arange(4.0), coverage=curves)
+    assert steps_to(result, 0.995, 1200).tolist() == [20.0, 30.0, 1200.0]

@@ -13,6 +13,7 @@ import torch
 
 from maexp.agents import make_env, make_policy
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded
+from maexp.kernels.types import DT
 
 GOAL = 0.995
 WORDS = ("scenario.starts=together", f"scenario.success_coverage={GOAL}", "scenario.macro_steps=60", "num_threads=1")
@@ -57,11 +58,15 @@ def play(policy: str, scenario: str, episodes: int, distinct: bool) -> Evaluatio
         return chooser(state)
 
     result = evaluate_recorded(choose, env, episodes, name=policy)
-    there = result.coverage.max(1) >= GOAL
-    limit = env.local_steps * env.macro_steps
-    first = (result.coverage >= GOAL).argmax(1) / (result.coverage.shape[1] - 1) * limit
-    result.episodes.update(last=np.where(there, first, limit), there=1.0 * there, needless=needless)
+    last = steps_to(result, GOAL, env.local_steps * env.macro_steps)
+    result.episodes.update(last=last, there=1.0 * (result.coverage.max(1) >= GOAL), needless=needless)
     return result
+
+
+def steps_to(result: EvaluationResult, share: float, limit: int) -> np.ndarray:
+    """The local step of the first record at which each episode had covered a share, or the limit; [episodes]."""
+    there = result.coverage >= share
+    return np.where(there.any(1), result.times[there.argmax(1)] / DT, limit)
 
 
 def main(policy: str, episodes: int, scenarios: list[str]) -> None:
