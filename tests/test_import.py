@@ -116,6 +116,26 @@ def test_a_radius_decides_what_a_robot_fits_through(tmp_path):
         import_map(path, robot_radius=-1)
 
 
+def test_what_lies_behind_narrow_gaps_is_told_with_the_setting_that_decides(tmp_path):
+    image = np.full((150, 150), UNKNOWN, dtype=np.uint8)
+    image[10:140, 10:140] = FREE
+    image[10:140, 74:76] = WALL
+    image[70:75, 74:76] = FREE  # a door of 0.5 m
+    path = write_ros(tmp_path, image)
+
+    def warnings(**settings) -> str:
+        return " ".join(import_map_with_report(path, **settings)[1].warnings)
+
+    assert not warnings(robot_radius=0.2)
+    lies = r"\d\d% of the free space lies behind gaps narrower than"
+    assert re.search(lies + r" 0\.7 m, too narrow for a robot of robot\.radius=0\.35", warnings(robot_radius=0.35))
+    assert re.search(lies + r" importing\.min_passage=0\.8 m, and .* set less", warnings(min_passage=0.8))
+    with pytest.raises(MapError, match=r"found 0\.0 m2 .* robot\.radius=50 can use .* a smaller robot\.radius"):
+        import_map(path, robot_radius=50)
+    with pytest.raises(MapError, match=r"found 0\.0 m2 .* set a smaller importing\.min_passage"):
+        import_map(path, min_passage=100)
+
+
 def test_coarse_pixels_are_cut_to_what_keeps_a_robot_from_colliding(tmp_path):
     """A robot of `pointcloud` collides 0.3 m from a point, one of `indoor_small` at 0.06 m."""
     for scenario, pixel, threshold in (("pointcloud", 0.5, 0.3), ("indoor_small", 0.1, 0.06)):

@@ -22,6 +22,7 @@ STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of th
 KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
 CLEANED_CELLS = 6_000_000  # cleaning takes some 200 bytes a cell
 POINTS_IN_RANGE = 2.0  # a radar must reach this many points far
+LOST_SHARE = 0.2  # of the free space behind narrow gaps: from here on it is worth a warning
 GAP = 2.0  # points farther apart than this many collision thresholds let a robot through
 
 
@@ -40,6 +41,7 @@ def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOpt
     _warn_of_coarse_cells(cleaned, scenario, options, report)
     report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
     cleaned.tell(report)
+    _warn_of_narrow_gaps(cleaned, scenario, options, report)
     return _to_map(cleaned.grid, scenario, name, options, report)
 
 
@@ -81,6 +83,18 @@ def _warn_of_coarse_cells(cleaned: _Cleaned, scenario: Scenario, options: Import
         f"{what} coarser than {threshold:g} m, the distance at which {_whose(options, scenario)} collides, so "
         f"robots may be lost at ragged walls; {remedy}"
     )
+
+
+def _warn_of_narrow_gaps(cleaned: _Cleaned, scenario: Scenario, options: ImportOptions, report: ImportReport) -> None:
+    lost = (cleaned.dropped_gaps + cleaned.dropped_rest) / (cleaned.free_before - cleaned.dropped_pieces)
+    if lost < LOST_SHARE:
+        return
+    if options.min_passage is not None:
+        why = f"importing.min_passage={options.min_passage:g} m, and is left out; set less to keep it"
+    else:
+        why = f"{cleaned.passage:g} m, too narrow for {_whose(options, scenario)}, and is left out; if yours are "
+        why += "smaller, say how large they are with robot.radius"
+    report.warn(f"{lost:.0%} of the free space lies behind gaps narrower than {why}")
 
 
 def _whose(options: ImportOptions, scenario: Scenario) -> str:
@@ -201,6 +215,8 @@ def _require_room(cleaned: _Cleaned, options: ImportOptions, scenario: Scenario)
     if cleaned.room >= options.num_robots:
         return
     hint = "use a finer importing.resolution, fewer robots, or check importing.units, up and floor"
+    if options.min_passage is not None:
+        hint = f"set a smaller importing.min_passage, {hint}"
     if options.robot_radius is not None:
         size, hint = f"a robot of robot.radius={options.robot_radius:g}", f"say a smaller robot.radius, {hint}"
     else:

@@ -174,15 +174,16 @@ def close_gaps(grid: Grid, clearance: float, component) -> tuple[Grid, int]:
     """Drops free space behind gaps that a robot of `clearance` [m] cannot pass, so that nothing is out of reach.
 
     The drivable places fall into pieces; every free cell belongs to the piece it is nearest to along free cells.
-    Cells of the other pieces become unknown. Returns the grid and how many cells were dropped.
+    Cells of the other pieces become unknown, all cells where no robot finds room. Returns the grid and how many cells
+    were dropped.
     """
     pieces, count = ndimage.label(drivable(grid, clearance))
     free = grid.labels == FREE
     owner = _piece_of_cells(pieces, free)
     reached = owner > 0
     if not reached.any():
-        return grid, 0
-    if isinstance(component, str):
+        chosen = -1
+    elif isinstance(component, str):
         chosen = int(np.bincount(owner[reached]).argmax())
     else:
         cells = np.argwhere(reached)
