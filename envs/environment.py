@@ -34,7 +34,7 @@ from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.reward import MARKS
 from maexp.kernels.state import STATE
-from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, REGIONS
+from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, REGIONS, ROOM_UNIT
 
 PICTURES = (("agents", "observation", "map"), ("team", "map"))
 """Observations that are pictures."""
@@ -326,14 +326,17 @@ class ExplorationEnv(EnvBase):
         error = self.simulation.tensors["error"]
         if not bool(error.any()):
             return
-        code = int(torch.bitwise_and(error, ERRORS).max())
-        env = int(error.argmax())
+        codes = torch.bitwise_and(error, ERRORS)
+        code = int(codes.max())
+        word, env = torch.where(codes == code, error, torch.iinfo(error.dtype).max).min(0)
+        room, env = int(word) // ROOM_UNIT, int(env)
         error.zero_()
         if code & ERROR_CAPACITY:
             raise RuntimeError(f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/bank.py")
         if code & ERROR_START:
             raise MapError(
-                f"no free start was left for num_robots={self.num_robots} robots (env {env}): {NO_ROOM}"
+                f"starts drawn at random left room for {room} of num_robots={self.num_robots} robots (env {env}): "
+                f"{NO_ROOM}"
             )
         raise ValueError(f"the action of env {env} is NaN or infinite: the policy has diverged or was fed wrongly")
 

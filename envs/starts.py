@@ -84,7 +84,7 @@ def _fix_map(m: PointCloudMap, thresholds: np.ndarray, seed: int) -> np.ndarray:
     for i in range(len(need)):
         fits = (np.minimum(far, nearest) >= need[i]) & ~taken
         if not fits.any():
-            raise MapError(f"map {m.name} has no room for robot {i} of {len(need)} at fixed starts: {NO_ROOM}")
+            raise MapError(f"map {m.name} has room for {i} of num_robots={len(need)} robots at fixed starts: {NO_ROOM}")
         starts[i] = points[fits.argmax()]
         gap = np.linalg.norm(points - starts[i], axis=1)
         nearest, taken = np.minimum(nearest, gap), taken | (gap < need[i])

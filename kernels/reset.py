@@ -9,7 +9,7 @@ import warp as wp
 
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import BESIDE, ERROR_START, PI, START_CLEARANCE, Maps, Robots, point_xy
+from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
@@ -153,6 +153,7 @@ def _place_team(
         for i in range(pose.shape[1]):
             put_robot(e, i, point_xy(center[e, i]), PI * (2.0 * wp.randf(rng) - 1.0), robots, pose, center)
         return
+    crowded = wp.bool(False)
     for i in range(pose.shape[1]):
         point = int(-1)
         for _try in range(TRIES):
@@ -168,7 +169,9 @@ def _place_team(
                     break
         theta = PI * (2.0 * wp.randf(rng) - 1.0)
         if point < 0:
-            wp.atomic_or(error, e, ERROR_START)
+            if not crowded:
+                wp.atomic_or(error, e, ERROR_START + ROOM_UNIT * i)
+            crowded = True
             point = first
         put_robot(e, i, point_xy(maps.free[point]), theta, robots, pose, center)
 

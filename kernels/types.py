@@ -60,6 +60,8 @@ ERROR_START = 2
 ERROR_CAPACITY = 4
 """Bit of the error word: a scratch buffer overflowed."""
 ERRORS = ERROR_ACTION | ERROR_START | ERROR_CAPACITY
+ROOM_UNIT = 256
+"""The error word of a team without room for all holds so many times the robots that had room before it was crowded."""
 
 
 @wp.struct

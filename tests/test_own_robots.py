@@ -1,6 +1,7 @@
 """Settings of one's own robots on one's own floor: lengths of episodes, sizes that cannot be, radars without end."""
 
 import math
+import re
 import time
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from worlds import room
 from maexp.agents.build import team_configs
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import describe_radius, resolve
-from maexp.envs import ExplorationEnv, RadarConfig, RobotConfig
+from maexp.envs import ExplorationEnv, MapError, RadarConfig, RobotConfig
 from maexp.envs.config import complete_robot
 from maexp.envs.render import draw_teams
 from maexp.envs.scenarios import SCENARIOS, default_macro_steps
@@ -48,6 +49,17 @@ def test_an_episode_lasts_as_long_as_its_robots_need():
 def test_a_robot_larger_than_the_map_is_refused(size, told):
     with pytest.raises(ValueError, match=told):
         ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig(**size))
+
+
+@pytest.mark.parametrize("starts", ["drawn", "fixed"])
+def test_a_team_without_room_is_told_how_many_have(starts):
+    """Packed one beside the other 50 fit; drawn at random, fewer do."""
+    words = r"room for (\d+) of num_robots=45 robots.*use fewer robots, a smaller robot\.radius"
+    with pytest.raises(MapError, match=words) as told:
+        ExplorationEnv(FLOOR, 4, 45, robot=RobotConfig(radius=0.6), starts=starts, num_threads=1).reset()
+    room = int(re.search(words, str(told.value))[1])
+    assert 30 < room < 45
+    ExplorationEnv(FLOOR, 4, room - 2, robot=RobotConfig(radius=0.6), starts=starts, num_threads=1).reset()
 
 
 ROUND = {"length": 0.7, "width": 0.7, "collision_threshold": 0.35}
