@@ -29,7 +29,7 @@ class Verb:
 
 VERBS = {
     "train": Verb(
-        "trains a team, then evaluates it beside the random policy",
+        "trains a team, then evaluates it beside the untrained one and planners",
         ("maexp train algorithm=mappo scenario=maze", "maexp train resume=outputs/DATE/RUN",
          "maexp train -m algorithm=ippo,mappo seed=0,1,2"),
     ),

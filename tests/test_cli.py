@@ -155,6 +155,7 @@ BAD = {
     "an axis twice": (["bench", "scale", "axes=envs,envs"], "names envs twice"),
     "the end of a setting's name": (["bench", "scale", "robots=0"], "did you mean num_robots."),
     "a setting of two groups": (["train", "steps=3"], "did you mean scenario.local_steps or scenario.macro_steps or"),
+    "a setting twice": (["evaluate", "policy=random", "policy=voronoi"], "policy is given twice, policy=random and"),
     "a word too many": (["maps", "check", "a.npz", "b.npz"], "b.npz"),
 }
 

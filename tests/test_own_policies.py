@@ -52,6 +52,10 @@ def nothing(env):
 def an_agent(env):
     return Stay()
 
+def looks(env):
+    return lambda td: td["agents", "observation", "targets"]
+
+
 def raises(env):
     raise RuntimeError("no weights")
 
@@ -142,6 +146,7 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
         ("my_robots:nothing", "policy my_robots.nothing: called with the env it returned nothing"),
         ("my_robots:an_agent", "called with the env it returned a Stay: name its class itself"),
         ("my_robots:raises", r"calling it with the env raised RuntimeError in my_robots.py, line \d+: no weights"),
+        ("my_robots:looks", r"raised KeyError.* The env shows no targets: add observation.targets=24\."),
         ("my_robots:number", "policy my_robots.number returned a int: return the tensordict"),
         ("my_robots:no_action", "policy my_robots.no_action wrote no action: .* must hold region, int"),
         ("my_robots:no_offset", "policy my_robots.no_offset wrote no offset"),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from maexp.agents.runtime import TeamPlanner
+from maexp.agents.runtime import __main__ as runtime
 from maexp.agents.runtime.floors import make_floor, place_team, read_floor
 from maexp.agents.runtime.simulate import Floor, explore
 
@@ -88,3 +89,20 @@ def test_the_command(tmp_path):
         [sys.executable, "-m", "maexp.agents.runtime", "simulate", tmp_path / "no.yaml"], capture_output=True, text=True
     )
     assert wrong.returncode == 1 and wrong.stderr.startswith("error: ") and "Traceback" not in wrong.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("--robots 0", "--robots 0 must be 1 or more"), ("--runs 0", "--runs 0 must be"),
+        ("--radius -1", "--radius -1 must be more"), ("--speed nan", "--speed nan must be more"),
+        ("--picture gone/x.png", "--picture gone/x.png must be a .png file in a folder that is there"),
+        ("--metres 8.1 --start 900 0", "start=900 0 is no place for a robot of 0.35 m, nor is any near it: the"),
+        ("--metres 8.1 --start nan 0", "start=nan 0 is no place"),
+    ],
+)  # fmt: skip
+def test_the_command_refuses_in_a_sentence(words, told, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["runtime", "simulate", *words.split()])
+    with pytest.raises(SystemExit) as end:
+        runtime.main()
+    assert told in capsys.readouterr().err + str(end.value)

@@ -241,6 +241,7 @@ def test_view_plays_a_policy_on_the_map_that_is_given(tmp_path, capsys, monkeypa
     assert printed.count("maze_small_3, random, 2 robots") == 2 and "maexp view v browser=true" in printed
     assert [Episode.load(one).map.name for one in sorted(Path("v/episodes").iterdir())] == ["maze_small_3"] * 2
     assert "maze_small_3" in view(capsys, "v", "out=again.png", "size=300"), "its folder can be viewed again"
+    assert "maze_small_5, random" in view(capsys, "maze_small", "index=5", *words[:-2], "hydra.run.dir=w", "size=300")
 
 
 def test_view_of_a_run_plays_its_policy(tmp_path, capsys, monkeypatch):
@@ -304,6 +305,7 @@ def test_a_window_opens_where_there_is_a_display(episode, tmp_path, capsys, monk
         (["maze_small", "size=10"], "size=10"),
         (["maze_small", "num_envs=65"], "at most 64"),
         (["maze_small", "index=-1"], "index=-1"),
+        (["map.npz", "index=1"], "map.npz is one map"),
         (["maze_small", "more"], "'more'"),
     ],
 )

@@ -54,7 +54,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 def check(cfg: ViewSettings) -> None:
     """Raise UserError for what cannot be viewed, before a folder is made."""
     check_counts(cfg, "num_envs", "num_robots")
-    check_counts(cfg, "index", "port", least=0)
+    check_counts(cfg, *["index"] * (cfg.index is not None), "port", least=0)
     if cfg.num_envs > MOST_TEAMS:
         raise UserError(f"num_envs={cfg.num_envs} teams cannot be viewed at once: give at most {MOST_TEAMS}.")
     last = MOST_EPISODES - cfg.num_envs
@@ -132,7 +132,8 @@ def find_subject(cfg: ViewSettings, where: Path) -> tuple[list[Episode], PointCl
         return [Episode.load(file) for file in files[:MOST_TEAMS]], None
     if cfg.checkpoint is None and cfg.policy is None:
         return [], find_map(cfg, place)
-    maps = load_maps(cfg.scenario, train=False).held_out if place is None else [find_map(cfg, place)]
+    given_map = place is not None or cfg.index is not None
+    maps = [find_map(cfg, place)] if given_map else load_maps(cfg.scenario, train=False).held_out
     player = find_trained(cfg) if cfg.checkpoint is not None else find_player(cfg.policy)
     suit_observation(cfg, [player])
     player.check_maps(maps)
@@ -190,12 +191,22 @@ def split_name(file: Path) -> tuple[int, str]:
 
 
 def find_map(cfg: ViewSettings, place: Path | None) -> PointCloudMap:
-    """The map of a file, of scenario=pointcloud, or of a scenario and an index."""
+    """The map of a file, or the one with the index in a scenario, the first by default.
+
+    Raises:
+        UserError: an index where there is only one map, or of one that is not there.
+    """
     if place is not None:
+        if cfg.index is not None:
+            raise UserError(f"index={cfg.index} picks a map of a scenario, and {place} is one map: leave one out.")
         return import_map(str(place), **given(cfg.scenario.importing))
-    if SCENARIOS[cfg.scenario.name].build is None:
-        return import_files(cfg.scenario)[0]
-    return make_map(cfg.scenario.name, cfg.index)
+    index = cfg.index or 0
+    if SCENARIOS[cfg.scenario.name].build is not None:
+        return make_map(cfg.scenario.name, index)
+    maps = import_files(cfg.scenario)
+    if index >= len(maps):
+        raise UserError(f"index={index} is not here: scenario.path gives {len(maps)}, from 0 on.")
+    return maps[index]
 
 
 def check_team(cfg: ViewSettings, episodes: list[Episode]) -> None:

@@ -113,12 +113,20 @@ def make_own(found: Callable, env: ExplorationEnv, name: str) -> Callable[[Tenso
     try:
         policy = found(env)
     except Exception as error:
-        raise UserError(f"policy {name}: calling it with the env raised {describe_error(error)}.") from error
+        raise UserError(
+            f"policy {name}: calling it with the env raised {describe_error(error)}.{_missing_targets(error, env)}"
+        ) from error
     if not callable(policy):
         what = "nothing" if policy is None else f"a {type(policy).__name__}"
         instead = "name its class itself" if hasattr(policy, "act") else "return a policy on tensordicts"
         raise UserError(f"policy {name}: called with the env it returned {what}: {instead}.")
     return OwnPolicy(policy, env, name)
+
+
+def _missing_targets(error: Exception, env: ExplorationEnv) -> str:
+    """What to do where a policy looks for targets that the env does not show."""
+    wants = isinstance(error, KeyError) and "target" in str(error) and not env.observation_config.targets
+    return " The env shows no targets: add observation.targets=24." if wants else ""
 
 
 class OwnPolicy:
@@ -131,7 +139,7 @@ class OwnPolicy:
     """
 
     def __init__(self, policy: Callable, env: ExplorationEnv, name: str):
-        self.policy, self.name = policy, name
+        self.policy, self.name, self.env = policy, name, env
         self.shape = (env.num_envs, env.num_robots)
         self.targets = env.observation_config.targets
         self.direct = env.planner_config.name == "direct"
@@ -140,7 +148,9 @@ class OwnPolicy:
         try:
             answer = self.policy(tensordict)
         except Exception as error:
-            raise UserError(f"policy {self.name} raised {describe_error(error)}.") from error
+            raise UserError(
+                f"policy {self.name} raised {describe_error(error)}.{_missing_targets(error, self.env)}"
+            ) from error
         answer = tensordict if answer is None else answer
         if not isinstance(answer, TensorDictBase):
             raise UserError(f"policy {self.name} returned a {type(answer).__name__}: return the tensordict it gets.")

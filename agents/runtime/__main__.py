@@ -10,6 +10,7 @@ import itertools
 import logging
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def run(given: argparse.Namespace, grid: np.ndarray, cell: float, policy: str, s
     if given.notes:
         print("".join(f"    {one}\n" for one in course.notes), end="")
     if given.picture:
-        draw(given.picture, floor, course)
+        draw(given.picture, floor, course, policy)
     return course
 
 
@@ -110,8 +111,8 @@ def compare(policy: str, apart: list[Course], shared: list[Course], limit: float
     return "\n".join(lines)
 
 
-def draw(path: str, floor: Floor, course: Course) -> None:
-    """The floor, what was seen, and the robots' ways, as a picture."""
+def draw(path: str, floor: Floor, course: Course, policy: str) -> None:
+    """The floor, what was seen (white), and the ways of a policy's robots, as a picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # late: robots need it not
     from matplotlib.figure import Figure
 
@@ -121,10 +122,11 @@ def draw(path: str, floor: Floor, course: Course) -> None:
     extent = (0.0, width * floor.cell, 0.0, height * floor.cell)
     axes.imshow(shade, cmap="gray", origin="lower", extent=extent, vmin=0.0, vmax=1.0)
     for robot in range(course.tracks.shape[1]):
-        (line,) = axes.plot(*course.tracks[:, robot].T, linewidth=1.2)
+        (line,) = axes.plot(*course.tracks[:, robot].T, linewidth=1.2, label=f"robot {robot}")
         axes.plot(*course.tracks[0, robot], "o", color=line.get_color())
         axes.plot(*course.tracks[-1, robot], "s", color=line.get_color())
-    axes.set_title(f"{100 * course.share:.1f} % seen in {course.seconds:.0f} s; from dots to squares")
+    axes.legend(loc="upper right")
+    axes.set_title(f"{policy}: {100 * course.share:.1f} % seen in {course.seconds:.0f} s; ways from dots to squares")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     FigureCanvasAgg(figure).print_png(path)
@@ -144,7 +146,7 @@ def read_words(words: list[str]) -> argparse.Namespace:
     if simulates:
         parser.add_argument("floor", nargs="*", help="map_server yamls; default: rooms of our own")
         parser.add_argument("--policy", default="cost_utility", help="one or several: cost_utility,universal")
-        parser.add_argument("--start", type=float, nargs=2, help="x y [m] that the team begins at; default: drawn")
+        parser.add_argument("--start", type=float, nargs=2, help="x y [m] that the team begins near; default: drawn")
         parser.add_argument("--radius", type=float, default=0.35, help="of a robot [m]")
         parser.add_argument("--range", type=float, default=6.0, help="of its lidar [m]")
         parser.add_argument("--speed", type=float, default=0.6, help="[m/s]")
@@ -155,12 +157,27 @@ def read_words(words: list[str]) -> argparse.Namespace:
         parser.add_argument("--together", dest="distinct", action="store_false", help="robots may share a target")
         parser.add_argument("--compare", action="store_true", help="each run both ways, and a table of the differences")
         parser.add_argument("--notes", action="store_true", help="print what the planner says")
-        parser.add_argument("--picture", help="file to draw the last run in (.png)")
+        parser.add_argument("--picture", help="file to draw the last run in (.png), with its axes in metres")
     else:
         parser.add_argument("--calls", type=int, default=10, help="plans for each planner")
     given = parser.parse_args(words[1:] if simulates else words)
+    _check(parser, given)
     given.run = simulate if simulates else measure
     return given
+
+
+def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """End with a sentence for a number that is out of its range, or a picture that cannot be written."""
+    for name in ("metres", "resolution", "radius", "range", "speed", "seconds"):
+        value = getattr(given, name, 1.0)
+        if not 0.0 < value < np.inf:
+            parser.error(f"--{name} {value:g} must be more than 0")
+    for name in ("robots", "runs", "calls"):
+        if getattr(given, name, 1) < 1:
+            parser.error(f"--{name} {getattr(given, name)} must be 1 or more")
+    picture = Path(getattr(given, "picture", None) or "x.png")
+    if picture.suffix != ".png" or not picture.parent.is_dir():
+        parser.error(f"--picture {picture} must be a .png file in a folder that is there")
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 
 WALL, FREE = 100, 0
+NEAR = 1.0  # a team begins so near to where it was told to, or within four of its robots' radii [m]
 
 
 def make_floor(cells: int, room: int = 80, door: int = 10) -> np.ndarray:
@@ -61,7 +62,7 @@ def place_team(grid: np.ndarray, cell: float, radius: float, count: int, first) 
         first: x, y [m] that the robots stand nearest to, or a `numpy.random.Generator` that draws a place.
 
     Raises:
-        ValueError: there is no room.
+        ValueError: there is no room, or none near `first`.
     """
     open_ = distance_transform_edt(grid == FREE) * cell > radius + cell
     y, x = np.nonzero(open_)
@@ -71,7 +72,13 @@ def place_team(grid: np.ndarray, cell: float, radius: float, count: int, first) 
     if isinstance(first, np.random.Generator):
         first = room[first.integers(len(room))]
     parts, _ = label(open_)
-    home = np.linalg.norm(room - first, axis=-1).argmin()
+    away = np.linalg.norm(room - first, axis=-1)
+    home = away.argmin()
+    if not away[home] <= max(NEAR, 4.0 * radius):
+        raise ValueError(
+            f"start={first[0]:g} {first[1]:g} is no place for a robot of {radius:g} m, nor is any near it: "
+            f"the nearest is {room[home][0]:.1f} {room[home][1]:.1f}"
+        )
     room = room[parts[y, x] == parts[y[home], x[home]]]
     room = room[np.linalg.norm(room - first, axis=-1).argsort(kind="stable")]
     places: list[np.ndarray] = []

@@ -54,7 +54,7 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         multirun: commas mean a sweep, so they are left alone
 
     Raises:
-        UserError: a bare word too many, or one that is no override even when quoted.
+        UserError: a bare word too many, one that is no override even when quoted, or a setting with two values.
     """
     names = list(positional)
     known = {*schema(verb).__dataclass_fields__, "hydra"}
@@ -74,7 +74,17 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         result.append(_make_override(verb, name, value, multirun))
     if several:
         result.append(f"{names[0].removesuffix('...')}=[{','.join(several)}]")
+    _check_once(result)
     return result
+
+
+def _check_once(overrides: list[str]) -> None:
+    """Raise UserError for a setting with two values, one of which Hydra would drop without a word."""
+    first: dict[str, str] = {}
+    for word in overrides:
+        name = word.partition("=")[0]
+        if first.setdefault(name, word) != word:
+            raise UserError(f"{name} is given twice, {first[name]} and {word}: leave one out.")
 
 
 def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:

@@ -235,7 +235,7 @@ class ViewSettings(LearnerSettings):
 
     action: str = MISSING  # which file of conf/action
     place: str | None = setting(None, "a run, a checkpoint, a folder of maexp evaluate, an episode or a map")
-    index: int = setting(0, "which map of the scenario")
+    index: int | None = setting(None, "which map of the scenario; default: the first, for a team the first held out")
     policy: str | None = setting(None, "a policy to watch, as of maexp evaluate, on the map given or a held-out one")
     checkpoint: str | None = None  # what `place` becomes where it is a run
     num_robots: int = setting(3, "robots in a team")

@@ -83,7 +83,10 @@ def load_checkpoint(path: Path) -> dict:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file fails anywhere inside zip and pickle
-        raise UserError(f"{path} is not a whole checkpoint: it is damaged or something else.") from error
+        raise UserError(
+            f"{path} is not a whole checkpoint of maexp train: it is damaged or something else. "
+            "A model of another library plays as policy=module:function (docs/extending.md)."
+        ) from error
     if not _is_ours(state):
         raise UserError(f"{path} is no checkpoint of the kind {FORMAT}: train again, or use the version that wrote it.")
     return state

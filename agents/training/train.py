@@ -1,4 +1,4 @@
-"""The training loop: collect, learn, log, keep; then evaluate beside the random policy."""
+"""The training loop: collect, learn, log, keep; then evaluate beside others."""
 
 import math
 import signal
@@ -426,13 +426,14 @@ def ending(experience: Experience) -> Iterator[None]:
 
 @contextmanager
 def stop_on_signals() -> Iterator[list[int]]:
-    """A list that fills on Ctrl-C or SIGTERM, so that the loop can end cleanly; a second Ctrl-C ends at once."""
+    """A list that fills on Ctrl-C or SIGTERM, so that the loop can end cleanly; a second one ends at once."""
     received: list[int] = []
 
     def handle(number, frame):
         if received:
             raise KeyboardInterrupt
         received.append(number)
+        print("\nEnding after this iteration, with a checkpoint to go on from; once more ends at once.", flush=True)
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
