@@ -32,7 +32,7 @@ from maexp.agents.settings.schema import (
     LearnerSettings,
     ScenarioSettings,
     TrainSettings,
-    given,
+    read,
 )
 from maexp.envs import (
     CommConfig,
@@ -120,11 +120,11 @@ def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
 
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of scenario=pointcloud: `scenario.path` names a file, or several with commas between them."""
-    from maexp.envs.importing import import_map
+    from maexp.envs.importing import ImportOptions, import_map
 
     if not scenario.path:
         raise UserError("scenario=pointcloud needs a map: add scenario.path=FILE.")
-    maps = [import_map(path, **given(scenario.importing)) for path in split_paths(scenario.path)]
+    maps = [import_map(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
     names = [one.name for one in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
@@ -157,12 +157,12 @@ def make_env(
         robot=robot,
         radar=radar,
         planner=planner_config(cfg, find_scenario(maps[0].scenario)),
-        reward=RewardConfig(**given(cfg.reward)),
-        observation=ObservationConfig(**given(cfg.observation)),
-        comm=CommConfig(**given(cfg.comm)),
-        faults=FaultsConfig(**given(cfg.faults)),
-        targets=TargetsConfig(**given(cfg.targets)),
-        lookahead=LookaheadConfig(**given(cfg.lookahead)),
+        reward=read(RewardConfig, cfg.reward),
+        observation=read(ObservationConfig, cfg.observation),
+        comm=read(CommConfig, cfg.comm),
+        faults=read(FaultsConfig, cfg.faults),
+        targets=read(TargetsConfig, cfg.targets),
+        lookahead=read(LookaheadConfig, cfg.lookahead),
         local_steps=scenario.local_steps,
         macro_steps=scenario.macro_steps,
         collision=scenario.collision,
@@ -227,14 +227,13 @@ def team_configs(
     An entry of `robot.team` holds settings of a robot, and under `radar` those of its radar. A team larger than
     the list repeats it.
     """
-    radar = given(cfg.radar)
     if not cfg.robot.team:
-        return robot_config(cfg), RadarConfig(**radar)
+        return robot_config(cfg), read(RadarConfig, cfg.radar)
     entries = OmegaConf.to_container(cfg.robot.team)
     _check_team(entries)
     entries = [entries[i % len(entries)] for i in range(num_robots)]
     robots = [robot_config(cfg, one) for one in entries]
-    return robots, [RadarConfig(**(radar | one.get("radar", {}))) for one in entries]
+    return robots, [read(RadarConfig, cfg.radar, **one.get("radar", {})) for one in entries]
 
 
 def _check_team(entries: object) -> None:

@@ -6,7 +6,7 @@ stopped goes on where it was when it is given again; more conditions, scenarios,
 
 import json
 import sys
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -21,7 +21,7 @@ from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import write_json, write_text
 from maexp.agents.locking import lock
 from maexp.agents.settings.overrides import quote
-from maexp.agents.settings.ranges import check_ranges, whole
+from maexp.envs.fields import check_settings, setting
 
 IR2 = ("comm=ir2",)
 BASE = (*IR2, "comm.base_station=true")
@@ -56,27 +56,18 @@ PLAN, TABLE, FORMAT = "conditions.json", "conditions.md", "maexp-conditions-1"
 
 @dataclass(frozen=True)
 class ConditionsConfig:
-    """What is played.
+    """What is played."""
 
-    Attributes:
-        out: folder for the evaluations and the table.
-        conditions: some of `CONDITIONS`; the first of these joins them by itself.
-        scenarios: whose held-out maps are played.
-        teams: sizes.
-        policies: each as `maexp evaluate policy=` takes it.
-        episodes: of each condition, scenario, size and policy.
-        num_envs: teams at once.
-        seed: of maps, starts and everything else.
-    """
-
-    out: str = "conditions"
-    conditions: list[str] = field(default_factory=lambda: list(CONDITIONS))
-    scenarios: list[str] = field(default_factory=lambda: ["indoor_medium", "indoor_large", "maze"])
-    teams: list[int] = field(default_factory=lambda: [3, 5])
-    policies: list[str] = field(default_factory=lambda: ["cost_utility", "hungarian", "universal"])
-    episodes: int = whole(64)
-    num_envs: int = whole(32)
-    seed: int = whole(0, least=0)
+    out: str = setting("conditions", "folder for the evaluations and the table")
+    conditions: list[str] = setting(list(CONDITIONS), "some of `CONDITIONS`; the first of these joins them by itself")
+    scenarios: list[str] = setting(["indoor_medium", "indoor_large", "maze"], "whose held-out maps are played")
+    teams: list[int] = setting([3, 5], "sizes")
+    policies: list[str] = setting(
+        ["cost_utility", "hungarian", "universal"], "each as `maexp evaluate policy=` takes it"
+    )
+    episodes: int = setting(64, "of each condition, scenario, size and policy", low=1)
+    num_envs: int = setting(32, "teams at once", low=1)
+    seed: int = setting(0, "of maps, starts and everything else", low=0)
 
 
 KEPT = ("episodes", "num_envs", "seed")  # of a folder: the rest may grow
@@ -170,7 +161,7 @@ def read_config(words: list[str]) -> ConditionsConfig:
         chosen = {next(iter(CONDITIONS)), *values["conditions"]}
         values["conditions"] = [name for name in CONDITIONS if name in chosen]
         config = ConditionsConfig(**values)
-        check_ranges(config, "conditions")
+        check_settings(config, "conditions")
     except (OmegaConfBaseException, ValueError) as error:
         raise UserError(" ".join(str(error).split())) from error
     return config

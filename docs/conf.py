@@ -21,13 +21,19 @@ autodoc_default_options = {"members": True}
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
-napoleon_custom_sections = [(name, "params_style") for name in ("Robot and map", "Clouds and meshes", "Cleaning")]
 python_use_unqualified_type_names = True
 
 
 def escape(app, what, name, obj, options, lines):
     """Shapes as [*, robots] and |free| mean themselves in our docstrings, not emphasis and substitution."""
     lines[:] = [line.replace("[*,", r"[\*,").replace("|free|", r"\|free\|") for line in lines]
+
+
+def list_settings(app, what, name, obj, options, lines):
+    """The settings of a dataclass, one a line, as its fields declare them."""
+    from maexp.envs.fields import describe
+
+    lines += describe(obj) if isinstance(obj, type) else []
 
 
 def draw_leaderboard(app, error):
@@ -43,3 +49,4 @@ def draw_leaderboard(app, error):
 def setup(app):
     app.connect("build-finished", draw_leaderboard)
     app.connect("autodoc-process-docstring", escape)
+    app.connect("autodoc-process-docstring", list_settings)

@@ -1,63 +1,84 @@
-"""Settings of the env as dataclasses; every default that a scenario fixes comes from its row of the table."""
+"""Settings of an env as dataclasses; every default that a scenario fixes comes from its row of the table."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
+from maexp.envs.fields import check_settings, check_value, kinds, setting, words_of
 from maexp.envs.scenarios import Scenario
 
 STARTS = ("drawn", "together", "fixed")
 """Where robots start, besides poses that are given: drawn at every reset, each by itself or all beside each other, or
 drawn once for each map and kept."""
+MOST_CANDIDATES = 64
+MOST_HORIZON = 100
+MOST_TARGETS = 256  # that a robot is shown
+PLANNERS = {
+    "dwa": "dynamic window: straight to the goal, around what is near (paper)",
+    "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
+    "direct": "none: the policy itself accelerates and steers",
+}
+CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
+SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
+CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """One robot. Lengths in metres, speeds in m/s, angles in radians; None takes the scenario's value.
+    """One robot; None takes the scenario's value. ``radius`` makes the body round: length, width and collision
+    threshold follow from it (`Scenario.with_radius`)."""
 
-    ``max_yaw_rate`` [rad/s] is the turn limit of a differential drive, ``max_steer`` that of a car.
-    ``wheelbase`` of a car is metres, or "width" (None, the default) or "length" of the body. ``radius`` makes the body
-    round: length, width and collision threshold follow from it (`Scenario.with_radius`).
-    """
-
-    kind: Literal["ackermann", "differential", "omnidirectional"] = "ackermann"
-    length: float | None = None
-    width: float | None = None
-    wheelbase: float | Literal["width", "length"] | None = None
-    max_speed: float | None = None
-    max_accel: float | None = None
-    max_steer: float | None = None
-    max_yaw_rate: float = math.pi / 2
-    collision_threshold: float | None = None
-    radius: float | None = None
+    kind: Literal["ackermann", "differential", "omnidirectional"] = setting("ackermann", "how it drives")
+    length: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_length")
+    width: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_width")
+    wheelbase: float | Literal["width", "length"] | None = setting(
+        None, "of a car, or width or length: that of the body; default: its width", unit="m", above=0
+    )
+    max_speed: float | None = setting(None, "greatest speed", unit="m/s", above=0, scenario="max_speed")
+    max_accel: float | None = setting(None, "greatest acceleration", unit="m/s^2", above=0, scenario="max_accel")
+    max_steer: float | None = setting(None, "steering limit of a car", unit="rad", above=0, scenario="max_steer")
+    max_yaw_rate: float = setting(math.pi / 2, "turn limit of a differential drive", unit="rad/s", above=0)
+    collision_threshold: float | None = setting(
+        None, "centre to a wall or another centre", unit="m", above=0, scenario="collision_threshold"
+    )
+    radius: float | None = setting(
+        None, "of a round body, which says length, width and collision_threshold", unit="m", above=0
+    )
 
 
 @dataclass(frozen=True)
 class RadarConfig:
-    """A robot's range sensor. ``obstacle_radius`` "auto" is each obstacle's spacing / sqrt(2)."""
+    """A robot's range sensor."""
 
-    range: float | None = None
-    fov: float = 2.0 * math.pi
-    alpha1: float = 1e-3
-    alpha2: float = 1e-6
-    obstacle_radius: float | Literal["auto"] = "auto"
+    range: float | None = setting(None, "how far it sees", unit="m", above=0, scenario="radar_range")
+    fov: float = setting(2.0 * math.pi, "field of view", unit="rad", above=0)
+    alpha1: float = setting(1e-3, "1 - cos of a beam's half width; 1e-3: 2.56 degrees", low=0, high=2)
+    alpha2: float = setting(
+        1e-6, "an obstacle point hides what is behind it, and before it what is nearer by less than this", unit="m"
+    )
+    obstacle_radius: float | Literal["auto"] = setting(
+        "auto", "of an obstacle point; auto: its spacing / sqrt(2)", unit="m", low=0
+    )
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
     """How a robot drives to its goal (docs/planners.md)."""
 
-    name: Literal["dwa", "wavefront", "direct"] = "wavefront"
-    num_accel: int = 3
-    num_steering: int | None = None
-    horizon: int = 3
-    clearance_factor: float | None = None
-    clearance_weight: float = 100.0
-    replan_steps: int = 5
-
-
-TIME_ON = ("uncovered", "covered", "gained")  # numbered as in kernels/reward.py
+    name: Literal["dwa", "wavefront", "direct"] = setting(
+        "wavefront", "dwa: straight to the goal; wavefront: on a way through the known map; direct: the policy steers"
+    )
+    num_accel: int = setting(3, "DWA's candidates of the acceleration", low=1)
+    num_steering: int | None = setting(
+        None, "DWA's candidates of the steering angle", low=1, scenario="num_steering"
+    )
+    horizon: int = setting(3, "local steps that DWA looks ahead", low=1)
+    clearance_factor: float | None = setting(
+        None, "nearer than so many collision thresholds costs DWA; wavefront's paths keep as clear of walls", above=0
+    )
+    clearance_weight: float = setting(100.0, "how much that costs", above=0)
+    replan_steps: int = setting(5, "local steps between two looks of wavefront for a path", low=1)
 
 
 @dataclass(frozen=True)
@@ -73,60 +94,64 @@ class RewardConfig:
     the last corners count then, too.
     """
 
-    explore: float = 0.3
-    overlap: float = 0.0
-    time: float = 1.0
-    unfinished: float = 0.0
-    success: float = 100.0
-    collision: float = 200.0
-    points: float = 60.0
-    events: float = 60.0 / 7000.0
-    time_on: Literal["uncovered", "covered", "gained"] = "uncovered"
-    charge_rest: bool = True
+    explore: float = setting(0.3, "for a point that no robot of the team had seen before", low=0)
+    overlap: float = setting(0.0, "subtracted for a point that another robot sees at the same time", low=0)
+    time: float = setting(1.0, "subtracted in every local step, times the share that is still unexplored", low=0)
+    unfinished: float = setting(0.0, "added to that share until the team is done", low=0)
+    success: float = setting(100.0, "once, when the coverage reaches scenario.success_coverage", low=0)
+    collision: float = setting(200.0, "subtracted once, from the robot that collides", low=0)
+    points: float = setting(60.0, "explore and overlap are multiplied by points / free points of the map", low=0)
+    events: float = setting(
+        60.0 / 7000.0, "what multiplies time, success and collision (60 / 7000); 0: points / free points", low=0
+    )
+    time_on: Literal["uncovered", "covered", "gained"] = setting(
+        "uncovered", "covered: the time term grows with what is explored, as the paper prints; gained: paid at once"
+    )
+    charge_rest: bool = setting(True, "a team that has crashed pays the time that was left, as if the episode went on")
 
 
 @dataclass(frozen=True)
 class ObservationConfig:
-    """What a robot sees.
+    """What a robot sees; its frontier targets are those of `maexp.envs.target_view`."""
 
-    ``map`` is what its picture shows: what it has ``seen`` itself, or ``known`` through communication. Without
-    ``pictures`` those of the robots and of the team are left out: they are most of an observation's cost. ``targets``
-    is how many frontier targets it is shown to choose from, 0 for none (`maexp.envs.target_view`).
-    """
-
-    map: Literal["seen", "known"] = "seen"
-    pictures: bool = True
-    targets: int = 0
+    map: Literal["seen", "known"] = setting(
+        "seen", "what its picture shows: seen by itself, or known: through communication, too"
+    )
+    pictures: bool = setting(True, "false leaves them out: they are most of an observation's cost")
+    targets: int = setting(
+        0, "frontier targets that a robot is shown, to choose from; 0: none", low=0, high=MOST_TARGETS
+    )
 
 
 @dataclass(frozen=True)
 class CommConfig:
     """Who hears whom (docs/conditions.md).
 
-    Robots within ``range`` [m], in line of sight if asked, and with ``signal`` those whose signal arrives with more
-    than ``threshold`` [dBm] of the ``power`` [dBm] it is sent with (`maexp.kernels.radio`). ``cell`` is the edge of
-    the cells that the signal's model counts [m], "auto" an 80th of the greatest radar range, as in IR2, where a sensor
-    reaches 80 cells. ``noise`` [dB] is how much each part of the loss fades at most, drawn for every pair and moment.
-
-    ``loss`` is the probability that two radios miss what they say to each other in a local step.
-
-    ``base_station`` is a radio with a map of its own: True stands where robot 0 starts, or it is a place (x, y) [m].
-
-    ``strategy`` is what robots do to tell others what they know, whatever their policy (`maexp.envs.strategy`):
-    nothing but to talk when they meet (``opportunistic``), or to report or meet every ``period`` decisions.
+    Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
+    (`maexp.kernels.radio`). ``strategy`` is what robots do to tell others what they know, whatever their policy
+    (`maexp.envs.strategy`): nothing but to talk when they meet (``opportunistic``), or to report or meet every
+    ``period`` decisions. A base station is a radio with a map of its own.
     """
 
-    range: float = math.inf
-    line_of_sight: bool = False
-    signal: bool = False
-    power: float = -20.0
-    threshold: float = -70.0
-    cell: float | Literal["auto"] = "auto"
-    noise: float = 0.0
-    loss: float = 0.0
-    base_station: bool | tuple[float, float] = False
-    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = "opportunistic"
-    period: int = 8
+    range: float = setting(math.inf, "of a radio; inf: everyone hears everyone", unit="m", low=0, infinite=True)
+    line_of_sight: bool = setting(False, "walls between two robots part them")
+    signal: bool = setting(False, "robots hear those whose signal arrives")
+    power: float = setting(-20.0, "that signals are sent with", unit="dBm")
+    threshold: float = setting(-70.0, "that has to arrive, and more, for a link", unit="dBm")
+    cell: float | Literal["auto"] = setting(
+        "auto", "edge of a cell of the signal's model; auto: an 80th of the greatest radar range", unit="m", above=0
+    )
+    noise: float = setting(
+        0.0, "greatest fading of each part of the loss, drawn for every pair and moment", unit="dB", low=0
+    )
+    loss: float = setting(0.0, "probability that two radios miss each other in a step of 0.1 s", low=0, high=1)
+    base_station: bool | tuple[float, float] = setting(
+        False, "true: a radio with a map of its own where robot 0 starts; or a place [x, y]", unit="m"
+    )
+    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = setting(
+        "opportunistic", "what robots do to tell others what they know (docs/conditions.md)"
+    )
+    period: int = setting(8, "decisions between two reports or meetings", low=1)
 
     @property
     def limited(self) -> bool:
@@ -141,15 +166,17 @@ class CommConfig:
 
 @dataclass(frozen=True)
 class FaultsConfig:
-    """Robots that fail (docs/conditions.md): they stop, see nothing, say nothing and stand in the way.
+    """Robots that fail (docs/conditions.md): they stop, see nothing, say nothing and stand in the way."""
 
-    Each fails with ``probability`` in an episode, at a moment drawn evenly over it; those of ``at``, pairs of a robot's
-    number and seconds into the episode, fail at that moment. ``duration`` [s] is how long; inf: for good.
-    """
-
-    probability: float = 0.0
-    at: tuple[tuple[int, float], ...] = ()
-    duration: float = math.inf
+    probability: float = setting(
+        0.0, "that a robot fails in an episode, at a moment drawn evenly over it", low=0, high=1
+    )
+    at: tuple[tuple[int, float], ...] = setting(
+        (), "failures at given moments: pairs of a robot and seconds, as [[0, 30], [2, 12.5]]"
+    )
+    duration: float = setting(
+        math.inf, "how long a failure lasts; inf: for good", unit="s", low=0.1, infinite=True
+    )
 
     @property
     def some(self) -> bool:
@@ -157,24 +184,16 @@ class FaultsConfig:
         return self.probability > 0.0 or bool(self.at)
 
 
-STRATEGIES = ("opportunistic", "rendezvous", "relay", "return_to_base", "pursuit")
-DONE = ("union", "base", "everyone")
-"""Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
-station knows, or what every robot knows that has neither collided nor failed."""
-CELLS_OF_RADAR = 80  # that IR2's sensor reaches
-
-
 @dataclass(frozen=True)
 class TargetsConfig:
-    """How robots share targets out, with any policy that chooses among them.
+    """How robots share targets out, with any policy that chooses among them."""
 
-    ``distinct``: robots that hear each other go to different targets, farther apart than their bodies; else each goes
-    where it likes best. ``spare`` says what robots do for which no target is left then: ``wait`` where they are, or go
-    ``home`` to where they started.
-    """
-
-    distinct: bool = True
-    spare: Literal["wait", "home"] = "wait"
+    distinct: bool = setting(
+        True, "robots that hear each other go to different targets; else each goes where it likes best"
+    )
+    spare: Literal["wait", "home"] = setting(
+        "wait", "where robots go for which no target is left: nowhere, or home to where they started"
+    )
 
 
 @dataclass(frozen=True)
@@ -190,24 +209,35 @@ class LookaheadConfig:
     ground, what the ``nearest`` known cell holds, or what the map predictor says (``predicted``).
     """
 
-    rollout_policy: str = "cost_utility"
-    candidates: int = 5
-    horizon: int = 1
-    unknown: Literal["free", "nearest", "predicted"] = "free"
-    margin: float = 0.02
-    loss: float = 1.0
-    rest: float = 1.0
-    prior: float = 0.7
+    rollout_policy: str = setting(
+        "cost_utility",
+        "chooses where no branch is better, and plays on; or a trained one, for which cost_utility plays on",
+    )
+    candidates: int = setting(
+        5, "targets that each robot tries, its own choice among them", low=1, high=MOST_CANDIDATES
+    )
+    horizon: int = setting(1, "decisions that are played, the first among them", low=1, high=MOST_HORIZON)
+    unknown: Literal["free", "nearest", "predicted"] = setting(
+        "free", "what is taken to stand where nobody has looked; nearest: what the nearest known cell holds; predicted"
+    )
+    margin: float = setting(
+        0.02, "how much more than the own choice a branch must be worth to be taken", unit="radar discs", low=0
+    )
+    loss: float = setting(1.0, "what a robot lost costs", unit="radar discs", low=0)
+    rest: float = setting(1.0, "weight of what is covered at a branch's end beside the average over its time", low=0)
+    prior: float = setting(
+        0.7, "weight of what the target is worth to cost_utility beside what the branch covers", low=0
+    )
 
 
-MOST_CANDIDATES = 64
-MOST_HORIZON = 100
-MOST_TARGETS = 256  # that a robot is shown
-CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
-SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
-ROBOT_KINDS = ("ackermann", "differential", "omnidirectional")
-BODY = {"length": "body_length", "width": "body_width", "collision_threshold": "collision_threshold"}
-"""What a radius decides: settings of a robot, and what a scenario calls them."""
+ROBOT_KINDS = words_of(RobotConfig, "kind")
+TIME_ON = words_of(RewardConfig, "time_on")  # numbered as in kernels/reward.py
+STRATEGIES = words_of(CommConfig, "strategy")
+DONE = ("union", "base", "everyone")
+"""Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
+station knows, or what every robot knows that has neither collided nor failed."""
+BODY = ("length", "width", "collision_threshold")
+"""What a radius decides of a robot."""
 
 
 def supplied(kind: type) -> list[str]:
@@ -215,30 +245,20 @@ def supplied(kind: type) -> list[str]:
     return [one.name for one in fields(kind) if one.default is None and one.name != "radius"]
 
 
-def _complete(config, **defaults):
-    """``config`` with its None fields filled in."""
-    return replace(config, **{k: v for k, v in defaults.items() if getattr(config, k) is None})
+def _complete(config, scenario: Scenario):
+    """``config`` with what is None taken from the scenario, where that says it."""
+    sources = {one.name: one.metadata.get("scenario") for one in fields(config) if getattr(config, one.name) is None}
+    return replace(config, **{name: getattr(scenario, source) for name, source in sources.items() if source})
 
 
 def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
     """Fill in what the radius or the scenario fixes and check every value."""
     if config.radius is not None:
         scenario = scenario.with_radius(_check_radius(config))
-    config = _complete(
-        config,
-        length=scenario.body_length,
-        width=scenario.body_width,
-        max_speed=scenario.max_speed,
-        max_accel=scenario.max_accel,
-        max_steer=scenario.max_steer,
-        collision_threshold=scenario.collision_threshold,
-    )
+    config = _complete(config, scenario)
+    check_settings(config, "robot")
     if config.wheelbase in (None, "width", "length"):
         config = replace(config, wheelbase=getattr(config, config.wheelbase or "width"))
-    elif not isinstance(config.wheelbase, int | float):
-        raise ValueError(f"robot.wheelbase={config.wheelbase!r} must be metres, width or length")
-    _check_choice("robot.kind", config.kind, ROBOT_KINDS)
-    _check_positive("robot", config, skip=("kind", "radius"))
     if config.max_steer >= math.pi / 2:
         raise ValueError(f"robot.max_steer={config.max_steer} must stay below pi/2 = 1.5708 rad")
     return config
@@ -247,8 +267,8 @@ def complete_robot(config: RobotConfig, scenario: Scenario) -> RobotConfig:
 def _check_radius(config: RobotConfig) -> float:
     """The radius, if it is one and agrees with what else is said of the body."""
     radius = config.radius
-    if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0.0 < radius < math.inf:
-        raise ValueError(f"robot.radius={radius!r} must be a positive finite number of metres")
+    metadata = {one.name: one.metadata for one in fields(config)}["radius"]
+    check_value("robot.radius", radius, kinds(RobotConfig)["radius"], metadata)
     for name in BODY:
         value, round_one = getattr(config, name), radius if name == "collision_threshold" else 2 * radius
         if value is not None and value != round_one:
@@ -261,79 +281,49 @@ def _check_radius(config: RobotConfig) -> float:
 
 def complete_radar(config: RadarConfig, scenario: Scenario) -> RadarConfig:
     """Fill in the scenario's range and check every value."""
-    config = _complete(config, range=scenario.radar_range)
-    _check_positive("radar", config, skip=("obstacle_radius", "alpha1", "alpha2"))
-    radius = config.obstacle_radius
-    if radius != "auto" and not (isinstance(radius, int | float) and 0.0 <= radius < math.inf):
-        raise ValueError(f'radar.obstacle_radius={radius!r} must be "auto" or a number of metres, 0 or more')
-    if not 0.0 <= config.alpha1 <= 2.0 or not math.isfinite(config.alpha2):
-        raise ValueError(f"radar.alpha1={config.alpha1} must lie in [0, 2] and radar.alpha2={config.alpha2} be finite")
+    config = _complete(config, scenario)
+    check_settings(config, "radar")
     return config
 
 
 def complete_planner(config: PlannerConfig, scenario: Scenario) -> PlannerConfig:
     """Fill in the scenario's candidates and the planner's clearance and check every value."""
-    clearance = CLEARANCE.get(config.name, scenario.clearance_factor)
-    config = _complete(config, num_steering=scenario.num_steering, clearance_factor=clearance)
-    _check_choice("planner.name", config.name, ("dwa", "wavefront", "direct"))
-    _check_positive("planner", config, skip=("name",))
+    config = _complete(config, scenario)
+    if config.clearance_factor is None:
+        config = replace(config, clearance_factor=CLEARANCE.get(config.name, scenario.clearance_factor))
+    check_settings(config, "planner")
     return config
 
 
 def check_reward(config: RewardConfig) -> RewardConfig:
     """Every weight must be a finite number; signs are fixed by the meaning of the terms."""
-    _check_choice("reward.time_on", config.time_on, TIME_ON)
-    if not isinstance(config.charge_rest, bool):
-        raise ValueError(f"reward.charge_rest={config.charge_rest!r} must be true or false")
+    check_settings(config, "reward")
     if config.time_on == "gained" and not config.charge_rest:
         raise ValueError(
             "reward.charge_rest=False with reward.time_on='gained': nothing is charged, "
             "use true or reward.time_on=uncovered"
         )
-    for f in fields(config):
-        value = getattr(config, f.name)
-        number = isinstance(value, int | float) and 0.0 <= value < math.inf
-        if f.name not in ("time_on", "charge_rest") and not number:
-            raise ValueError(f"reward.{f.name}={value!r} must be a finite number, 0 or more")
     return config
 
 
 def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None:
     """The settings must be known, and targets need a planner that drives to goals."""
-    _check_choice("observation.map", config.map, ("seen", "known"))
-    if not isinstance(config.pictures, bool):
-        raise ValueError(f"observation.pictures={config.pictures!r} must be true or false")
-    count = config.targets
-    if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= MOST_TARGETS:
-        raise ValueError(f"observation.targets={count!r} must be a whole number from 0 to {MOST_TARGETS}")
-    if count and planner.name == "direct":
-        raise ValueError(f"planner=direct takes controls, observation.targets={count} shows goals: add action=regions")
+    check_settings(config, "observation")
+    if config.targets and planner.name == "direct":
+        raise ValueError(
+            f"planner=direct takes controls, observation.targets={config.targets} shows goals: add action=regions"
+        )
 
 
 def check_comm(config: CommConfig) -> CommConfig:
     """Check every value, and make a place a tuple."""
-    everyone = "0 or more metres (inf: everyone hears everyone)"
-    _check_number("comm.range", config.range, everyone, least=0.0, finite=False)
-    for name in ("line_of_sight", "signal"):
-        if not isinstance(getattr(config, name), bool):
-            raise ValueError(f"comm.{name}={getattr(config, name)!r} must be true or false")
-    _check_number("comm.power", config.power, "a finite number of dBm")
-    _check_number("comm.threshold", config.threshold, "a finite number of dBm")
-    _check_number("comm.loss", config.loss, "a share from 0 to 1 (comm.range=0 parts all)", least=0.0, most=1.0)
-    _check_number("comm.noise", config.noise, "a finite number of dB, 0 or more", least=0.0)
+    check_settings(config, "comm")
     if config.signal and config.threshold >= config.power - SIGNAL_LOSS:
         raise ValueError(
             f"comm.threshold={config.threshold:g} dBm is out of reach: of comm.power={config.power:g} dBm "
             f"{config.power - SIGNAL_LOSS:g} arrive at best, and nobody would ever hear anybody; lower the threshold, "
             "or use comm.range=0 if that is meant"
         )
-    cell = config.cell
-    number = isinstance(cell, int | float) and not isinstance(cell, bool)
-    if cell != "auto" and not (number and 0.0 < cell < math.inf):
-        raise ValueError(f'comm.cell={cell!r} must be "auto" or a number of metres above 0')
-    _check_choice("comm.strategy", config.strategy, STRATEGIES)
-    if isinstance(config.period, bool) or not isinstance(config.period, int) or config.period < 1:
-        raise ValueError(f"comm.period={config.period!r} must be a whole number of decisions, 1 or more")
     return replace(config, base_station=_check_base(config.base_station))
 
 
@@ -364,8 +354,7 @@ def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:
 
 def check_faults(config: FaultsConfig, num_robots: int | None = None) -> FaultsConfig:
     """Check every value, robots where it is known how many there are, and make the pairs tuples."""
-    _check_number("faults.probability", config.probability, "a share in [0, 1]", least=0.0, most=1.0)
-    _check_number("faults.duration", config.duration, "0.1 or more seconds (inf: for good)", least=0.1, finite=False)
+    check_settings(config, "faults")
     pairs = config.at if isinstance(config.at, Sequence) and not isinstance(config.at, str) else [config.at]
     found: dict[int, float] = {}
     for pair in pairs:
@@ -379,14 +368,16 @@ def check_faults(config: FaultsConfig, num_robots: int | None = None) -> FaultsC
             raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")
         if robot in found:
             raise ValueError(f"faults.at names robot {robot} twice: it fails once in an episode")
-        _check_number(f"faults.at: the moment of robot {robot}", seconds, "0 or more seconds", least=0.0)
+        if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0.0 <= seconds < math.inf:
+            raise ValueError(f"faults.at: the moment of robot {robot}={seconds!r} must be 0 or more seconds")
         found[robot] = float(seconds)
     return replace(config, at=tuple(found.items()))
 
 
 def check_done(done: str, comm: CommConfig) -> str:
     """Whose coverage ends an episode must be known, and there."""
-    _check_choice("done", done, DONE)
+    if done not in DONE:
+        raise ValueError(f"done={done!r} is unknown: choose one of {', '.join(DONE)}")
     if done == "base" and not comm.has_base:
         raise ValueError("done='base' needs a base station: add comm.base_station=true")
     return done
@@ -394,23 +385,13 @@ def check_done(done: str, comm: CommConfig) -> str:
 
 def check_targets(config: TargetsConfig) -> TargetsConfig:
     """The settings must be known."""
-    if not isinstance(config.distinct, bool):
-        raise ValueError(f"targets.distinct={config.distinct!r} must be true or false")
-    _check_choice("targets.spare", config.spare, ("wait", "home"))
+    check_settings(config, "targets")
     return config
 
 
 def check_lookahead(config: LookaheadConfig) -> LookaheadConfig:
     """Counts must be whole and within reason, weights finite. Whether the rollout policy is one, the planner checks."""
-    for name, most in (("candidates", MOST_CANDIDATES), ("horizon", MOST_HORIZON)):
-        value = getattr(config, name)
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-            raise ValueError(f"lookahead.{name}={value!r} must be a whole number from 1 to {most}")
-    for name in ("margin", "loss", "rest", "prior"):
-        value = getattr(config, name)
-        if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
-            raise ValueError(f"lookahead.{name}={value!r} must be a finite number, 0 or more")
-    _check_choice("lookahead.unknown", config.unknown, ("free", "nearest", "predicted"))
+    check_settings(config, "lookahead")
     return config
 
 
@@ -431,23 +412,3 @@ def one_config(what: str, config, kind: type):
     if config is not None and not isinstance(config, kind):
         raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
     return config or kind()
-
-
-def _check_number(
-    name: str, value, what: str, least: float = -math.inf, most: float = math.inf, finite: bool = True
-) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and least <= value <= most and (math.isfinite(value) or (not finite and value == math.inf))):
-        raise ValueError(f"{name}={value!r} must be {what}")
-
-
-def _check_choice(name: str, value, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
-
-
-def _check_positive(group: str, config, skip: tuple[str, ...]) -> None:
-    for f in fields(config):
-        value = getattr(config, f.name)
-        if f.name not in skip and not (isinstance(value, int | float) and 0.0 < value < math.inf):
-            raise ValueError(f"{group}.{f.name}={value!r} must be a positive finite number")

@@ -2,12 +2,13 @@
 
 import math
 import os
+from dataclasses import fields
 
 import numpy as np
 import torch
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON
+from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, RobotConfig
 from maexp.envs.nav_grid import bank_nav_grids, build_nav_grid, grid_shape, open_cells
 from maexp.envs.settings import EnvSettings
 from maexp.kernels.blocks import block_memory_per_env, block_sides
@@ -16,7 +17,16 @@ from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, DT, OMNIDIRECTIONAL, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
+from maexp.kernels.types import (
+    ACKERMANN,
+    DIFFERENTIAL,
+    DT,
+    OMNIDIRECTIONAL,
+    PICTURE_CHANNELS,
+    PIXELS,
+    TEAM_CHANNELS,
+    Robots,
+)
 from maexp.kernels.wavefront import grid_memory_per_env
 
 KINDS = {
@@ -54,16 +64,11 @@ def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
     """Parameters of every robot, [E, N] each (fields of `kernels.types.Robots`)."""
     robots, radars = settings.robots, settings.radars
     factor = settings.planner.clearance_factor
-    columns = {
+    same = [one.name for one in fields(RobotConfig) if one.name in Robots.vars]
+    columns = {name: [getattr(r, name) for r in robots] for name in same} | {
         "kind": [KINDS[r.kind] for r in robots],
-        "length": [r.length for r in robots],
-        "width": [r.width for r in robots],
-        "wheelbase": [r.wheelbase for r in robots],
         "center_offset": [0.5 * r.length if r.kind == "ackermann" else 0.0 for r in robots],
-        "max_speed": [r.max_speed for r in robots],
-        "max_accel": [r.max_accel for r in robots],
         "max_turn": [r.max_steer if r.kind == "ackermann" else r.max_yaw_rate for r in robots],
-        "collision_threshold": [r.collision_threshold for r in robots],
         "clearance": [factor * r.collision_threshold for r in robots],
         "radar_range": [r.range for r in radars],
         "radar_cos_fov": [math.cos(0.5 * r.fov) if r.fov < 2.0 * math.pi - 1e-6 else -2.0 for r in radars],
@@ -80,14 +85,11 @@ def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
 
 def reward_weights(settings: EnvSettings) -> RewardWeights:
     """The reward's coefficients as the kernels read them."""
-    reward = settings.reward
     weights = RewardWeights()
-    for name in ("explore", "overlap", "time", "unfinished", "success", "collision", "points", "events"):
-        setattr(weights, name, float(getattr(reward, name)))
-    weights.time_on = TIME_ON.index(reward.time_on)
+    for name, value in vars(settings.reward).items():
+        setattr(weights, name, TIME_ON.index(value) if isinstance(value, str) else value)
     weights.success_coverage = settings.success_coverage
     weights.length = settings.episode_steps
-    weights.charge_rest = int(reward.charge_rest)
     return weights
 
 

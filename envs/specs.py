@@ -6,7 +6,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from maexp.envs.features import FEATURES
 from maexp.envs.settings import EnvSettings
 from maexp.kernels.observe import picture_shapes
-from maexp.kernels.reward import MARKS
+from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.types import REGIONS
 
 INFO_ENV = {
@@ -18,9 +18,6 @@ INFO_ENV = {
 }
 """Entries of ``info`` of shape [E, 1]. ``coverage_auc``: mean coverage over the local steps of a full episode, as if
 nothing more were seen from now on."""
-
-REWARD_TERMS = ("explore", "overlap", "time", "success", "collision")
-"""Order of the last axis of the kernels' reward terms."""
 
 INFO_ROBOT = {
     **{f"reward_{term}": torch.float32 for term in REWARD_TERMS},

@@ -14,13 +14,9 @@ if TYPE_CHECKING:
 
 wp.set_module_options(MODULE_OPTIONS)
 
-EXPLORE = 0
-OVERLAP = 1
-TIME = 2
-SUCCESS = 3
-COLLISION = 4
-TERMS = 5
-"""Number of reward terms; the names above index the last axis of ``terms`` and ``unscaled``."""
+REWARD_TERMS = ("explore", "overlap", "time", "success", "collision")
+"""The last axis of ``terms`` and ``unscaled``."""
+EXPLORE, OVERLAP, TIME, SUCCESS, COLLISION = range(len(REWARD_TERMS))
 UNCOVERED = 0
 COVERED = 1
 GAINED = 2

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from maexp.kernels.reward import MARKS, TERMS
+from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Robots
 
@@ -233,7 +233,7 @@ def axis_sizes(
         "E": num_envs, "N": num_robots, "U": radios, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
-        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": TERMS, "D": 3 * BINS,
+        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": len(REWARD_TERMS), "D": 3 * BINS,
         "S": num_robots, "M": len(MARKS), "1": 1,
     }  # fmt: skip
 

@@ -1,8 +1,11 @@
 """Settings: every choice composes, and what does not fit is refused in one sentence."""
 
 from dataclasses import asdict, fields
+from importlib import resources
 
 import pytest
+import yaml
+from omegaconf import OmegaConf
 
 from maexp.agents.algorithms.table import ALGORITHMS, TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
@@ -10,17 +13,12 @@ from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups
 from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
-from maexp.agents.settings.schema import SCHEMAS, ScenarioSettings, given, schema
+from maexp.agents.settings.resolved import planner_config
+from maexp.agents.settings.schema import SCHEMAS, schema
 from maexp.envs.config import (
-    CommConfig,
-    FaultsConfig,
-    LookaheadConfig,
-    ObservationConfig,
     PlannerConfig,
     RadarConfig,
-    RewardConfig,
     RobotConfig,
-    TargetsConfig,
     complete_planner,
     complete_radar,
     complete_robot,
@@ -52,54 +50,48 @@ def test_choices_match_the_tables_of_the_code():
 
 REGIONS = ["action=regions"]  # action=targets brings settings of its own
 
-# conf/ holds the values, the dataclasses those of Python users: a default that changes, changes in both
 
-
-@pytest.mark.parametrize("algorithm", TRAININGS)
-def test_conf_algorithm_holds_the_defaults(algorithm):
-    row, cfg = TRAININGS[algorithm], compose_config("train", [*REGIONS, f"algorithm={algorithm}"])
-    assert given(cfg.algorithm, "name") == asdict(row.settings), f"conf/algorithm/{algorithm}.yaml"
+def values(node, kind: type) -> dict:
+    return {one.name: node[one.name] for one in fields(kind)}
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_conf_reference_holds_the_originals(algorithm):
+def test_a_tuning_holds_the_settings_of_its_row(algorithm):
     row = ALGORITHMS[algorithm]
-    tuned = compose_config("train", [f"algorithm={algorithm}", "action=targets", "tuning=reference"])
-    assert given(tuned.algorithm, "name") == asdict(row.reference), f"conf/_tuning/reference_{algorithm}.yaml"
-
-
-def test_conf_model_holds_the_presets():
-    for name, sizes in SIZES.items():
-        held = given(compose_config("train", [*REGIONS, f"model={name}"]).model)
-        assert held == asdict(sizes), f"conf/model/{name}.yaml"
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_conf_scenario_holds_the_table(scenario):
-    row, words = SCENARIOS[scenario], [f"scenario={scenario}", "scenario.path=x"]
-    held = given(compose_config("train", words[: 1 + (row.build is None)]).scenario)
-    supplied = [one.name for one in fields(row) if one.name in ScenarioSettings.__dataclass_fields__]
-    assert len(supplied) == 12, "all but count, resolution, size and build"
-    wanted = supplied if row.build else ["name"]  # whose map it is, is known when it is read
-    held = {name: value for name, value in held.items() if name in supplied}
-    assert held == {one: getattr(row, one) for one in wanted}, f"conf/scenario/{scenario}.yaml"
+    for words, wanted in (
+        (REGIONS, row.settings),
+        (["action=targets", "tuning=reference"], row.reference),  # over what action=targets brings
+    ):
+        cfg = compose_config("train", [f"algorithm={algorithm}", *words])
+        assert values(cfg.algorithm, type(wanted)) == asdict(wanted)
 
 
 @pytest.mark.parametrize("planner", ["dwa", "wavefront", "direct"])
 @pytest.mark.parametrize("scenario", ["maze", "indoor_small", "outdoor"])
-def test_conf_holds_what_the_env_takes_by_itself(scenario, planner):
+def test_the_command_line_takes_what_the_env_takes_by_itself(scenario, planner):
     cfg, row = compose_config("train", [*REGIONS, f"scenario={scenario}", f"planner={planner}"]), SCENARIOS[scenario]
     robot, radar = team_configs(cfg, 1)
-    assert complete_robot(robot, row) == complete_robot(RobotConfig(), row), "conf/robot/ackermann.yaml"
-    assert complete_radar(radar, row) == complete_radar(RadarConfig(), row), "conf/radar/lidar.yaml"
+    assert complete_robot(robot, row) == complete_robot(RobotConfig(), row)
+    assert complete_radar(radar, row) == complete_radar(RadarConfig(), row)
     whole = complete_planner(PlannerConfig(name=planner), row)
-    assert complete_planner(PlannerConfig(**given(cfg.planner)), row) == whole, f"conf/planner/{planner}.yaml"
-    kinds = {
-        "reward": RewardConfig, "observation": ObservationConfig, "comm": CommConfig, "faults": FaultsConfig,
-        "targets": TargetsConfig, "lookahead": LookaheadConfig,
-    }  # fmt: skip
-    for group, kind in kinds.items():
-        assert given(cfg[group]) == asdict(kind()), f"conf/{group}"
+    assert complete_planner(planner_config(cfg, row), row) == whole
+
+
+def test_every_setting_of_a_file_differs_from_its_default():
+    """A value stands once: in the dataclass, in a row of a table, or where a choice changes it."""
+    plain, chosen = OmegaConf.to_container(OmegaConf.structured(schema("train"))), 0
+    for group, settings in plain.items():
+        for file in resources.files("maexp.conf").joinpath(group).glob("*.yaml") if isinstance(settings, dict) else ():
+            held = yaml.safe_load(file.read_text()) or {}
+            chosen += len(held)
+            same = {name for name, value in held.items() if name not in ("name", "kind") and settings[name] == value}
+            assert not same, f"conf/{group}/{file.name} repeats the defaults of {same}"
+    assert chosen > 20
+
+
+def test_null_is_refused_where_it_means_nothing():
+    assert refusal("train", "reward.explore=null") == "reward.explore=null has no meaning: give it a value."
+    assert compose_config("train", ["radar.range=null"]).radar.range is None  # the scenario's
 
 
 def test_every_verb_composes():

@@ -29,7 +29,7 @@ SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
 """The README shows sizes that people use; here they would take too long."""
 PLANNERS = get_args(PlannerConfig.__dataclass_fields__["name"].type)
 SHIPPED = {
-    "reward terms": (len(REWARD_TERMS), 5), "parameters of robots": (len(fields(RobotConfig)), 9),
+    "reward terms": (len(REWARD_TERMS), 5), "parameters of robots": (len(fields(RobotConfig)), 10),
     "kinds of robots": (len(ROBOT_KINDS), 3), "planners": (len(PLANNERS), 3), "features": (len(FEATURES), 32),
     "channels": (PICTURE_CHANNELS, 4), "arrays of the state": (len(STATE), 37),
 }  # fmt: skip
@@ -179,6 +179,14 @@ def test_diffs_apply(number):
     if done.returncode and own:
         pytest.skip(f"DIFF {number} OF docs/extending.md IS FOR THE TREE AS IT SHIPS; here are more: {', '.join(own)}")
     assert done.returncode == 0, f"write this diff of docs/extending.md anew:\n{done.stderr}"
+
+
+@pytest.mark.parametrize(("what", "number"), [("a-parameter-of-robots", 0), ("a-reward-term", 6)])
+def test_the_table_of_extending_counts_the_files(what, number):
+    page = (ROOT / "docs/extending.md").read_text()
+    files = re.findall(r"^\+\+\+ b/(\S+)", blocks("docs/extending.md", "diff")[number], re.MULTILINE)
+    assert int(re.search(rf"\(#{what}\) \| (\d)", page)[1]) == len(files) == len(set(files))
+    assert what != "a-reward-term" or files == ["envs/config.py", "kernels/reward.py"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -269,7 +269,7 @@ def test_bad_actions(maps):
         (dict(comm=CommConfig(signal=True, cell=0.0)), "comm.cell=0.0"),
         (dict(comm=CommConfig(signal=True, noise=-1.0)), "comm.noise=-1.0"),
         (dict(comm=CommConfig(signal=True, threshold=-40.0)), "comm.threshold=-40 dBm is out of reach"),
-        (dict(comm=CommConfig(loss=1.5)), "comm.loss=1.5 must be a share"),
+        (dict(comm=CommConfig(loss=1.5)), "comm.loss=1.5 must be a number from 0 to 1"),
         (dict(comm=CommConfig(base_station="home")), "comm.base_station='home'"),
         (dict(comm=CommConfig(base_station=(1.0, 2.0, 3.0))), "comm.base_station="),
         (dict(comm=CommConfig(base_station=(-900.0, 0.0))), "-900.0, 0.0. is no free ground of map maze"),

@@ -148,9 +148,9 @@ def test_who_has_failed_does_not_keep_an_episode_from_its_end():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (dict(probability=1.5), "faults.probability=1.5 must be a share"),
+        (dict(probability=1.5), "faults.probability=1.5 must be a number from 0 to 1"),
         (dict(probability=True), "faults.probability=True"),
-        (dict(duration=0.0), "faults.duration=0.0 must be 0.1 or more"),
+        (dict(duration=0.0), "faults.duration=0.0 must be a number, 0.1 or more"),
         (dict(at=[(3, 1.0)]), "names robot 3: there are num_robots=3, from 0 to 2"),
         (dict(at=[(-1, 1.0)]), "names robot -1"),
         (dict(at=[(1, 1.0), (1, 2.0)]), "names robot 1 twice"),

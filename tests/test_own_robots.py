@@ -78,7 +78,7 @@ def test_a_radius_stands_for_the_sizes_of_the_body():
 @pytest.mark.parametrize(("body", "told"), [
     ({"radius": 0.3, "length": 1.0}, r"robot\.radius=0\.3 makes robot\.length 0\.6 m, and 1\.0 is given: leave one"),
     ({"radius": 0.3, "collision_threshold": 0.4}, r"makes robot\.collision_threshold 0\.3 m, and 0\.4 is given"),
-    ({"radius": 0.0}, r"robot\.radius=0\.0 must be a positive finite number of metres"),
+    ({"radius": 0.0}, r"robot\.radius=0\.0 must be a finite number above 0 \[m\]"),
     ({"radius": math.inf}, r"robot\.radius=inf must be"),
     ({"radius": True}, r"robot\.radius=True must be"),
     ({"radius": 50.0}, r"robot\.radius=50 m does not fit on map .* of 18\.25 x 16\.25 m: .* robot\.radius=0\.5"),

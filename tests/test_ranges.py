@@ -1,13 +1,25 @@
 """Settings of algorithms and networks: each has a range, and what lies outside is named with it."""
 
 import math
-from dataclasses import fields
+import re
+from dataclasses import fields, is_dataclass
 
 import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
 from maexp.agents.settings.model import SIZES, ModelConfig
+from maexp.agents.settings.schema import SCHEMAS, schema
+from maexp.envs.config import (
+    CommConfig,
+    LookaheadConfig,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+)
+from maexp.envs.fields import check_settings, kinds
 
 # What each setting may be and what it may not be, from what it means (not from the code).
 GOOD = {
@@ -58,6 +70,47 @@ def test_every_size_of_a_network_has_its_range(name):
     for value in bad + EVERYWHERE:
         with pytest.raises(ValueError, match=rf"model\.{name}=.*must be"):
             ModelConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value", "sentence"),
+    [
+        (RobotConfig, "length", -1, "robot.length=-1 must be a finite number above 0 [m]."),
+        (RobotConfig, "kind", "boat", "robot.kind='boat' must be one of ackermann, differential, omnidirectional."),
+        (RadarConfig, "alpha1", 3.0, "radar.alpha1=3.0 must be a number from 0 to 2."),
+        (RadarConfig, "fov", 0, "radar.fov=0 must be a finite number above 0 [rad]."),
+        (CommConfig, "cell", "big", "comm.cell='big' must be auto or a finite number above 0 [m]."),
+        (PlannerConfig, "horizon", 2.5, "planner.horizon=2.5 must be a whole number, 1 or more."),
+        (CommConfig, "range", math.nan, "comm.range=nan must be a number, 0 or more [m], or inf."),
+        (CommConfig, "power", "loud", "comm.power='loud' must be a finite number [dBm]."),
+        (CommConfig, "signal", 1, "comm.signal=1 must be true or false."),
+        (ObservationConfig, "targets", True, "observation.targets=True must be a whole number from 0 to 256."),
+        (LookaheadConfig, "loss", math.inf, "lookahead.loss=inf must be a finite number, 0 or more [radar discs]."),
+        (RewardConfig, "time", None, "reward.time=None must be a finite number, 0 or more."),
+    ],
+)
+def test_the_message_names_setting_value_range_and_unit(kind, name, value, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        check_settings(kind(**{name: value}), kind.__name__.removesuffix("Config").lower())
+
+
+def test_what_may_be_infinite_or_left_open_passes():
+    check_settings(CommConfig(range=math.inf, cell=2.0, base_station=(1.0, 2.0)), "comm")
+    check_settings(RobotConfig(wheelbase="length"), "robot")
+
+
+@pytest.mark.parametrize("verb", SCHEMAS)
+def test_every_setting_has_a_line_of_help(verb):
+    """But names of choices and what only the command line fills in."""
+    settings = schema(verb)
+    missing = {one.name for one in fields(settings) if not one.metadata.get("help")}
+    groups = {one for one in missing if is_dataclass(kinds(settings)[one][0])}
+    allowed = {"preset", "action", "tuning", "task", "sweep", "checkpoint", *(["seed"] if verb == "benchmark" else [])}
+    assert missing - groups <= allowed
+    for group in groups:
+        kind = kinds(settings)[group][0]
+        bare = {one.name for one in fields(kind) if not one.metadata.get("help")}
+        assert bare <= {"name", "team", "importing"}, (group, bare)
 
 
 @pytest.mark.parametrize(

@@ -106,8 +106,8 @@ def test_yaml_holds_the_same_values():
     settings |= {"resume": " ".join(["a run"] * 30)}  # more than a line
     written = to_yaml(settings, "train")
     assert OmegaConf.to_container(OmegaConf.create(written)) == settings
-    assert "  range: 1.0  # [m]\n" in written and "  lr: 0.002  # learning rate\n" in written
-    assert "num_robots: 3  # robots in a team" in written and "  max_speed: 0.6  # [m/s]\n" in written
+    assert "  range: 1.0  # how far it sees [m]\n" in written and "  gamma: 1.0  # does nothing here\n" in written
+    assert "num_robots: 3  # robots in a team" in written and "  lr: 0.002  # learning rate of the policy\n" in written
 
 
 # A checkpoint and new words
@@ -245,9 +245,11 @@ def test_the_papers_set_up_is_the_same_for_every_verb():
     assert algorithm_settings(cfg) == ALGORITHMS["vda2c"].reference
     cfg = compose_config("train", ["preset=paper", "planner=wavefront", "algorithm.lr=0.5"])
     assert (cfg.planner.name, model_settings(cfg).channels, algorithm_settings(cfg).lr) == ("wavefront", 32, 0.5)
-    assert (cfg.planner.clearance_factor, compose_config("train", ["planner=dwa"]).planner.clearance_factor) == (2, 3)
-    paper = compose_config("train", ["preset=paper", "scenario=indoor_large"]).planner
-    assert (paper.name, paper.clearance_factor) == ("dwa", 4.2)
+    assert resolve(cfg)["planner"]["clearance_factor"] == 2.0
+    assert resolve(compose_config("train", ["planner=dwa"]))["planner"]["clearance_factor"] == 3.0
+    paper = resolve(compose_config("train", ["preset=paper", "scenario=indoor_large"]))["planner"]
+    assert (paper["name"], paper["clearance_factor"]) == ("dwa", 4.2)
+    assert "clearance_factor" not in resolve(compose_config("benchmark", ["preset=paper"]))["planner"], "its scenarios'"
     assert model_settings(compose_config("train", ["preset=paper", "model=small"])).channels == 16
 
 

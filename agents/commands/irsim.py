@@ -11,10 +11,11 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import IrsimSettings, given
+from maexp.agents.settings.schema import IrsimSettings, read
 from maexp.agents.training.named import find_player
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.film import write_gif
+from maexp.envs.importing import ImportOptions
 from maexp.envs.scenarios import default_macro_steps, find_scenario
 
 FILM_SPEED = 4.0  # frames a second; one a decision
@@ -50,7 +51,7 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     from maexp.agents.irsim.trial import run_trial
 
     with blame_input():
-        world = import_map(cfg.floor, num_robots=cfg.num_robots, **given(cfg.importing))
+        world = import_map(cfg.floor, read(ImportOptions, cfg.importing))
         config = make_config(cfg, world)
         player = find_player(cfg.policy)
         env = ours.make_team(world, cfg.num_robots, config, player.targets or 0)

@@ -13,9 +13,9 @@ from maexp.agents.files import command, write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import MapsSettings, given
+from maexp.agents.settings.schema import MapsSettings, read
 from maexp.envs.checker import check_map, repair_map
-from maexp.envs.importing import ImportReport, draw_import, export_ros_map, import_map_with_report
+from maexp.envs.importing import ImportOptions, ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.importing.bags import is_bag
 from maexp.envs.importing.options import make_options
 from maexp.envs.map import PointCloudMap
@@ -140,8 +140,8 @@ def read_map(cfg: MapsSettings) -> tuple[PointCloudMap, ImportReport | None]:
 
 
 def import_options(cfg: MapsSettings) -> dict[str, Any]:
-    """The settings of the import that were given, and the team."""
-    return {"num_robots": cfg.num_robots} | given(cfg.importing)
+    """The settings of the import."""
+    return vars(read(ImportOptions, cfg.importing))
 
 
 def _generated() -> list[str]:

@@ -16,10 +16,11 @@ from maexp.agents.files import command, short
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import ViewSettings, given
+from maexp.agents.settings.schema import ViewSettings, read
 from maexp.agents.training.checkpoint import find_checkpoint, is_run
 from maexp.agents.training.named import check_planner, find_player, suit_observation
 from maexp.envs import PointCloudMap, import_map, make_map
+from maexp.envs.importing import ImportOptions
 from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS
 from maexp.envs.viewing import show
@@ -199,7 +200,7 @@ def find_map(cfg: ViewSettings, place: Path | None) -> PointCloudMap:
     if place is not None:
         if cfg.index is not None:
             raise UserError(f"index={cfg.index} picks a map of a scenario, and {place} is one map: leave one out.")
-        return import_map(str(place), **given(cfg.scenario.importing))
+        return import_map(str(place), read(ImportOptions, cfg.scenario.importing))
     index = cfg.index or 0
     if SCENARIOS[cfg.scenario.name].build is not None:
         return make_map(cfg.scenario.name, index)

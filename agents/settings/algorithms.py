@@ -1,8 +1,9 @@
 """Settings of the seven algorithms: types, ranges, defaults and those of the original platform."""
 
 from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Literal
 
-from maexp.agents.settings.ranges import check_ranges, choice, flag, number, whole
+from maexp.envs.fields import check_settings, replaced, setting
 
 
 @dataclass(frozen=True)
@@ -10,41 +11,36 @@ class Settings:
     """Settings that all algorithms share. A team step is one macro step of one team.
 
     ValueError where one is out of its range (all subclasses).
-
-    Attributes:
-        gamma: discount per macro step
-        lmbda: trace decay of the generalised advantages
-        finite_horizon: an episode that ran out of time is over: nothing that would come after it counts
-        lr: learning rate of the policy
-        critic_lr: learning rate of the critic
-        final_lr_share: both decay linearly to this share at the end of the training
-        entropy_coeff: weight of the summed entropy of the action's heads
-        critic_coeff: weight of the critic's loss
-        value_norm: measure the critic's error in units of the returns' running spread
-        normalize_advantage: standardise advantages per minibatch
-        mask_collided: leave the actions of robots that had collided out of what the policy learns from
-        minibatch_size: team steps per gradient step
-        max_grad_norm: bound on the gradient of the policy, and on the critic's
-        anchor_coeff: after a warm start, weight of the divergence from its policy; falls linearly to 0
     """
 
-    gamma: float = number(0.99, high=1.0)
-    lmbda: float = number(0.95, high=1.0)
-    finite_horizon: bool = flag(True)
-    lr: float = number(7e-4, open_ends=True)
-    critic_lr: float = number(1e-3, open_ends=True)
-    final_lr_share: float = number(1.0, high=1.0)
-    entropy_coeff: float = number(3e-3)
-    critic_coeff: float = number(1.0)
-    value_norm: bool = flag(True)
-    normalize_advantage: bool = flag(True)
-    mask_collided: bool = flag(True)
-    minibatch_size: int = whole(128)
-    max_grad_norm: float = number(1.0, open_ends=True)
-    anchor_coeff: float = number(0.1)
+    gamma: float = setting(0.99, "discount per macro step", low=0, high=1)
+    lmbda: float = setting(0.95, "trace decay of the generalised advantages", low=0, high=1)
+    finite_horizon: bool = setting(
+        True, "an episode that ran out of time is over: nothing that would come after it counts"
+    )
+    lr: float = setting(7e-4, "learning rate of the policy", above=0)
+    critic_lr: float = setting(1e-3, "learning rate of the critic", above=0)
+    final_lr_share: float = setting(
+        1.0, "learning rates decay linearly to this share at the end of the training", low=0, high=1
+    )
+    entropy_coeff: float = setting(3e-3, "weight of the summed entropy of the action's heads", low=0)
+    critic_coeff: float = setting(1.0, "weight of the critic's loss", low=0)
+    value_norm: bool = setting(True, "measure the critic's error in units of the returns' running spread")
+    normalize_advantage: bool = setting(True, "standardise advantages per minibatch")
+    mask_collided: bool = setting(
+        True, "leave the actions of robots that had collided out of what the policy learns from"
+    )
+    minibatch_size: int = setting(128, "team steps per gradient step", low=1)
+    max_grad_norm: float = setting(1.0, "bound on the gradient of the policy, and on the critic's", above=0)
+    anchor_coeff: float = setting(
+        0.1, "after a warm start, weight of the divergence from its policy; falls linearly to 0", low=0
+    )
+
+    unused: ClassVar[tuple[str, ...]] = ()
+    """Settings that do nothing with this algorithm."""
 
     def __post_init__(self):
-        check_ranges(self, "algorithm")
+        check_settings(self, "algorithm")
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings."""
@@ -55,21 +51,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class ClippedSettings(Settings):
-    """Settings of the clipped algorithms.
+    """Settings of the clipped algorithms."""
 
-    Attributes:
-        epochs: passes over each batch
-        clip_epsilon: bound on each robot's probability ratio
-        clip_value: bound on the change of a value, in the critic's units; 0 for none
-        kl_coeff: first weight of the penalty on the divergence; 0 for none
-        kl_target: divergence at which that weight stays
-    """
-
-    epochs: int = whole(3)
-    clip_epsilon: float = number(0.2, high=1.0, open_ends=True)
-    clip_value: float = number(0.0)
-    kl_coeff: float = number(0.0)
-    kl_target: float = number(0.01, open_ends=True)
+    epochs: int = setting(3, "passes over each batch", low=1)
+    clip_epsilon: float = setting(0.2, "bound on each robot's probability ratio", above=0, below=1)
+    clip_value: float = setting(0.0, "bound on the change of a value, in the critic's units; 0 for none", low=0)
+    kl_coeff: float = setting(0.0, "first weight of the penalty on the divergence; 0 for none", low=0)
+    kl_target: float = setting(0.01, "divergence at which that weight stays", above=0)
 
     def loss_arguments(self) -> dict:
         names = ("clip_epsilon", "kl_coeff", "kl_target")
@@ -79,40 +67,28 @@ class ClippedSettings(Settings):
 
 @dataclass(frozen=True)
 class MixedClippedSettings(ClippedSettings):
-    """ClippedSettings and the `mixer` that makes the team's value: vdn or qmix.
+    """ClippedSettings of an algorithm that mixes the robots' values.
 
     The advantage is the team's, with the noise of all robots in it: a shorter trace learned faster.
     """
 
-    lmbda: float = number(0.8, high=1.0)
-    mixer: str = choice("qmix", "vdn")
+    lmbda: float = replaced(Settings, "lmbda", 0.8)
+    mixer: Literal["qmix", "vdn"] = setting("qmix", "how the robots' values make the team's, vdn or qmix")
 
 
 @dataclass(frozen=True)
 class TrustRegionSettings(Settings):
-    """Settings of the trust-region algorithms.
+    """Settings of the trust-region algorithms."""
 
-    Attributes:
-        max_kl: bound on the mean divergence of a policy step
-        accept_ratio: least share of the promised improvement
-        damping: added to the Fisher matrix's diagonal
-        cg_steps: conjugate-gradient steps
-        backtracks: lengths tried
-        backtrack_factor: each over the one before
-        policy_minibatch_size: team steps per policy step
-        fisher_size: team steps of these that make the Fisher matrix
-        critic_epochs: passes of the critic over each batch
-    """
-
-    max_kl: float = number(0.03, open_ends=True)
-    accept_ratio: float = number(0.1, high=1.0)
-    damping: float = number(0.1)
-    cg_steps: int = whole(10)
-    backtracks: int = whole(15)
-    backtrack_factor: float = number(0.8, high=1.0, open_ends=True)
-    policy_minibatch_size: int = whole(512)
-    fisher_size: int = whole(128)
-    critic_epochs: int = whole(3)
+    max_kl: float = setting(0.03, "bound on the mean divergence of a policy step", above=0)
+    accept_ratio: float = setting(0.1, "least share of the promised improvement", low=0, high=1)
+    damping: float = setting(0.1, "added to the Fisher matrix's diagonal", low=0)
+    cg_steps: int = setting(10, "conjugate-gradient steps", low=1)
+    backtracks: int = setting(15, "lengths tried", low=1)
+    backtrack_factor: float = setting(0.8, "each over the one before", above=0, below=1)
+    policy_minibatch_size: int = setting(512, "team steps per policy step", low=1)
+    fisher_size: int = setting(128, "team steps of these that make the Fisher matrix", low=1)
+    critic_epochs: int = setting(3, "passes of the critic over each batch", low=1)
 
 
 @dataclass(frozen=True)
@@ -121,42 +97,36 @@ class ActorCriticSettings(Settings):
 
     The pass is cut in minibatches, whose steps stay close to the policy that acted (logged as `kl`). Nothing bounds a
     step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
-
-    Attributes:
-        epochs: passes over each batch
-        mixer: how the robots' values make the team's, vdn or qmix
     """
 
-    lmbda: float = number(0.8, high=1.0)
-    lr: float = number(2e-3, open_ends=True)
-    final_lr_share: float = number(0.1, high=1.0)
-    entropy_coeff: float = number(5e-4)
-    epochs: int = whole(1)
-    mixer: str = choice("qmix", "vdn")
+    lmbda: float = replaced(Settings, "lmbda", 0.8)
+    lr: float = replaced(Settings, "lr", 2e-3)
+    final_lr_share: float = replaced(Settings, "final_lr_share", 0.1)
+    entropy_coeff: float = replaced(Settings, "entropy_coeff", 5e-4)
+    epochs: int = replaced(ClippedSettings, "epochs", 1)
+    mixer: Literal["qmix", "vdn"] = replaced(MixedClippedSettings, "mixer", "qmix")
 
 
 @dataclass(frozen=True)
 class ExpertSettings(Settings):
-    """Settings of expert iteration. It has neither returns nor a critic: of those above only `lr`, `final_lr_share`,
-    `minibatch_size` (decisions of teams) and `max_grad_norm` do anything.
+    """Settings of expert iteration, which has neither returns nor a critic."""
 
-    Attributes:
-        candidates: targets that a robot tries where it is branched at, its own choice among them
-        branch_horizon: decisions that are played in a branch; `lookahead` says what they are worth
-        branch_share: share of the teams' decisions that are branched at
-        epochs: how often a branched decision is learned from, on average; few: what is to be learned is small beside
-            what chance adds
-        memory: decisions kept to learn from, of every team size
-        weight_decay: of the weights, as in AdamW
-    """
+    minibatch_size: int = setting(64, "decisions of teams per gradient step", low=1)
+    candidates: int = setting(
+        5, "targets that a robot tries where it is branched at, its own choice among them", low=2, high=24
+    )
+    branch_horizon: int = setting(
+        4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
+    )
+    branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
+    epochs: int = setting(2, "how often a branched decision is learned from, on average", low=1)
+    memory: int = setting(20_000, "decisions kept to learn from, of every team size", low=1)
+    weight_decay: float = setting(0.1, "of the weights, as in AdamW", low=0)
 
-    minibatch_size: int = whole(64)
-    candidates: int = whole(5, 2, 24)
-    branch_horizon: int = whole(4, 1, 100)
-    branch_share: float = number(0.5, 0.01, 1.0)
-    epochs: int = whole(2)
-    memory: int = whole(20_000)
-    weight_decay: float = number(0.1)
+    unused: ClassVar[tuple[str, ...]] = (
+        "gamma", "lmbda", "finite_horizon", "critic_lr", "entropy_coeff", "critic_coeff", "value_norm",
+        "normalize_advantage", "mask_collided", "anchor_coeff",
+    )  # fmt: skip
 
 
 def _reference(settings: Settings, **others) -> Settings:
@@ -178,11 +148,13 @@ class Tunings:
         name: as on the command line
         default: what learns best here
         reference: what the original platform has
+        summary: a line for `--help`
     """
 
     name: str
     default: Settings
     reference: Settings
+    summary: str
 
     def configure(self, tuning: str = "default", **overrides) -> Settings:
         """The settings of a tuning ("default" or "reference") with some replaced.
@@ -199,22 +171,29 @@ class Tunings:
         return replace(getattr(self, tuning), **overrides)
 
 
-def _tunings(name: str, settings: Settings, **reference) -> Tunings:
-    return Tunings(name, settings, _reference(settings, **reference))
+def _tunings(name: str, summary: str, settings: Settings, **reference) -> Tunings:
+    return Tunings(name, settings, _reference(settings, **reference), summary)
 
 
 TUNINGS = {
     one.name: one
     for one in (
-        _tunings("ippo", ClippedSettings(), **_CLIPPED),
-        _tunings("mappo", ClippedSettings(), **_CLIPPED),
-        _tunings("itrpo", TrustRegionSettings(), **_TRUST),
-        _tunings("matrpo", TrustRegionSettings(), **_TRUST),
-        _tunings("vdppo", MixedClippedSettings(), **_CLIPPED),
-        _tunings("vda2c", ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
-        Tunings("expert_iteration", ExpertSettings(), ExpertSettings()),  # the original has none
+        _tunings("ippo", "independent PPO: each robot's critic sees its own observation",
+                 ClippedSettings(), **_CLIPPED),
+        _tunings("mappo", "PPO with a critic that sees the whole team",
+                 ClippedSettings(), **_CLIPPED),
+        _tunings("itrpo", "independent trust region: each robot's critic sees its own observation",
+                 TrustRegionSettings(), **_TRUST),
+        _tunings("matrpo", "trust region with a critic that sees the whole team",
+                 TrustRegionSettings(), **_TRUST),
+        _tunings("vdppo", "PPO with a team value mixed from the robots' values",
+                 MixedClippedSettings(), **_CLIPPED),
+        _tunings("vda2c", "advantage actor-critic with a team value mixed from the robots' values",
+                 ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
+        Tunings("expert_iteration", ExpertSettings(), ExpertSettings(),  # the original has none
+                "learns what targets are worth from branches of its episodes in the true simulator; no critic"),
     )
-}
+}  # fmt: skip
 
 
 def find_tunings(algorithm: str) -> Tunings:

@@ -18,10 +18,14 @@ KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or f
 
 
 def group_choices(group: str) -> dict[str, str]:
-    """The choices of a group of `conf/` with the comment on their first line: {"maze": "125 m mazes ..."}."""
+    """The choices of a group with what they are: rows of the code's tables, and files of `conf/` with the comment on
+    their first line. {"maze": "125 m mazes ..."}."""
+    from maexp.agents.settings.schema import stored_choices
+
+    found = {name: summary for name, (summary, _) in stored_choices().get(group, {}).items()}
     folder = resources.files("maexp.conf").joinpath(group)
-    files = sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name)
-    return {one.name[:-5]: _first_comment(one.read_text()) for one in files}
+    files = [one for one in folder.iterdir() if one.name.endswith(".yaml")] if folder.is_dir() else []
+    return dict(sorted((found | {one.name[:-5]: _first_comment(one.read_text()) for one in files}).items()))
 
 
 def _first_comment(text: str) -> str:
@@ -31,9 +35,11 @@ def _first_comment(text: str) -> str:
 
 
 def groups() -> list[str]:
-    """Names of the groups of `conf/`."""
+    """Names of the groups of settings that offer choices."""
+    from maexp.agents.settings.schema import stored_choices
+
     folder = resources.files("maexp.conf")
-    return sorted(one.name for one in folder.iterdir() if one.is_dir() and not one.name.startswith("_"))
+    return sorted({*stored_choices(), *(one.name for one in folder.iterdir() if one.is_dir() and one.name[0] != "_")})
 
 
 def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
@@ -102,6 +108,9 @@ def explain(error: Exception, verb: str) -> str:
     if found := re.search(r"Value '(.*?)' of type '\w+' could not be converted to (\w+)\s+full_key: (\S+)", text, re.S):
         value, kind, key = found.groups()
         return f"{key}={value} must be {KINDS.get(kind, kind)}."
+    if found := re.search(r"cannot be assigned None|is not Optional.*?full_key: (\S+)", text, re.S):
+        key = re.search(r"full_key: (\S+)", text)
+        return f"{key[1] if key else 'a setting'}=null has no meaning: give it a value."
     if found := re.search(r"Ambiguous value for argument '([^']+)'", text):
         return f"{found[1]} gives several values: add -m to run one after another, or write one value."
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc/docs" not in line]

@@ -1,56 +1,43 @@
 """Sizes of the networks: the dataclass, and those that have a name."""
 
 from dataclasses import dataclass
+from typing import Literal
 
-from maexp.agents.settings.ranges import check_ranges, choice, flag, number, whole
+from maexp.envs.fields import check_settings, setting
 
 
 @dataclass(frozen=True)
 class ModelConfig:
     """What a policy chooses, and the sizes that it shares with the critics.
 
-    Attributes:
-        action: what a robot chooses: a region of the map and an offset, or one of its frontier "targets" (the env shows
-            them with observation.targets). Those of `target_...` and `score_weight` belong to the latter, the
-            other sizes but `critic_hidden` to regions.
-        target_width: features per target.
-        target_heads: attention heads; must divide `target_width`.
-        score_weight: of the classical planner's value of a target in its logit, where one radar disc is 1.
-        stem: how the picture becomes small. "pool" averages blocks of 4 x 4 pixels (no weights, fast on a
-            CPU); "conv" learns two strided convolutions on the full picture, as in the paper.
-        channels: feature maps of the convolutions.
-        grid_features: features made from the pose and the previous goal, per cell.
-        depth: Spatial-TeamFormer blocks.
-        heads: attention heads; must divide `channels + grid_features`.
-        feedforward: width of the feed-forward layers as a multiple of the cell's features.
-        merge_maps: show each cell what the robots in contact have explored together, as two more input
-            channels. The attention can find that out by itself, only later.
-        offsets: "per_region" gives each region an offset of its own; with one "shared" by all regions, as in the
-            paper, a policy cannot even copy a planner.
-        sees_time: show each cell the share of the episode that is left, and whether its robot has collided.
-        critic_hidden: width of the critic's hidden layers.
-        critic_encoder: "own": critics of targets have an encoder of their own, as beside trust regions and for regions
-            anyway. "shared": they read what the policy's encoder made of them, and what they learn trains it too.
+    `target_...` and `score_weight` belong to a policy that chooses among targets, the other sizes but `critic_hidden`
+    to one that chooses regions.
     """
 
-    action: str = choice("regions", "targets")
-    target_width: int = whole(48, most=4096)
-    target_heads: int = whole(2, most=64)
-    score_weight: float = number(50.0)
-    stem: str = choice("pool", "conv")
-    channels: int = whole(16, most=4096)
-    grid_features: int = whole(16, most=4096)
-    depth: int = whole(1, most=64)
-    heads: int = whole(1, most=64)
-    feedforward: int = whole(2, most=64)
-    merge_maps: bool = flag(True)
-    offsets: str = choice("per_region", "shared")
-    sees_time: bool = flag(True)
-    critic_hidden: int = whole(64, most=4096)
-    critic_encoder: str = choice("own", "shared")
+    action: Literal["regions", "targets"] = setting(
+        "regions", "what a robot chooses: regions (and an offset), or one of its frontier targets"
+    )
+    target_width: int = setting(48, "features per target", low=1, high=4096)
+    target_heads: int = setting(2, "of the attention over targets; divide target_width", low=1, high=64)
+    score_weight: float = setting(50.0, "of the classical value of a target in its logit", low=0)
+    stem: Literal["pool", "conv"] = setting(
+        "pool", "how the picture becomes small: pool averages 4 x 4 pixels, conv learns two strided convolutions"
+    )
+    channels: int = setting(16, "feature maps of the convolutions", low=1, high=4096)
+    grid_features: int = setting(16, "features made from pose and last goal, per cell", low=1, high=4096)
+    depth: int = setting(1, "Spatial-TeamFormer blocks", low=1, high=64)
+    heads: int = setting(1, "of the attention; divide channels + grid_features", low=1, high=64)
+    feedforward: int = setting(2, "width of the feed-forward layers, times a cell's features", low=1, high=64)
+    merge_maps: bool = setting(True, "show each cell what the robots in contact have explored together")
+    offsets: Literal["per_region", "shared"] = setting("per_region", "per_region, or one shared by all regions")
+    sees_time: bool = setting(True, "show each cell the time that is left and whether its robot has collided")
+    critic_hidden: int = setting(64, "width of the critic's hidden layers", low=1, high=4096)
+    critic_encoder: Literal["own", "shared"] = setting(
+        "own", "of targets: own, or shared: what the policy's made of them (faster; not beside trust regions)"
+    )
 
     def __post_init__(self):
-        check_ranges(self, "model")
+        check_settings(self, "model")
         if self.width % self.heads:
             raise ValueError(
                 f"model.heads={self.heads} does not divide channels + grid_features = {self.width}; choose a divisor."
@@ -82,6 +69,12 @@ SIZES = {
         critic_hidden=128,
     ),
 }
+
+SUMMARIES = {
+    "small": "16 channels, one block: learns on a laptop",
+    "paper": "the paper's sizes: 32 channels, two blocks",
+}
+"""Lines for `--help`."""
 
 
 def model_config(model: "str | ModelConfig") -> ModelConfig:

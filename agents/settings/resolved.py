@@ -1,6 +1,6 @@
 """The values that settings come to: what is null in the composed settings is filled in from where it comes."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import yaml
@@ -11,7 +11,7 @@ from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, describe, given, schema
+from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, helps, read, schema
 from maexp.envs.config import (
     BODY,
     CommConfig,
@@ -62,14 +62,16 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         ValueError: a value out of its range.
     """
     settings = plain(cfg)
+    if "planner" in settings:
+        settings["planner"] = _own_planner(settings["planner"])
     if "scenarios" in settings:  # a benchmark: its cells have one each, and write what that comes to
-        del settings["scenario"]["name"], settings["algorithm"]["name"]
+        del settings["scenario"]["name"], settings["scenario"]["importing"], settings["algorithm"]["name"]
     elif "scenario" in settings:
         row = find_scenario(maps[0].scenario if maps else cfg.scenario.name)
         known = maps is not None or row.build is not None
         if known:
             settings["robot"] |= _resolve_robot(cfg, row)
-            settings["radar"] = asdict(complete_radar(RadarConfig(**given(cfg.radar)), row))
+            settings["radar"] = asdict(complete_radar(read(RadarConfig, cfg.radar), row))
         settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
         if maps and not settings["scenario"]["macro_steps"]:
             settings["scenario"]["macro_steps"] = default_macro_steps(
@@ -77,12 +79,12 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
             )
         if known:
             settings["planner"] = _resolve_planner(cfg, row)
-        settings["reward"] = asdict(check_reward(RewardConfig(**given(cfg.reward))))
-        settings["observation"] = asdict(ObservationConfig(**given(cfg.observation)))
-        settings["comm"] = asdict(check_comm(CommConfig(**given(cfg.comm))))
-        settings["faults"] = asdict(check_faults(FaultsConfig(**given(cfg.faults))))
-        settings["targets"] = asdict(check_targets(TargetsConfig(**given(cfg.targets))))
-        settings["lookahead"] = asdict(check_lookahead(LookaheadConfig(**given(cfg.lookahead))))
+        settings["reward"] = asdict(check_reward(read(RewardConfig, cfg.reward)))
+        settings["observation"] = asdict(read(ObservationConfig, cfg.observation))
+        settings["comm"] = asdict(check_comm(read(CommConfig, cfg.comm)))
+        settings["faults"] = asdict(check_faults(read(FaultsConfig, cfg.faults)))
+        settings["targets"] = asdict(check_targets(read(TargetsConfig, cfg.targets)))
+        settings["lookahead"] = asdict(check_lookahead(read(LookaheadConfig, cfg.lookahead)))
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -97,7 +99,7 @@ def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | No
     settings = {"local_steps": scenario.local_steps or row.local_steps}
     settings["macro_steps"] = scenario.macro_steps or row.macro_steps
     if find_scenario(scenario.name).build is None:
-        return settings | {"importing": asdict(ImportOptions(**given(scenario.importing, "robot_radius")))}
+        return settings | {"importing": asdict(read(ImportOptions, scenario.importing, robot_radius=None))}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
     settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
     return settings | {"importing": None}
@@ -118,9 +120,9 @@ def plain_value(value: Any) -> Any:
 
 def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
-    radar, team = given(cfg.radar), []
+    team = []
     for entry in plain_value(cfg.robot.team) or []:
-        seen = complete_radar(RadarConfig(**(radar | entry.get("radar", {}))), row)
+        seen = complete_radar(read(RadarConfig, cfg.radar, **entry.get("radar", {})), row)
         team.append(_without_null(asdict(complete_robot(robot_config(cfg, entry), row))) | {"radar": asdict(seen)})
     return asdict(complete_robot(robot_config(cfg), row)) | {"team": team or None}
 
@@ -132,10 +134,9 @@ def robot_config(cfg: CommonSettings, entry: dict[str, Any] | None = None) -> Ro
         entry: may hold the radar's settings, too, which are left out.
     """
     own = {name: value for name, value in (entry or {}).items() if name != "radar"}
-    robot = given(cfg.robot, "team")
-    if (robot | own).get("radius") is not None:
-        robot = {name: value for name, value in robot.items() if name not in BODY or not _follows(cfg, "robot", name)}
-    return RobotConfig(**(robot | own))
+    if own.get("radius", cfg.robot.radius) is not None:
+        own = {name: None for name in BODY if _follows(cfg, "robot", name)} | own
+    return read(RobotConfig, cfg.robot, **own)
 
 
 def describe_radius(cfg: DictConfig) -> str | None:
@@ -152,25 +153,30 @@ def describe_radius(cfg: DictConfig) -> str | None:
 
 def planner_config(cfg: CommonSettings, row: Scenario) -> PlannerConfig:
     """The planner's settings; without a clearance DWA takes that of the map's scenario (`planner=paper`)."""
-    own = given(cfg.planner)
-    if cfg.planner.name == "dwa":
-        own.setdefault("clearance_factor", row.clearance_factor)
-    return PlannerConfig(**own)
+    planner = read(PlannerConfig, cfg.planner)
+    if planner.name == "dwa" and planner.clearance_factor is None:
+        return replace(planner, clearance_factor=row.clearance_factor)
+    return planner
 
 
 def _resolve_planner(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
-    planner = asdict(complete_planner(planner_config(cfg, row), row))
-    return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(cfg.planner.name, ())}
+    return _own_planner(asdict(complete_planner(planner_config(cfg, row), row)))
+
+
+def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:
+    """What a planner has, whatever the scenario."""
+    return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(planner["name"], ())}
 
 
 def algorithm_settings(cfg: LearnerSettings) -> Settings:
     """The settings of the algorithm."""
-    return find_tunings(cfg.algorithm.name).configure(**given(cfg.algorithm, "name"))
+    given = {name: value for name, value in cfg.algorithm.items() if name != "name" and value is not None}
+    return find_tunings(cfg.algorithm.name).configure(**given)
 
 
 def model_settings(cfg: LearnerSettings) -> ModelConfig:
     """The sizes of the networks."""
-    return ModelConfig(**given(cfg.model))
+    return read(ModelConfig, cfg.model)
 
 
 def find_followers(cfg: DictConfig) -> list[str]:
@@ -219,4 +225,4 @@ _Dumper.add_representer(
 def to_yaml(settings: dict, verb: str) -> str:
     """Resolved settings of a verb as the text of a config.yaml, with units and meanings as comments."""
     text = yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
-    return with_comments(text, settings, {name: meaning for name, _, meaning in describe(schema(verb))})
+    return with_comments(text, helps(schema(verb), settings))

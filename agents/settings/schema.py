@@ -1,25 +1,26 @@
 """Types of the settings, registered with Hydra: a misspelt name or a word in a number's place is refused.
 
-Values live in `conf/`, types here. Where settings belong to a class of the layers below (`RobotConfig`,
-`ModelConfig`, ...), their names and types are read from that class, each optional: null where a group does not have
-the setting, or where its value follows from the map.
+A setting is declared once, as a field of a dataclass (`maexp.envs.fields`). Where settings belong to a class of the
+layers below (`RobotConfig`, `ModelConfig`, ...), their names, types and help are read from that class.
 
 Hydra hands on a `DictConfig` of these types. A function that reads settings by attribute names the dataclass, so that
 one sees what there is; one that looks settings up by name, or takes any verb's, says `DictConfig`.
 """
 
-import types
 from dataclasses import MISSING as NO_DEFAULT
-from dataclasses import dataclass, field, fields, make_dataclass
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from dataclasses import Field, asdict, dataclass, field, fields, is_dataclass, make_dataclass
+from types import NoneType
+from typing import Any, Literal, get_origin
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig
 
 from maexp.agents.runtime.choices import CHOICES
-from maexp.agents.settings.algorithms import TUNINGS
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.settings.algorithms import TUNINGS, find_tunings
+from maexp.agents.settings.model import SIZES, SUMMARIES, ModelConfig
 from maexp.envs.config import (
+    CLEARANCE,
+    PLANNERS,
     CommConfig,
     FaultsConfig,
     LookaheadConfig,
@@ -30,7 +31,9 @@ from maexp.envs.config import (
     RobotConfig,
     TargetsConfig,
 )
+from maexp.envs.fields import explain, kinds, setting
 from maexp.envs.importing.options import ImportOptions
+from maexp.envs.scenarios import SCENARIOS, Scenario
 
 NAMES = (*CHOICES, "lookahead", "oracle", "clairvoyant")
 """Of the policies that come with the package and are not trained."""
@@ -38,123 +41,150 @@ OTHERS = "a trained one or its folder, a run, module:function"
 PRIMITIVES = (int, float, bool, str)
 
 
-def optional_settings(*classes: type, **extra: Any) -> type:
-    """Dataclass with every field of `classes` optional, default null, and `extra` name=type fields likewise."""
-    named = {}
-    for cls in classes:
-        hints = get_type_hints(cls)
-        named |= {one.name: storable_type(hints[one.name]) for one in fields(cls) if one.init}
-    named |= extra
-    entries = [(name, kind, field(default=None)) for name, kind in named.items()]
-    return make_dataclass(f"{classes[0].__name__}Settings", entries)
+def storable(cls: type, *names: str, **extra: Any) -> type:
+    """Dataclass with the settings of `cls`, their defaults and types that OmegaConf can check.
+
+    What a scenario supplies refers to it: `radar.range` is `${scenario.radar_range}`.
+
+    Args:
+        names: only these; none: all.
+        extra: further fields, name=type, null by default.
+    """
+    chosen = [one for one in fields(cls) if one.init and (not names or one.name in names)]
+    entries = [(one.name, _storable(kinds(cls)[one.name]), _supplied(one)) for one in chosen]
+    return make_dataclass(cls.__name__, entries + [(name, kind, field(default=None)) for name, kind in extra.items()])
 
 
-def storable_type(kind: Any) -> Any:
-    """The nearest type that OmegaConf can check, None allowed: Literal becomes str, a mixture with tuples Any."""
-    members = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
-    plain = {str if get_origin(one) is Literal else one for one in members if one is not type(None)}
+def _supplied(one: Field) -> Any:
+    """A copy of the field; its default refers to the scenario where that says it."""
+    source, default = one.metadata.get("scenario"), one.default
+    if default is NO_DEFAULT and one.default_factory is not NO_DEFAULT:
+        return field(default_factory=one.default_factory, metadata=one.metadata)
+    return field(default=f"${{scenario.{source}}}" if source else default, metadata=one.metadata)
+
+
+def _storable(members: tuple, optional: bool = False) -> Any:
+    """The nearest type that OmegaConf can check: Literal becomes str, a mixture with tuples Any."""
+    if get_origin(members[0]) is list:
+        return members[0]
+    plain = {str if get_origin(one) is Literal else one for one in members if one is not NoneType}
     if not plain.issubset(PRIMITIVES):
         return Any
     union = None
     for one in sorted(plain, key=PRIMITIVES.index):
         union = one if union is None else union | one
-    return union | None
+    return union | None if optional or NoneType in members else union
 
 
-def given(node: DictConfig, *leave_out: str) -> dict[str, Any]:
-    """The values of a settings node that are not null, without the names in `leave_out`."""
-    return {name: value for name, value in node.items() if value is not None and name not in leave_out}
+def optional_settings(*classes: type) -> type:
+    """Dataclass with a name and the settings of all of `classes`, each optional and null by default."""
+    entries = {
+        one.name: (one.name, _storable(kinds(cls)[one.name], True), field(default=None, metadata=one.metadata))
+        for cls in classes
+        for one in fields(cls)
+        if one.metadata.get("help")
+    }
+    return make_dataclass(f"{classes[0].__name__}Settings", [("name", str, MISSING), *entries.values()])
 
 
-def setting(default: Any, text: str) -> Any:
-    """A field with its default and the line that `--help` prints."""
-    return field(default=default, metadata={"help": text})
+def read(kind: type, node: DictConfig, /, **others: Any) -> Any:
+    """The settings of a group as the object that declares them; `others` stand for values of the group."""
+    return kind(**{one.name: node[one.name] for one in fields(kind) if one.name not in others} | others)
 
 
 def describe(cls: type) -> list[tuple[str, Any, str]]:
     """(name, default, line of help) of the top-level settings of a verb, its own before those it shares."""
-    documented = [one for one in fields(cls) if "help" in one.metadata]
+    documented = [one for one in fields(cls) if one.metadata.get("help")]
     documented.sort(key=lambda one: one.name not in vars(cls)["__annotations__"])
-    return [(one.name, None if one.default is NO_DEFAULT else one.default, one.metadata["help"]) for one in documented]
+    return [(one.name, None if one.default is NO_DEFAULT else one.default, explain(one.metadata)) for one in documented]
 
 
-RobotSettings = optional_settings(RobotConfig, team=Any)  # team: a list of settings, one per robot
-ModelSettings = optional_settings(ModelConfig)
-RadarSettings = optional_settings(RadarConfig)
-PlannerSettings = optional_settings(PlannerConfig)
-RewardSettings = optional_settings(RewardConfig)
-ObservationSettings = optional_settings(ObservationConfig)
-CommSettings = optional_settings(CommConfig)
-FaultsSettings = optional_settings(FaultsConfig)
-TargetsSettings = optional_settings(TargetsConfig)
-LookaheadSettings = optional_settings(LookaheadConfig)
-AlgorithmSettings = optional_settings(
-    *{type(row.default): None for row in TUNINGS.values()}, name=str | None
-)
-ImportSettings = optional_settings(ImportOptions)
+def helps(cls: type, settings: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """{"radar.range": "how far it sees [m]"} of all settings of a verb's dataclass, those of groups included."""
+    found = {prefix + one.name: explain(one.metadata) for one in fields(cls) if one.metadata.get("help")}
+    for one in fields(cls):
+        kind, values = kinds(cls)[one.name][0], settings.get(one.name)
+        if is_dataclass(kind) and isinstance(values, dict):
+            kind = type(find_tunings(values["name"]).default) if one.name == "algorithm" and "name" in values else kind
+            found |= helps(kind, values, f"{prefix}{one.name}.")
+            found |= {f"{prefix}{one.name}.{name}": "does nothing here" for name in getattr(kind, "unused", ())}
+    return found
 
 
-def import_settings() -> Any:
-    """A field with the settings of the import, for the robot whose radius `robot.radius` says."""
-    return field(default_factory=lambda: ImportSettings(robot_radius="${robot.radius}"))
+RobotSettings = storable(RobotConfig, team=Any)  # team: a list of settings, one per robot
+ModelSettings = storable(ModelConfig)
+RadarSettings = storable(RadarConfig)
+PlannerSettings = storable(PlannerConfig)
+RewardSettings = storable(RewardConfig)
+ObservationSettings = storable(ObservationConfig)
+CommSettings = storable(CommConfig)
+FaultsSettings = storable(FaultsConfig)
+TargetsSettings = storable(TargetsConfig)
+LookaheadSettings = storable(LookaheadConfig)
+AlgorithmSettings = optional_settings(*{type(row.default): None for row in TUNINGS.values()})
+ImportSettings = storable(ImportOptions)
+SUPPLIED = tuple(one.name for one in fields(Scenario) if one.metadata.get("help"))
+"""What a scenario's row supplies; null: what the map's own scenario says."""
+
+
+def import_settings(**references: str) -> Any:
+    """A field with the settings of the import, some of which refer to others."""
+    return field(default_factory=lambda: ImportSettings(**references))
 
 
 @dataclass
-class ScenarioSettings:
+class ScenarioSettings(optional_settings(Scenario)):
     """Where the team explores, and what robot, radar and planner take from there. Null: what the map says."""
 
-    name: str = MISSING
-    also: Any = None  # further scenarios to train on, as [maze,outdoor], each with its own robots and episode
-    path: str | None = None  # the map of scenario=pointcloud, or several: a.yaml,b.pcd
-    maps: Any = None  # indices trained on; null: what held_out and validation leave of the table's count
-    validation: Any = None  # indices that choose between checkpoints and planners; null: the last fifth of the rest
-    held_out: Any = None  # indices evaluated; null: the last fifth of the table's count
-    held_out_count: int | None = None  # instead: so many, from the first held-out one on, beyond the table's count too
-    local_steps: int | None = None  # control steps in one decision
-    macro_steps: int | None = None  # decisions in one episode
-    starts: str = "drawn"  # anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses
-    radar_range: float | None = None
-    max_speed: float | None = None
-    max_accel: float | None = None
-    body_length: float | None = None
-    body_width: float | None = None
-    collision_threshold: float | None = None
-    clearance_factor: float | None = None
-    num_steering: int | None = None
-    max_steer: float | None = None
-    success_coverage: float = 0.95  # share of the free points that ends an episode, in (0, 1]
-    done: str = "union"  # whose: what the team has seen; or base, everyone: what the station, or every robot, knows
-    collision: str = "centre"  # or footprint
-    importing: ImportSettings = import_settings()
-
-
-SUPPLIED = (
-    "local_steps", "macro_steps", "radar_range", "max_speed", "max_accel", "body_length", "body_width",
-    "collision_threshold", "clearance_factor", "num_steering", "max_steer",
-)  # fmt: skip
-"""What a scenario's file supplies; null: what the map's own scenario says."""
+    also: Any = setting(None, "further scenarios to train on, as [maze,outdoor], each with its own robots and episode")
+    path: str | None = setting(None, "the map of scenario=pointcloud, or several: a.yaml,b.pcd")
+    maps: Any = setting(None, "indices trained on; default: what held_out and validation leave of the table's count")
+    validation: Any = setting(
+        None, "indices that choose between checkpoints and planners; default: the last fifth of the rest"
+    )
+    held_out: Any = setting(None, "indices evaluated; default: the last fifth of the table's count")
+    held_out_count: int | None = setting(
+        None, "instead: so many, from the first held-out one on, beyond the table's count too"
+    )
+    starts: str = setting(
+        "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
+    )
+    success_coverage: float = setting(
+        0.95, "share of the free points that ends an episode, up to 1; 0.99 with more macro_steps: to the end"
+    )
+    done: str = setting(
+        "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
+    )
+    collision: str = setting("centre", "of centres with walls and centres, or footprint: of oriented rectangles")
+    importing: ImportSettings = import_settings(robot_radius="${robot.radius}")
 
 
 @dataclass
 class CollectorSettings:
     """How experience is gathered."""
 
-    steps: int | None = None  # macro steps of every team in one iteration; null: scenario.macro_steps, a whole episode
-    backend: str = "single"  # or processes, ray
-    workers: int = 1  # worker processes, for each team size
-    overlap: bool = False  # collect the next batch while learning from this one; the policy that acts is one batch old
-    sample_device: str | None = None  # null: device
-    train_device: str | None = None  # null: device
-    ray_address: str | None = None  # of a cluster's head, or auto; null: a cluster of this machine alone
+    steps: int | None = setting(
+        None, "macro steps of every team in one iteration; default: scenario.macro_steps, a whole episode"
+    )
+    backend: str = setting("single", "one process; or processes, ray")
+    workers: int = setting(1, "worker processes, for each team size")
+    overlap: bool = setting(
+        False, "collect the next batch while learning from this one; the policy that acts is one batch old"
+    )
+    sample_device: str | None = setting(None, "where teams play; default: device")
+    train_device: str | None = setting(None, "where the networks learn; default: device")
+    ray_address: str | None = setting(
+        None, "of a cluster's head, or auto; default: a cluster of this machine alone"
+    )
 
 
 @dataclass
 class LoggerSettings:
     """Where the metrics go besides metrics.csv."""
 
-    backends: list[str] = field(default_factory=list)
-    project: str = "maexp"
-    mode: str = "online"
+    backends: list[str] = setting([], "tensorboard, wandb")
+    project: str = setting("maexp", "of Weights & Biases")
+    mode: str = setting("online", "of Weights & Biases; or offline")
 
 
 @dataclass
@@ -278,7 +308,7 @@ class PoliciesSettings:
 class RoundSettings:
     """Of the robots a map is for."""
 
-    radius: float | None = None  # [m]; null: the robot of the map's scenario
+    radius: float | None = setting(None, "of a round body; default: the robot of the map's scenario", unit="m")
 
 
 @dataclass
@@ -297,7 +327,7 @@ class MapsSettings:
     num_robots: int = setting(3, "the team that must find room")
     repair: bool = setting(False, "check: mend what can be mended and write the mended map")
     robot: RoundSettings = field(default_factory=RoundSettings)
-    importing: ImportSettings = import_settings()
+    importing: ImportSettings = import_settings(robot_radius="${robot.radius}", num_robots="${num_robots}")
 
 
 @dataclass
@@ -320,7 +350,7 @@ class IrsimSettings:
     pose_noise: float = setting(0.0, "of x and y a robot believes, anew every 0.1 s [m]; of its heading, a fifth [rad]")
     pose_drift: float = setting(0.0, "the same, of an error that walks at random with the way, after 1 m [m]")
     people: int = setting(0, "people who walk about")
-    importing: ImportSettings = field(default_factory=ImportSettings)
+    importing: ImportSettings = import_settings(num_robots="${num_robots}")
 
 
 @dataclass
@@ -417,4 +447,32 @@ def schema(verb: str) -> type:
 
 def register_schema(verb: str) -> None:
     """Make the types known to Hydra as `<verb>_schema`, the first entry of the verb's primary config."""
-    ConfigStore.instance().store(name=f"{verb}_schema", node=schema(verb))
+    store = ConfigStore.instance().store
+    store(name=f"{verb}_schema", node=schema(verb))
+    for group, choices in stored_choices().items():
+        for name, (_, values) in choices.items():
+            store(group=group, name=name, node=values)
+    for name, row in TUNINGS.items():
+        if row.reference != row.default:
+            store(group="_tuning", name=f"reference_{name}", node=asdict(row.reference))
+
+
+def stored_choices() -> dict[str, dict[str, tuple[str, dict[str, Any]]]]:
+    """Choices of groups that tables of the code hold: {"scenario": {"maze": (summary, values)}}."""
+    return {
+        "scenario": {name: (row.summary, _place(row)) for name, row in SCENARIOS.items()},
+        "algorithm": {name: (row.summary, {"name": name} | asdict(row.default)) for name, row in TUNINGS.items()},
+        "planner": {name: (summary, _planner(name)) for name, summary in PLANNERS.items()},
+        "model": {name: (SUMMARIES[name], asdict(sizes)) for name, sizes in SIZES.items()},
+    }
+
+
+def _planner(name: str) -> dict[str, Any]:
+    return {"name": name} | ({"clearance_factor": CLEARANCE[name]} if name in CLEARANCE else {})
+
+
+def _place(row: Scenario) -> dict[str, Any]:
+    """What a scenario's row supplies; of a map of one's own that is known when it is read."""
+    if row.build is None:
+        return {"name": row.name, "path": MISSING}
+    return {"name": row.name} | {name: getattr(row, name) for name in SUPPLIED}

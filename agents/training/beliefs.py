@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,8 +23,9 @@ from torchrl.envs.utils import step_mdp
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_utility
-from maexp.agents.settings.ranges import check_ranges, choice, number, whole
+from maexp.agents.settings.schema import storable
 from maexp.envs import ExplorationEnv, MapError, ObservationConfig, PlannerConfig, PointCloudMap, make_map
+from maexp.envs.fields import check_settings, setting
 from maexp.envs.importing.finish import crop_grid, finish_map
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
@@ -45,32 +47,24 @@ EXTRA_MAPS = 1_000_000  # further maps to train on are numbered from here: in no
 
 @dataclass(frozen=True)
 class BeliefConfig:
-    """Which beliefs are written.
+    """Which beliefs are written."""
 
-    Attributes:
-        out: folder for the files.
-        split: maps that are played, `train` or `validation`; held-out ones never are.
-        scenarios: those played; `plans` is the folder `plans`.
-        plans: folder of map_server files, imported as users' maps are; "": none. The last fifth in sorted order is held
-            out, the last fifth of the others is for validation.
-        limit: maps of each scenario at most, spread evenly; 0: all.
-        extra: maps of each scenario beyond those of its table, for `train` alone.
-        batch: maps played at once.
-        rounds: episodes on each map.
-        departures: share of decisions in which a robot takes any target.
-        seed: of starts and departures.
-    """
-
-    out: str = "beliefs"
-    split: str = choice("train", "validation")
-    scenarios: list[str] = field(default_factory=lambda: list(GENERATED))
-    plans: str = ""
-    limit: int = whole(0, 0)
-    extra: int = whole(0, 0)
-    batch: int = whole(8, 1, 1024)
-    rounds: int = whole(2)
-    departures: float = number(0.3, 0.0, 1.0)
-    seed: int = whole(0, 0)
+    out: str = setting("beliefs", "folder for the files")
+    split: Literal["train", "validation"] = setting(
+        "train", "maps that are played, `train` or `validation`; held-out ones never are"
+    )
+    scenarios: list[str] = setting(list(GENERATED), "those played; `plans` is the folder `plans`")
+    plans: str = setting(
+        "",
+        "folder of map_server files, imported as users' maps are; empty: none. The last fifth in sorted order is held "
+        "out, the last fifth of the others is for validation",
+    )
+    limit: int = setting(0, "maps of each scenario at most, spread evenly; 0: all", low=0)
+    extra: int = setting(0, "maps of each scenario beyond those of its table, for `train` alone", low=0)
+    batch: int = setting(8, "maps played at once", low=1, high=1024)
+    rounds: int = setting(2, "episodes on each map", low=1)
+    departures: float = setting(0.3, "share of decisions in which a robot takes any target", low=0, high=1)
+    seed: int = setting(0, "of starts and departures", low=0)
 
 
 @dataclass(frozen=True)
@@ -211,7 +205,7 @@ def load_groups(folder: Path) -> dict[str, list[Episode]]:
 
 def write_beliefs(config: BeliefConfig) -> None:
     """Play and write what is not there yet."""
-    check_ranges(config, "beliefs")
+    check_settings(config, "beliefs")
     for name in config.scenarios:
         write_maps(config, name, list_sources(config, name))
         if config.extra and name != PLANS and config.split == "train":
@@ -249,7 +243,7 @@ def write_batch(config: BeliefConfig, name: str, sources: list, first: int) -> N
 def main() -> int:
     """Write beliefs as the command line says."""
     try:
-        words = OmegaConf.merge(OmegaConf.structured(BeliefConfig), OmegaConf.from_cli())
+        words = OmegaConf.merge(OmegaConf.structured(storable(BeliefConfig)), OmegaConf.from_cli())
         write_beliefs(OmegaConf.to_object(words))
     except (OmegaConfBaseException, UserError, MapError, ValueError) as error:
         print(str(error).splitlines()[0], file=sys.stderr)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +32,9 @@ from maexp.agents.networks.distributions import ACTION
 from maexp.agents.policies.lookahead import list_candidates
 from maexp.agents.policies.rollouts import Rollouts, pick_places
 from maexp.agents.settings.algorithms import ExpertSettings
-from maexp.agents.settings.ranges import check_ranges, number, whole
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.features import FEATURES
+from maexp.envs.fields import check_settings, setting
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
 
 SHOWN = 24  # candidates that a policy sees
@@ -46,31 +46,22 @@ SCORE, TRAVEL = FEATURES.index("score"), FEATURES.index("travel")
 
 @dataclass(frozen=True)
 class BranchingConfig:
-    """Which branches are played.
+    """Which branches are played."""
 
-    Attributes:
-        out: folder for the files.
-        scenarios: whose training maps are played; validation and held-out maps never are.
-        robots: of a team.
-        teams: played at once, each an episode a round.
-        rounds: files of each scenario.
-        every: decisions from one that is branched at to the next.
-        candidates: that a robot tries, its own choice among them.
-        horizon: decisions that are played in a branch.
-        departures: share of the episodes' decisions in which a team departs from what `cost_utility` chooses.
-        seed: of starts, departures and what is tried.
-    """
-
-    out: str = "branches"
-    scenarios: list[str] = field(default_factory=lambda: list(GENERATED))
-    robots: int = whole(3, 1, 64)
-    teams: int = whole(24, 1, 1024)
-    rounds: int = whole(2)
-    every: int = whole(2)
-    candidates: int = whole(5, 2, 24)
-    horizon: int = whole(4, 1, 100)
-    departures: float = number(0.3, 0.0, 1.0)
-    seed: int = whole(0, 0)
+    out: str = setting("branches", "folder for the files")
+    scenarios: list[str] = setting(
+        list(GENERATED), "whose training maps are played; validation and held-out maps never are"
+    )
+    robots: int = setting(3, "of a team", low=1, high=64)
+    teams: int = setting(24, "played at once, each an episode a round", low=1, high=1024)
+    rounds: int = setting(2, "files of each scenario", low=1)
+    every: int = setting(2, "decisions from one that is branched at to the next", low=1)
+    candidates: int = setting(5, "that a robot tries, its own choice among them", low=2, high=24)
+    horizon: int = setting(4, "decisions that are played in a branch", low=1, high=100)
+    departures: float = setting(
+        0.3, "share of the episodes' decisions in which a team departs from what `cost_utility` chooses", low=0, high=1
+    )
+    seed: int = setting(0, "of starts, departures and what is tried", low=0)
 
 
 class BranchPlayer:
@@ -256,7 +247,7 @@ def read_config(words: list[str]) -> BranchingConfig:
     try:
         given = OmegaConf.merge(OmegaConf.structured(BranchingConfig), OmegaConf.from_dotlist(words))
         config = BranchingConfig(**{one.name: given[one.name] for one in fields(BranchingConfig)})
-        check_ranges(config, "branching")
+        check_settings(config, "branching")
         for name in config.scenarios:
             if find_scenario(name).build is None:
                 raise ValueError(f"scenarios={name} has no training maps: choose among {', '.join(GENERATED)}.")

@@ -23,8 +23,8 @@ from torch.nn import functional as F
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.map_predictor import MapPredictor
-from maexp.agents.settings.ranges import check_ranges, number, whole
 from maexp.agents.training.beliefs import Episode, load_groups
+from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, UNKNOWN
 
 BAND = 2.0  # radar ranges from known free ground within which cells count
@@ -34,31 +34,18 @@ CHECKPOINT, LOG = "checkpoint.pt", "metrics.csv"
 
 @dataclass(frozen=True)
 class PredictorConfig:
-    """How the predictor is trained.
+    """How the predictor is trained."""
 
-    Attributes:
-        data: folder of beliefs.
-        out: folder of the checkpoint and the log.
-        start: folder of an earlier training whose weights are the first ones; "": none.
-        width: channels of the network's finest level.
-        steps: gradient steps of the whole training.
-        batch: beliefs in a step.
-        crop: side of the square cut out around a frontier cell of each [cells].
-        learning_rate: of Adam after 100 steps; falls to 0 along a cosine.
-        seed: of weights and of what is drawn.
-        save_every: steps between checkpoints.
-    """
-
-    data: str = "beliefs"
-    out: str = "map_predictor"
-    start: str = ""
-    width: int = whole(16, 1, 256)
-    steps: int = whole(4000)
-    batch: int = whole(16, 1, 4096)
-    crop: int = whole(80, 32, 512)
-    learning_rate: float = number(2e-3, 0.0, 1.0, open_ends=True)
-    seed: int = whole(0, 0)
-    save_every: int = whole(100)
+    data: str = setting("beliefs", "folder of beliefs")
+    out: str = setting("map_predictor", "folder of the checkpoint and the log")
+    start: str = setting("", "folder of an earlier training whose weights are the first ones; \"\": none")
+    width: int = setting(16, "channels of the network's finest level", low=1, high=256)
+    steps: int = setting(4000, "gradient steps of the whole training", low=1)
+    batch: int = setting(16, "beliefs in a step", low=1, high=4096)
+    crop: int = setting(80, "side of the square cut out around a frontier cell of each", unit="cells", low=32, high=512)
+    learning_rate: float = setting(2e-3, "of Adam after 100 steps; falls to 0 along a cosine", above=0, below=1)
+    seed: int = setting(0, "of weights and of what is drawn", low=0)
+    save_every: int = setting(100, "steps between checkpoints", low=1)
 
 
 @dataclass(frozen=True)
@@ -138,7 +125,7 @@ def train_predictor(config: PredictorConfig, report: Callable[[str], None] = pri
     Raises:
         ValueError: a setting is out of its range, or the folder holds a training with others.
     """
-    check_ranges(config, "map_predictor")
+    check_settings(config, "map_predictor")
     groups = load_groups(Path(config.data))
     torch.manual_seed(config.seed)
     net = start_net(config).to(memory_format=torch.channels_last)

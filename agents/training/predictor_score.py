@@ -21,9 +21,9 @@ from scipy import ndimage
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.networks.map_predictor import load_predictor, predict, sample_worlds
-from maexp.agents.settings.ranges import check_ranges, whole
 from maexp.agents.training.beliefs import Episode, load_groups
 from maexp.agents.training.map_predictor import BAND, matters
+from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 MOST_DISTANCE = 48  # cells; a histogram takes what lies farther as lying there
@@ -37,21 +37,13 @@ DISTANCES = (0.25, 0.5, 1.0, 2.0)  # radar ranges up to which accuracies are tol
 
 @dataclass(frozen=True)
 class ScoreConfig:
-    """What is compared.
+    """What is compared."""
 
-    Attributes:
-        data: folder of beliefs for validation.
-        train: folder of beliefs that the histograms are counted in.
-        predictor: name or folder.
-        moments: beliefs looked at in each episode.
-        out: JSON file with the figures; "": none.
-    """
-
-    data: str = "beliefs/validation"
-    train: str = "beliefs/train"
-    predictor: str = "general"
-    moments: int = whole(4)
-    out: str = ""
+    data: str = setting("beliefs/validation", "folder of beliefs for validation")
+    train: str = setting("beliefs/train", "folder of beliefs that the histograms are counted in")
+    predictor: str = setting("general", "name or folder")
+    moments: int = setting(4, "beliefs looked at in each episode", low=1)
+    out: str = setting("", "JSON file with the figures; \"\": none")
 
 
 @dataclass(frozen=True)
@@ -179,7 +171,7 @@ def share_alike(worlds: np.ndarray, pairs: np.ndarray) -> float:
 
 def score(config: ScoreConfig) -> dict[str, dict[str, dict[str, float]]]:
     """{scenario: {guess: figures}}; under "mean" the mean of all scenarios."""
-    check_ranges(config, "score")
+    check_settings(config, "score")
     net = load_predictor(config.predictor)
     tables = count_tables(load_groups(Path(config.train)))
     found = {}

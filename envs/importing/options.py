@@ -4,107 +4,83 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Literal
 
+from maexp.envs.fields import check_settings, setting
 from maexp.envs.map import MapError
 from maexp.envs.scenarios import Scenario, find_scenario
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937, "in": 0.0254}
-UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How a file becomes a planar map. None or "auto": chosen from the file, and the report says what.
+    """How a file becomes a planar map. None or "auto": chosen from the file, and the report says what."""
 
-    Robot and map:
-        scenario: whose robot and radar fit the map; "auto": "outdoor" for airborne scans where that scenario
-            exists, else "pointcloud".
-        name: name of the map; None: the stem of the file.
-        resolution: spacing of the map's points [m]; None: at most the robot's collision threshold.
-        max_points: free points the automatic resolution may produce; it is coarser where they are not enough.
-        num_robots: the team that must find room.
-        robot_radius: of round robots [m], which fit through gaps twice as wide; None: the scenario's robot.
-
-    Grids (ROS map_server): `pixel_size` [m] when an image comes without its yaml; `free_threshold` and
-        `occupied_threshold` (shares of black) overrule the yaml; `grey_walls`: pixels between the thresholds but
-        darker than the grey of unknown space are obstacles; None: where they outnumber the black ones.
-
-    Bags (rosbag2): `topic`: the `OccupancyGrid` or `PointCloud2` to read; None: the only grid, or else the only cloud.
-        The two thresholds hold for grids of bags, too, as shares of 100.
-
-    Clouds and meshes:
-        units: of the file: "m", "cm", "mm", "ft", "us-ft", "in", or metres per unit.
-        up: axis that points up: "x", "y", "z", "-x", "-y", "-z".
-        level: rotate a tilted floor level; True, False.
-        place: "indoor" (one flat floor) or "outdoor" (terrain seen from above).
-        floor: height of the floor [m] after levelling, when no floor was scanned.
-        step_height: a robot drives over anything lower [m].
-        robot_height: a robot passes under anything higher [m].
-        voxel: points are thinned to one a voxel of this size [m].
-        outliers: remove stray points; True, False.
-        infer_free: take the inside of the walls as free where the floor was not scanned; True, False.
-        fill_holes: pinholes of the floor up to this many cells across are filled.
-        drop_invalid: drop NaN and infinite points instead of refusing the file.
-        sample_spacing: meshes are sampled every so many metres.
-
-    Cleaning:
-        crop: (xmin, ymin, xmax, ymax) [m] in the map's frame.
-        tile: side [m] of the square cut from a larger outdoor scan, where it has most free space.
-        recentre: move the map to the origin; "auto": where coordinates are larger than 10 km.
-        component: "largest", or (x, y) [m]: the free space around that place.
-        min_passage: gaps narrower than this [m] are closed; None: twice the collision threshold, or radius.
-        wall_depth: obstacle points kept behind the boundary [cells].
-    """
-
-    scenario: str = "auto"
-    name: str | None = None
-    resolution: float | None = None
-    max_points: int = 50_000
-    num_robots: int = 3
-    robot_radius: float | None = None
-    pixel_size: float | None = None
-    free_threshold: float | None = None
-    occupied_threshold: float | None = None
-    grey_walls: bool | None = None
-    topic: str | None = None
-    units: str | float = "auto"
-    up: str = "auto"
-    level: bool | None = None
-    place: str = "auto"
-    floor: float | None = None
-    step_height: float | None = None
-    robot_height: float | None = None
-    voxel: float | None = None
-    outliers: bool | None = None
-    infer_free: bool | None = None
-    fill_holes: int | None = None
-    drop_invalid: bool = False
-    sample_spacing: float | None = None
-    crop: tuple[float, float, float, float] | None = None
-    tile: float | None = None
-    recentre: bool | None = None
-    component: str | tuple[float, float] = "largest"
-    min_passage: float | None = None
-    wall_depth: int = 3
+    scenario: str = setting(
+        "auto", 'whose robot and radar fit the map; auto: outdoor for a scan from the air, else pointcloud'
+    )
+    name: str | None = setting(None, "of the map; default: the stem of the file")
+    resolution: float | None = setting(
+        None, "spacing of the map's points; default: at most the robot's collision threshold", unit="m", above=0
+    )
+    max_points: int = setting(50_000, "free points that the automatic resolution may produce", low=1)
+    num_robots: int = setting(3, "the team that must find room", low=1)
+    robot_radius: float | None = setting(
+        None, "of round robots, which fit through gaps twice as wide; default: the scenario's robot", unit="m"
+    )
+    pixel_size: float | None = setting(None, "of an image that comes without its yaml", unit="m", above=0)
+    free_threshold: float | None = setting(None, "share of black up to which ground is free; overrules the yaml")
+    occupied_threshold: float | None = setting(None, "share of black from which on it is an obstacle, the same")
+    grey_walls: bool | None = setting(
+        None,
+        "pixels between the thresholds but darker than the grey of unknown space are obstacles; default: where they "
+        "outnumber the black ones",
+    )
+    topic: str | None = setting(
+        None, "OccupancyGrid or PointCloud2 of a bag to read; default: the only grid, or else the only cloud"
+    )
+    units: str | float = setting("auto", f"of the file: {', '.join(UNITS)}, or metres per unit")
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "axis that points up")
+    level: bool | None = setting(None, "rotate a tilted floor level")
+    place: Literal["auto", "indoor", "outdoor"] = setting(
+        "auto", "indoor: one flat floor; outdoor: terrain seen from above"
+    )
+    floor: float | None = setting(
+        None, "height of the floor after levelling, when no floor was scanned", unit="m"
+    )
+    step_height: float | None = setting(None, "a robot drives over anything lower", unit="m", low=0)
+    robot_height: float | None = setting(None, "a robot passes under anything higher", unit="m", above=0)
+    voxel: float | None = setting(None, "points are thinned to one a voxel of this size", unit="m", above=0)
+    outliers: bool | None = setting(None, "remove stray points")
+    infer_free: bool | None = setting(None, "take the inside of the walls as free where the floor was not scanned")
+    fill_holes: int | None = setting(None, "pinholes of the floor up to this many cells across are filled")
+    drop_invalid: bool = setting(False, "drop NaN and infinite points instead of refusing the file")
+    sample_spacing: float | None = setting(None, "between the points of a sampled mesh", unit="m", above=0)
+    crop: tuple[float, float, float, float] | None = setting(
+        None, "[xmin, ymin, xmax, ymax] in the map's frame", unit="m"
+    )
+    tile: float | None = setting(
+        None, "side of the square cut from a larger outdoor scan, where it has most free space", unit="m", above=0
+    )
+    recentre: bool | None = setting(
+        None, "move the map to the origin; default: where coordinates are larger than 10 km"
+    )
+    component: str | tuple[float, float] = setting(
+        "largest", "part of the free space: the largest, or that around a place [x, y]", unit="m"
+    )
+    min_passage: float | None = setting(
+        None, "gaps narrower than this are closed; default: twice the collision threshold, or radius", unit="m", low=0
+    )
+    wall_depth: int = setting(3, "obstacle points kept behind the boundary", unit="cells", low=1)
 
     def __post_init__(self):
-        _require(self.place in ("auto", "indoor", "outdoor"), "place", self.place, '"auto", "indoor" or "outdoor"')
-        _require(self.up in ("auto", *UP_AXES), "up", self.up, f'"auto" or one of {", ".join(UP_AXES)}')
-        known = self.units == "auto" or self.units in UNITS or _positive(self.units)
-        _require(known, "units", self.units, f'"auto", one of {", ".join(UNITS)}, or metres per unit')
-        for name in ("resolution", "pixel_size", "voxel", "sample_spacing", "tile", "robot_height"):
-            value = getattr(self, name)
-            _require(value is None or _positive(value), name, value, "a number of metres greater than 0")
         radius = self.robot_radius
         if radius is not None and not _positive(radius):
             raise MapError(f"robot.radius={radius!r} must be a number of metres greater than 0")
-        for name in ("step_height", "min_passage"):
-            value = getattr(self, name)
-            _require(value is None or value == 0 or _positive(value), name, value, "a number of metres >= 0")
-        for name in ("max_points", "num_robots", "wall_depth"):
-            value = getattr(self, name)
-            _require(isinstance(value, int) and value >= 1, name, value, "an integer >= 1")
+        check_settings(self, "importing", MapError)
+        known = self.units == "auto" or self.units in UNITS or _positive(self.units)
+        _require(known, "units", self.units, f'"auto", one of {", ".join(UNITS)}, or metres per unit')
         if self.crop is not None:
             good = len(self.crop) == 4 and self.crop[0] < self.crop[2] and self.crop[1] < self.crop[3]
             _require(good, "crop", self.crop, "(xmin, ymin, xmax, ymax) with xmin < xmax and ymin < ymax")

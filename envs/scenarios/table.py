@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral
 
+from maexp.envs.fields import setting
 from maexp.envs.map import PointCloudMap
 
 from .indoor import build_indoor
@@ -26,18 +27,19 @@ class Scenario:
     count: int | None  # maps in the suite; None: the user brings the map
     resolution: float  # spacing of the points [m]; the finest where maps of a scenario differ
     size: float | None  # longest side of the largest maps, in points x resolution [m]
-    radar_range: float  # [m]
-    max_speed: float  # [m/s]
-    max_accel: float  # [m/s^2]
-    body_length: float  # [m]
-    body_width: float  # [m]
-    collision_threshold: float  # centre to boundary point or to another centre [m]
-    clearance_factor: float  # the paper's k: its DWA keeps k * collision_threshold away (preset=paper)
-    local_steps: int  # control steps in one decision of the policy
-    macro_steps: int | None  # decisions in one episode; None: from the free area
-    num_steering: int = 25  # DWA candidates over the steering angle
-    max_steer: float = math.pi / 3  # [rad]
+    radar_range: float = setting(help="how far a radar sees", unit="m")
+    max_speed: float = setting(help="of a robot", unit="m/s")
+    max_accel: float = setting(help="of a robot", unit="m/s^2")
+    body_length: float = setting(help="of a robot", unit="m")
+    body_width: float = setting(help="of a robot", unit="m")
+    collision_threshold: float = setting(help="a centre this near to a wall or another centre collides", unit="m")
+    clearance_factor: float = setting(help="the paper's: DWA keeps so many thresholds away (preset=paper)")
+    local_steps: int = setting(help="control steps of 0.1 s in one decision")
+    macro_steps: int | None = setting(help="decisions in one episode, at most; default: from the free area")
+    num_steering: int = setting(25, "DWA's candidates of the steering angle")
+    max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
+    summary: str = ""  # a line for `--help`
 
     def with_radius(self, radius: float | None) -> "Scenario":
         """With a round robot of that radius [m], which collides where its body touches a wall; None: as it is."""
@@ -58,24 +60,36 @@ _INDOOR = dict(
 )  # fmt: skip
 
 _ROWS = [
-    Scenario("random_obstacles", **_RANDOM,
+    Scenario("random_obstacles", summary="125 m of corridors, rooms and scattered obstacles (paper)",
+             **_RANDOM,
              build=partial(build_random_obstacles, scenario="random_obstacles", resolution=1.0)),
-    Scenario("random_obstacles_adaptive", **_RANDOM,
+    Scenario("random_obstacles_adaptive",
+             summary="the same with half the points in open ground: density varies over the map",
+             **_RANDOM,
              build=partial(build_adaptive, scenario="random_obstacles_adaptive", resolution=1.0, near=2.0)),
-    Scenario("maze", size=125.0, macro_steps=30, **_MAZE,
+    Scenario("maze", summary="125 m mazes, corridors of constant width, no loops (paper)",
+             size=125.0, macro_steps=30, **_MAZE,
              build=partial(build_maze, scenario="maze", cells=12, corridor=5, wall=5, resolution=1.0)),
-    Scenario("maze_small", size=37.0, macro_steps=15, **_MAZE,
+    Scenario("maze_small", summary="37 m mazes, 1 m points: small enough to learn in minutes",
+             size=37.0, macro_steps=15, **_MAZE,
              build=partial(build_maze, scenario="maze_small", cells=6, corridor=5, wall=1, resolution=1.0)),
-    Scenario("indoor_small", count=17, size=10.0, **_INDOOR,
+    Scenario("indoor_small", summary="furnished floor plans under 10 m, 0.1 m points",
+             count=17, size=10.0, **_INDOOR,
              build=partial(build_indoor, scenario="indoor_small", longest=(6.5, 9.8))),
-    Scenario("indoor_medium", count=32, size=14.0, **_INDOOR,
+    Scenario("indoor_medium", summary="furnished floor plans of 10 to 14 m, 0.1 m points",
+             count=32, size=14.0, **_INDOOR,
              build=partial(build_indoor, scenario="indoor_medium", longest=(10.2, 13.8))),
-    Scenario("indoor_large", count=22, size=20.0, **_INDOOR,
+    Scenario("indoor_large", summary="furnished floor plans over 14 m, 0.1 m points",
+             count=22, size=20.0, **_INDOOR,
              build=partial(build_indoor, scenario="indoor_large", longest=(14.4, 19.8))),
-    Scenario("outdoor", count=32, resolution=1.5, size=288.0, radar_range=20.0, max_speed=6.0, **_CAR,
+    Scenario("outdoor", summary="288 m of city blocks, trees and open ground, 1.5 to 2 m points",
+             count=32, resolution=1.5, size=288.0, radar_range=20.0, max_speed=6.0, **_CAR,
              clearance_factor=4.2, local_steps=40, macro_steps=20, num_steering=21,
              build=partial(build_outdoor, scenario="outdoor")),
-    Scenario("pointcloud", count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
+    Scenario("pointcloud",
+             summary="a map of your own: set scenario.path=FILE or FILE,FILE "
+                     "(.yaml .pcd .ply .xyz .las .laz .obj .glb .npz .npy)",
+             count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
              max_accel=1.0, body_length=0.6, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
              local_steps=20, macro_steps=None),
 ]  # fmt: skip

@@ -1,0 +1,140 @@
+"""Settings as fields of dataclasses: type, default, range, unit and one line of help, each said once.
+
+From these come the check of a value and its message (`check_settings`), the comments of a run's `config.yaml`, the
+types and defaults of the command line (`maexp.agents.settings.schema`), and the manual's table of settings. Imports
+neither torch nor Warp: whoever asks for help does not wait for them.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, field, fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+WHOLE_LIMIT = 10**9  # beyond any sensible count, and far from overflowing a 64-bit integer
+PRIMITIVES = (bool, int, float, str)
+
+
+def setting(
+    default: Any = MISSING,
+    help: str = "",
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+    infinite: bool = False,
+    scenario: str | None = None,
+) -> Any:
+    """A field of a dataclass that is a setting.
+
+    Args:
+        help: what it means, in a line.
+        unit: of the number, as "m/s".
+        low, high: bounds that it may reach; above, below: that it may not. An upper bound goes with a lower one.
+        infinite: whether it may be inf, too.
+        scenario: the field of `Scenario` whose value it takes where it is None.
+    """
+    limits = {"low": low, "high": high, "above": above, "below": below, "infinite": infinite}
+    metadata = {"help": help, "unit": unit, "limits": limits, "scenario": scenario}
+    if isinstance(default, list):
+        return field(default_factory=default.copy, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def replaced(cls: type, name: str, default: Any) -> Any:
+    """The setting of another dataclass, with another default."""
+    return field(default=default, metadata=cls.__dataclass_fields__[name].metadata)
+
+
+def explain(metadata: Mapping) -> str:
+    """Help and unit of a field in one line: "radius of a round body [m]"."""
+    unit = metadata.get("unit", "")
+    return f"{metadata.get('help', '')} [{unit}]".strip() if unit else metadata.get("help", "")
+
+
+def describe(cls: type) -> list[str]:
+    """The settings of a dataclass as a list in reStructuredText: name, default, help; [] where there are none."""
+    rows = []
+    for one in fields(cls) if is_dataclass(cls) else ():
+        if one.metadata.get("help"):
+            default = "" if one.default in (None, MISSING) else f" = {one.default}"
+            rows.append(f"- ``{one.name}{default}``: {explain(one.metadata)}")
+    return ["", *rows, ""] if rows else []
+
+
+def words_of(cls: type, name: str) -> tuple[str, ...]:
+    """The words that a setting may be, as its type names them."""
+    return tuple(word for kind in kinds(cls)[name] if get_origin(kind) is Literal for word in get_args(kind))
+
+
+@cache
+def kinds(cls: type) -> dict[str, tuple]:
+    """The types that each field of a dataclass may have."""
+    unions = (Union, UnionType)
+    hints = get_type_hints(cls)
+    return {one: get_args(kind) if get_origin(kind) in unions else (kind,) for one, kind in hints.items()}
+
+
+def check_settings(settings: Any, group: str = "", error: type[ValueError] = ValueError) -> None:
+    """Raise ``error``, naming `group.name=value` and what it must be, for the first setting that is out of its range.
+
+    Values of several numbers (a type that is neither a number, a bool nor a word) are left to whoever reads them.
+    """
+    allowed = kinds(type(settings))
+    for one in fields(settings):
+        if "limits" in one.metadata:
+            name = f"{group}.{one.name}" if group else one.name
+            check_value(name, getattr(settings, one.name), allowed[one.name], one.metadata, error)
+
+
+def check_value(
+    name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError
+) -> None:
+    """Raise ``error`` unless the value is of one of the types and in the range of a setting."""
+    if not _fits(value, allowed, **metadata["limits"]):
+        raise error(f"{name}={value!r} must be {_wanted(allowed, metadata['unit'], **metadata['limits'])}.")
+
+
+def _fits(value, allowed, low, high, above, below, infinite) -> bool:
+    words = [word for kind in allowed if get_origin(kind) is Literal for word in get_args(kind)]
+    if any(get_origin(kind) is not Literal and kind not in (*PRIMITIVES, NoneType) for kind in allowed):
+        return True  # several numbers: left to whoever reads them
+    if value is None or isinstance(value, bool):
+        return type(value) in allowed
+    if isinstance(value, str):
+        return str in allowed or value in words
+    if float not in allowed and not (int in allowed and isinstance(value, int) and value <= WHOLE_LIMIT):
+        return False
+    if not isinstance(value, int | float):
+        return False
+    inside = (low is None or value >= low) and (high is None or value <= high)
+    inside = inside and (above is None or value > above) and (below is None or value < below)
+    return inside and (math.isfinite(value) or (infinite and value == math.inf))
+
+
+def _wanted(allowed, unit, low, high, above, below, infinite) -> str:
+    """What a value must be: "a whole number from 1 to 64", "one of drawn, together"."""
+    words = [word for kind in allowed if get_origin(kind) is Literal for word in get_args(kind)]
+    told = ["true or false"] * (bool in allowed)
+    told += [", ".join(words)] * bool(words)
+    if words and len(allowed) - (NoneType in allowed) == 1:
+        return f"one of {told[0]}"
+    if int in allowed or float in allowed:
+        kind = "number" if float in allowed else "whole number"
+        if kind == "number" and not infinite and high is None and below is None:
+            kind = "finite number"
+        told.append(f"a {kind}{_between(low, high, above, below)}{f' [{unit}]' * bool(unit)}{', or inf' * infinite}")
+    return " or ".join(told)
+
+
+def _between(low, high, above, below) -> str:
+    if low is not None and high is not None:
+        return f" from {low:g} to {high:g}"
+    if above is not None and below is not None:
+        return f" above {above:g} and below {below:g}"
+    if low is not None:
+        return f", {low:g} or more"
+    return "" if above is None else f" above {above:g}"
