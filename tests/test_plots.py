@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from maexp.agents.commands.evaluate import draw_results
 from maexp.agents.evaluation import learning, plots
+from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.learning import draw_curves
 from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_summary
 
@@ -189,6 +191,16 @@ def test_summary_has_bars_with_intervals(tmp_path, figures):
     texts = [text.get_text().strip() for text in shown["Time to 95 % coverage"].texts]
     assert texts == ["120 (3 of 8)", "never reached (0 of 8)"]
     assert len(shown["Time to 95 % coverage"].patches) == 1
+
+
+@pytest.mark.parametrize("goal", [0.95, 0.99])
+def test_evaluations_show_no_mark_beyond_the_end_of_their_episodes(goal, tmp_path, figures):
+    values = {"exploration_ratio": np.full(3, 0.95), "coverage_step_99_censored": np.full(3, 300.0)}
+    one = EvaluationResult("random", 3, values, 1.0, np.array([*"abc"]), success_coverage=goal)
+    one.times, one.coverage = np.arange(4.0), np.tile(np.linspace(0.0, 0.95, 4), (3, 1))
+    one.shares = np.ones((3, 3)) / 3
+    draw_results([one], tmp_path)
+    assert ("Time to 99 % or the limit" in panels(figures[1])) == (goal == 0.99)
 
 
 def test_a_summary_without_metrics_is_refused(tmp_path):

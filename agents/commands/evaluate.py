@@ -230,7 +230,9 @@ def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
     whole = [one for one in results if not one.place]
     named = dict(zip(result_names(whole), whole, strict=True))
     draw_coverage({name: (one.times, one.coverage, one.maps) for name, one in named.items()}, where / "coverage.png")
-    draw_summary({name: one.summary() for name, one in named.items()}, where / "metrics.png")
+    summaries = {name: one.summary() for name, one in named.items()}
+    goal = {"success_coverage": max(one.success_coverage for one in whole)}
+    draw_summary(summaries | {"run": goal}, where / "metrics.png")
     draw_contributions({name: one.shares for name, one in named.items()}, where / "shares.png")
     return ["coverage.png", "metrics.png", "shares.png"]
 
