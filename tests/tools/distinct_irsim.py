@@ -56,7 +56,7 @@ def main(file: str, policy: str, runs: int, seconds: float) -> None:
     world = import_map(file, num_robots=ROBOTS, robot_radius=RADIUS)
     names = ["| policy", "seed", "targets", *(f"{100 * mark:g} % [s]" for mark in MARKS), "done [s]", "seen [%]"]
     print(" | ".join([*names, "driven [m]", "needless duplicates", "robots lost |"]))
-    print("|" + 10 * " --- |")
+    print("|" + 11 * " --- |")
     for seed in range(runs):
         for distinct in (False, True):
             print(row(policy, seed, distinct, *play(world, policy, seed, seconds, distinct)), flush=True)
