@@ -25,6 +25,7 @@ from maexp.envs.fields import check_settings, setting
 
 IR2 = ("comm=ir2",)
 BASE = (*IR2, "comm.base_station=true")
+RADAR = ("radar.missed=0.5", "radar.evidence=3")
 CONDITIONS = {
     "perfect": (),
     "range": ("comm.range=8", "comm.line_of_sight=true"),
@@ -32,12 +33,13 @@ CONDITIONS = {
     "ir2": IR2,
     "ir2_noise": (*IR2, "comm.noise=13"),
     "faults": ("faults.probability=0.5",),
+    "radar": RADAR,
     "base": BASE,
     "base_return": (*BASE, "comm.strategy=return_to_base"),
     "base_rendezvous": (*BASE, "comm.strategy=rendezvous"),
     "base_relay": (*BASE, "comm.strategy=relay"),
     "base_pursuit": (*BASE, "comm.strategy=pursuit"),
-    "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5"),
+    "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5", *RADAR),
 }
 """Name -> words of `maexp evaluate`; the others are compared with the first."""
 METRICS = {

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import CommConfig, FaultsConfig
+from maexp.envs.config import CommConfig, FaultsConfig, RadarConfig
 from maexp.kernels.state import STATE
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ OF_POINTS = ("seen_free", "seen_boundary", "viewers_free", "viewers_boundary", "
 NOT_COPIED = (
     "track", "starts", "seed", "map_id", "milestone_step", "milestone_overlap", "milestone_path", "path_length",
     "terms", "unscaled", "episode_reward", "base_sum", "worst_sum", "told_step", "connected",
+    "evidence_free", "evidence_boundary",
 )  # fmt: skip
 """State that no branch needs, for nobody asks it for metrics, or that is its own."""
 
@@ -35,12 +36,18 @@ def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig 
     limited = env.settings.limited if comm is None else comm.limited
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
-        env.settings, num_envs=count, comm=comm, faults=FaultsConfig(), limited=limited,  # nobody foresees a fault
+        env.settings, num_envs=count, comm=comm, limited=limited,
+        faults=FaultsConfig(), radars=tuple(map(perfect, env.settings.radars)),  # nobody foresees what chance does
         observation=replace(env.settings.observation, pictures=False),
     )  # fmt: skip
     made = ExplorationEnv.__new__(ExplorationEnv)
     made._set_up(settings, bank)
     return made
+
+
+def perfect(radar: RadarConfig) -> RadarConfig:
+    """A radar that misses nothing, alike in all else."""
+    return replace(radar, missed=0.0, noise=0.0, evidence=1)
 
 
 class Branches:

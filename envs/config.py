@@ -14,6 +14,8 @@ drawn once for each map and kept."""
 MOST_CANDIDATES = 64
 MOST_HORIZON = 100
 MOST_TARGETS = 256  # that a robot is shown
+MOST_MISSED = 0.99  # of a radar's returns
+MOST_EVIDENCE = 100  # returns that a robot may ask for before it knows a point
 PLANNERS = {
     "dwa": "dynamic window: straight to the goal, around what is near (paper)",
     "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
@@ -60,6 +62,18 @@ class RadarConfig:
     obstacle_radius: float | Literal["auto"] = setting(
         "auto", "of an obstacle point; auto: its spacing / sqrt(2)", unit="m", low=0
     )
+    missed: float = setting(
+        0.0, "probability that a point in view gives no return in a step of 0.1 s", low=0, high=MOST_MISSED
+    )
+    noise: float = setting(
+        0.0, "standard deviation of a range; returns off by half the points' spacing are dropped", unit="m", low=0
+    )
+    evidence: int = setting(1, "returns of a point after which a robot knows it", low=1, high=MOST_EVIDENCE)
+
+    @property
+    def perfect(self) -> bool:
+        """Whether a robot knows at once all that is in view."""
+        return self.missed == 0.0 and self.noise == 0.0 and self.evidence == 1
 
 
 @dataclass(frozen=True)

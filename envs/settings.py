@@ -34,6 +34,9 @@ from maexp.envs.config import (
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
 from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
+from maexp.kernels.sensing import return_chance
+
+LEAST_RETURNS = 0.01  # share of the returns in view that has to count
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,7 @@ def complete_settings(
     faults = check_faults(one_config("faults", faults, FaultsConfig), num_robots)
     check_strategy(comm, num_robots, planner)
     check_base(maps, comm)
+    check_noise(maps, radars)
     targets = check_targets(one_config("targets", targets, TargetsConfig))
     lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))
     threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
@@ -192,6 +196,17 @@ def check_base(maps: Sequence[PointCloudMap], comm: CommConfig) -> None:
                 f"[{left:.4g}, {low:.4g}] to [{right:.4g}, {high:.4g}] m: choose another place, or true for where "
                 "robot 0 starts"
             )
+
+
+def check_noise(maps: Sequence[PointCloudMap], radars: Sequence[RadarConfig]) -> None:
+    """Raise ValueError if a radar's ranges are so far off that hardly any return is taken for one of its point."""
+    for m in maps:
+        for radar in radars:
+            if return_chance(0.0, radar.noise, m.resolution) < LEAST_RETURNS:
+                raise ValueError(
+                    f"radar.noise={radar.noise:g} m leaves fewer than one return in {1 / LEAST_RETURNS:.0f} on map "
+                    f"{m.name}, whose points are {m.resolution:g} m apart: lower it, or use a coarser map"
+                )
 
 
 def positive_count(name: str, value: int) -> int:

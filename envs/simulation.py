@@ -6,6 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 import torch
+import warp as wp
 
 from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, RobotConfig
@@ -15,6 +16,7 @@ from maexp.kernels.blocks import block_memory_per_env, block_sides
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
+from maexp.kernels.sensing import Sensing, return_chance
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
 from maexp.kernels.types import (
@@ -55,6 +57,7 @@ def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = Fals
         num_shards=settings.num_threads,
         nav=bank_nav_grids(bank, settings.device) if need_grids else None,
         open_cells=open_ground(bank).to(settings.device) if settings.comm.signal else None,
+        sensing=None if perfect_radars(settings) else radar_sensing(settings, bank),
     )
     simulation.tensors["env_id"] += settings.first_env
     return simulation
@@ -100,6 +103,20 @@ def radio_struct(settings: EnvSettings) -> Radio:
     reach = max(one.range for one in settings.radars)
     radio.cell = reach / CELLS_OF_RADAR if comm.cell == "auto" else comm.cell
     return radio
+
+
+def perfect_radars(settings: EnvSettings) -> bool:
+    """Whether robots know at once all that is in view."""
+    return all(one.perfect for one in settings.radars)
+
+
+def radar_sensing(settings: EnvSettings, bank: MapBank) -> Sensing:
+    """What radars miss, as the kernels read it."""
+    chance = [[return_chance(one.missed, one.noise, m.resolution) for one in settings.radars] for m in bank.maps]
+    sensing, device = Sensing(), str(settings.device)
+    sensing.chance = wp.array(chance, dtype=wp.float32, device=device)
+    sensing.needed = wp.array([one.evidence for one in settings.radars], dtype=wp.int32, device=device)
+    return sensing
 
 
 def fault_steps(settings: EnvSettings) -> torch.Tensor:
@@ -163,6 +180,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         track=min(settings.episode_steps + 1, TRACK_LENGTH),
         limited=settings.limited,
         base_station=settings.comm.has_base,
+        sensing=not perfect_radars(settings),
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robots),
     )
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.sensing import forget_returns
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, Robots, point_xy
 
@@ -292,6 +293,7 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     lanes = lanes_on(shard.device, 1024)
     for one in flags:
         shard.call(launch, _clear_flags, "flags", (*one.shape[:2], lanes), flags=one, lanes=lanes)
+    forget_returns(launch, shard)
     shard.call(
         launch, _clear_env,
         "covered covered_before covered_sum shared "

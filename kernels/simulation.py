@@ -12,6 +12,7 @@ from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.planner import set_goals
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
+from maexp.kernels.sensing import Sensing
 from maexp.kernels.shards import Threads, blocks_per_thread, split
 from maexp.kernels.state import SCRATCH, STATE, allocate
 from maexp.kernels.types import DT, Maps
@@ -64,6 +65,7 @@ class Simulation:
         num_shards: runs of envs, each with a thread of its own on the CPU.
         nav: navigation grids of the maps and the cells of the largest; the `wavefront` planner and signals need them.
         open_cells: uint8, cells of all navigation grids, 1 where the ground is free; signals need them.
+        sensing: radars that miss returns; None: all that is in view is seen.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Simulation:
         num_shards: int = 1,
         nav: tuple[NavGrids, int] | None = None,
         open_cells: torch.Tensor | None = None,
+        sensing: "Sensing | None" = None,
     ):
         self.map_tensors, self.num_maps = maps, num_maps
         self.robot_tensors = robots | {"curvature": list_curvatures(robots, settings.num_steering)}
@@ -88,7 +91,7 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
-        self.radio, self.fault_at = radio, wp.from_torch(fault_at)
+        self.radio, self.fault_at, self.sensing = radio, wp.from_torch(fault_at), sensing
         self.open_cells = None if open_cells is None else wp.from_torch(open_cells)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.tensors["starts"].fill_(torch.inf)

@@ -25,6 +25,9 @@ AXES = {
     "H": ("word", "as W where communication is limited, else 1"),
     "P": ("free", "as F where communication is limited, else 1"),
     "Q": ("boundary", "as B where communication is limited, else 1"),
+    "A": ("robot", "as N where radars miss returns, else 1"),
+    "C": ("free", "as F where radars miss returns, else 1"),
+    "I": ("boundary", "as B where radars miss returns, else 1"),
     "R": ("term", "terms of the reward"),
     "M": ("mark", "coverages of `reward.MARKS`: 85, 95 and 99 %"),
     "T": ("step", "local steps that a trajectory remembers; step t stands at t % T"),
@@ -111,11 +114,15 @@ STATE = {
     # What they have seen and know. Points are numbered within their map, sorted by cell (`types.Maps`).
     "seen_free": Field(wp.int32, "E W F", "", "bit of every robot that has scanned the free point",
         "_clear_flags _merge_scan"),
-    "seen_boundary": Field(wp.int32, "E W B", "", "the same of boundary points", "_clear_flags _scan_boundary"),
+    "seen_boundary": Field(wp.int32, "E W B", "", "the same of boundary points",
+        "_clear_flags _scan_boundary _sense_points"),
     "viewers_free": Field(wp.int32, "E 1 F", "", "robots that have ever scanned the point; during a scan also"
-        " `VIEWER_NOW` for each that sees it now", "_clear_flags _scan_free _merge_scan"),
+        " `VIEWER_NOW` for each that sees it now", "_clear_flags _scan_free _sense_points _merge_scan"),
     "viewers_boundary": Field(wp.int32, "E 1 B", "", "robots that have ever scanned the point",
-        "_clear_flags _scan_boundary"),
+        "_clear_flags _scan_boundary _sense_points"),
+    "evidence_free": Field(wp.uint8, "E A C", "", "returns of the free point that the robot has had, until it knows it",
+        "_forget_returns _sense_points"),
+    "evidence_boundary": Field(wp.uint8, "E A I", "", "the same of boundary points", "_forget_returns _sense_points"),
     "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it",
         "_clear_flags _share_points"),
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_clear_flags _share_points"),
@@ -187,8 +194,8 @@ SCRATCH = {
     "occluder_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders"),
     "wall_count": Field(wp.int32, "E N", "", "how many of them, the first, belong to the map; 0: no matter",
         "_collect_occluders"),
-    "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now", "_scan_free"),
-    "visible_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders _scan_free"),
+    "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now", "_scan_free _sense_points"),
+    "visible_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders _scan_free _sense_points"),
 
     # Merging.
     "discovered": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team",
@@ -225,6 +232,7 @@ def axis_sizes(
     limited: bool,
     body_pixels: int = 1,
     base_station: bool = False,
+    sensing: bool = False,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     radios = num_robots + base_station
@@ -232,6 +240,7 @@ def axis_sizes(
     return {
         "E": num_envs, "N": num_robots, "U": radios, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
+        "A": num_robots if sensing else 1, "C": max(free, 1) if sensing else 1, "I": max(boundary, 1) if sensing else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
         "O": max(nearby, 1), "G": body_pixels, "T": track, "R": len(REWARD_TERMS), "D": 3 * BINS,
         "S": num_robots, "M": len(MARKS), "1": 1,

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.launches import Launch
+from maexp.kernels.sensing import sense
 from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
@@ -321,12 +322,16 @@ def _scan_boundary(
                     wp.atomic_add(viewers_boundary, e, 0, j, 1)
 
 
-def scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
-    """What every robot sees now, in the envs where ``running`` [env] is set; maps of an env are planar."""
+def scan(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+    """What every robot sees now, in the envs where ``running`` [env] is set; maps of an env are planar. ``ahead`` is 0
+    at a reset, 1 in a local step."""
     lanes = (*shard.shape, shard.lanes)
     shard.call(
         launch, _collect_occluders, "error bins direction limit occluder_count wall_count visible_count",
         active=running, planar=1,
     )  # fmt: skip
     shard.call(launch, _scan_free, "viewers_free error visible_count visible", lanes, active=running, planar=1)
-    shard.call(launch, _scan_boundary, "seen_boundary viewers_boundary", lanes, active=running)
+    if shard.sim.sensing is None:
+        shard.call(launch, _scan_boundary, "seen_boundary viewers_boundary", lanes, active=running)
+    else:
+        sense(launch, shard, running, ahead)

@@ -97,7 +97,7 @@ def digest(*tensors: torch.Tensor) -> str:
 
 def setups() -> dict:
     """Name -> (settings of an env, policy); between them they launch every kernel of the simulation."""
-    from maexp.envs import CommConfig, FaultsConfig, ObservationConfig, PlannerConfig, RobotConfig
+    from maexp.envs import CommConfig, FaultsConfig, ObservationConfig, PlannerConfig, RadarConfig, RobotConfig
 
     near, sight = CommConfig(range=9.0), CommConfig(range=20.0, line_of_sight=True)
     base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, loss=0.2, base_station=True)
@@ -115,6 +115,7 @@ def setups() -> dict:
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
         "signals": (dict(planner=wavefront, comm=base, done="everyone", num_robots=6), "cost_utility"),
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
+        "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
         "rollouts": (dict(planner=wavefront), "lookahead"),
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),

@@ -10,7 +10,7 @@ from worlds import room
 import maexp.kernels as mk
 from maexp.agents.policies import POLICIES
 from maexp.agents.training.collect import make_collector
-from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig
+from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig, RadarConfig
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
 DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
@@ -66,6 +66,16 @@ def test_failures_agree(device):
     faults = FaultsConfig(probability=0.7, duration=0.8)
     here, there = (play(one, "wavefront", faults=faults, macro_steps=6)["info"] for one in ("cpu", device))
     assert torch.equal(there["failed"], here["failed"]) and 0.02 < here["failed"].float().mean() < 0.7
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_missed_returns_agree(device):
+    """Which returns come is drawn from the same keys."""
+    radar = RadarConfig(missed=0.4, noise=0.4, evidence=2)
+    here, there = (play(one, "wavefront", radar=radar)["info"] for one in ("cpu", device))
+    torch.testing.assert_close(there["coverage"], here["coverage"], rtol=1e-3, atol=2e-3)
+    first = play("cpu", "wavefront")["info", "coverage"][0]
+    assert here["coverage"].max() > 0.2 and (here["coverage"][0] < first).all()
 
 
 @pytest.mark.parametrize("device", DEVICES)

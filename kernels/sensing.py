@@ -1,0 +1,168 @@
+"""Radars that miss returns: what a robot sees of the points in its view in a local step, and when it knows them.
+
+A point in view gives a return with the probability `return_chance`, drawn by (seed, env, episode, step, robot, point).
+A robot knows a point once it has had as many returns of it as `radar.evidence` asks for. Each counts its own: what it
+tells others is what it knows.
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from maexp.kernels.goals import keyed_uniform
+from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, Robots
+
+if TYPE_CHECKING:
+    from maexp.kernels.shards import Shard
+
+wp.set_module_options(MODULE_OPTIONS)
+
+COUNTED = 128  # beside the returns of a boundary point: looked at in this local step
+
+
+@wp.struct
+class Sensing:
+    """Radars that miss returns; arrays of robots are the same in all envs."""
+
+    chance: wp.array2d(dtype=wp.float32)  # [map, robot], `return_chance`
+    needed: wp.array(dtype=wp.int32)  # [robot], returns after which a robot knows a point
+
+
+def return_chance(missed: float, noise: float, spacing: float) -> float:
+    """Probability that a point in view gives a return, and that this is taken for a return of that point.
+
+    The error of a measured range is normal. A return whose error is half the spacing of the points or more is taken for
+    one of another place, and dropped.
+
+    Args:
+        missed: probability that there is no return.
+        noise: standard deviation of the error [m].
+        spacing: of the map's points [m].
+    """
+    return (1.0 - missed) * (math.erf(0.5 * spacing / (math.sqrt(2.0) * noise)) if noise > 0.0 else 1.0)
+
+
+@wp.func
+def gives_return(
+    chance: float, seed: int, env_id: int, episode: int, step: int, i: int, point: int, points: int
+) -> bool:
+    """Whether robot i has a return of a point in this step. Negative numbers keep the draws apart from all others."""
+    return chance >= 1.0 or keyed_uniform(seed, env_id, episode, step, -1 - i * points - point) < chance
+
+
+@wp.kernel
+def _sense_points(
+    # Map:
+    maps: Maps,
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    # Robots:
+    robots: Robots,
+    sensing: Sensing,
+    # Settings:
+    ahead: int,
+    # State in:
+    active: wp.array(dtype=wp.int32),  # [env]
+    seed: wp.array(dtype=wp.int32),  # [1]
+    env_id: wp.array(dtype=wp.int32),  # [env]
+    episode: wp.array(dtype=wp.int32),  # [env]
+    local_step: wp.array(dtype=wp.int32),  # [env]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    seen_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
+    # State in and out:
+    evidence_free: wp.array3d(dtype=wp.uint8),  # [env, robot, free]
+    evidence_boundary: wp.array3d(dtype=wp.uint8),  # [env, robot, boundary]
+    seen_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
+    # Scratch in and out:
+    visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
+    visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+):
+    """Mark the boundary points in view of robot (e, i) that it knows now, as `visibility._scan_boundary` does, and
+    leave in the list of visible free points those that give a return and are known.
+
+    A boundary point is in view where a free point is that it touches, whether or not that gives a return itself.
+    """
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    m = map_id[e]
+    step = local_step[e] + ahead
+    chance = sensing.chance[m, i]
+    needed = sensing.needed[i]
+    radius = robots.radar_range[e, i]
+    origin = center[e, i]
+    word = i / ROBOTS_PER_WORD
+    bit = 1 << (i % ROBOTS_PER_WORD)
+    first = maps.free_begin[m]
+    begin = maps.boundary_begin[m]
+    free = maps.free_begin[m + 1] - first
+    points = free + maps.boundary_begin[m + 1] - begin
+    count = wp.min(visible_count[e, i], visible.shape[2])
+    for k in range(count):
+        point = first + visible[e, i, k]
+        for n in range(maps.neighbour_begin[point], maps.neighbour_begin[point + 1]):
+            j = maps.neighbour[n]
+            found = int(evidence_boundary[e, i, j])
+            if found < COUNTED and (seen_boundary[e, word, j] & bit) == 0:
+                if wp.length(maps.boundary[begin + j] - origin) <= radius:
+                    if gives_return(chance, seed[0], env_id[e], episode[e], step, i, free + j, points):
+                        found += 1
+                        if found >= needed:
+                            wp.atomic_or(seen_boundary, e, word, j, bit)
+                            wp.atomic_add(viewers_boundary, e, 0, j, 1)
+                    evidence_boundary[e, i, j] = wp.uint8(found + COUNTED)
+    kept = int(0)
+    for k in range(count):
+        j = visible[e, i, k]
+        for n in range(maps.neighbour_begin[first + j], maps.neighbour_begin[first + j + 1]):
+            near = maps.neighbour[n]
+            evidence_boundary[e, i, near] = wp.uint8(int(evidence_boundary[e, i, near]) % COUNTED)
+        known = gives_return(chance, seed[0], env_id[e], episode[e], step, i, j, points)
+        if known and (seen_free[e, word, j] & bit) == 0:
+            found = int(evidence_free[e, i, j]) + 1
+            evidence_free[e, i, j] = wp.uint8(found)
+            known = found >= needed
+        if known:
+            visible[e, i, kept] = j
+            kept += 1
+        else:
+            wp.atomic_sub(viewers_free, e, 0, j, VIEWER_NOW)
+    visible_count[e, i] = kept
+
+
+@wp.kernel
+def _forget_returns(
+    # Settings:
+    lanes: int,
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
+    # State out:
+    evidence: wp.array3d(dtype=wp.uint8),  # [env, robot, point]
+):
+    e, i, lane = wp.tid()
+    if mask[e] != 0:
+        for j in range(lane, evidence.shape[2], lanes):
+            evidence[e, i, j] = wp.uint8(0)
+
+
+def sense(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+    """What radars that miss returns make of what is in view, where ``running`` [env] is set; ``ahead``: 0 in the scan
+    of a reset, 1 in that of a local step."""
+    shard.call(
+        launch, _sense_points,
+        "evidence_free evidence_boundary seen_boundary viewers_free viewers_boundary visible visible_count",
+        active=running, ahead=ahead, sensing=shard.sim.sensing,
+    )  # fmt: skip
+
+
+def forget_returns(launch: Launch, shard: "Shard") -> None:
+    """Clear the returns of the envs of ``mask``, if any are counted."""
+    if shard.sim.sensing is not None:
+        lanes = lanes_on(shard.device, 1024)
+        for one in (shard.view.evidence_free, shard.view.evidence_boundary):
+            dim = (*one.shape[:2], lanes)
+            shard.call(launch, _forget_returns, "evidence", dim, evidence=one, lanes=lanes)
