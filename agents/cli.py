@@ -51,6 +51,12 @@ VERBS = {
         ("task", "place"),
         ("list", "show", "run", "verify", "freeze"),
     ),
+    "ros2": Verb(
+        "serves a suite to robots' software over DDS, or drives a team of ROS 2, without ROS",
+        ("maexp ros2 serve minival", "maexp ros2 team policy=universal robots=robot1,robot2,robot3"),
+        ("task", "place"),
+        ("serve", "team"),
+    ),
     "leaderboard": Verb(
         "makes rows of runs of suites and draws a page of them that needs nothing but a browser",
         ("maexp leaderboard outputs/mine docs/leaderboard out=site",),

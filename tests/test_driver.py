@@ -9,6 +9,7 @@ from bag_writer import STORE, grid, header, kind, transforms, turn
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime.agent import TeamAgent
 from maexp.agents.runtime.driver import DriverSettings, TeamDriver, read_settings
+from maexp.agents.runtime.frames import compose, invert
 
 TEAM = {"robots": ("a", "b"), "radar_range": 3.0, "robot_radius": (0.2,), "map_topics": ("/map",)}
 
@@ -103,7 +104,10 @@ def test_maps_called_alike_are_refused_unless_offsets_are_given():
     parts(driver)
     driver.take_frames(transforms([("map", "base_link", 0.0, (1.0, 1.5, 0.0), 0.0)]), "a")
     driver.take_frames(transforms([("map", "base_link", 0.0, (1.0, 1.0, 0.0), 0.0)]), "b")
-    wanted, got = goals(drive().decide(0.0)), goals(driver.decide(0.0))
+    decision = driver.decide(0.0)
+    wanted, got = goals(drive().decide(0.0)), goals(decision)
+    for order in decision.orders:  # each robot knows its own map alone
+        assert order.frame == "map" and order.pose[:2] == pytest.approx(order.goal - (0.0, 3.0 * (order.name == "b")))
     assert got.keys() == wanted.keys() and all(np.allclose(got[name], wanted[name], atol=0.051) for name in got)
     assert driver.places["b"] == pytest.approx([1.0, 4.0])
 
@@ -181,7 +185,7 @@ def test_a_robot_that_is_lost_or_has_nothing_to_do_is_stopped_once():
 def test_an_episode_of_the_arena_is_played_as_inside(policy):
     episode = {
         "num_robots": 2, "radar_range": 3.0, "robot_radius": 0.2, "max_speed": 1.0, "max_accel": 1.0, "seconds": 40.0,
-        "decision_seconds": 2.0, "seed": 3,
+        "decision_seconds": 2.0, "seed": 3, "robots": ["a", "b"],
     }  # fmt: skip
     driver, agent = TeamDriver(DriverSettings(robots=("a", "b"), policy=policy)), TeamAgent(policy)
     driver.begin(episode)
@@ -208,6 +212,12 @@ def test_an_episode_of_the_arena_is_played_as_inside(policy):
             stays = np.isnan(wanted[k, 0])
             assert orders[name].stop == stays
             assert np.allclose(orders[name].goal, poses[k, :2] if stays else wanted[k], rtol=0.0, atol=1e-9)
+
+
+def test_a_pose_and_its_inverse():
+    pose = (1.0, -2.0, 0.7)
+    assert compose(invert(pose), pose) == pytest.approx((0.0, 0.0, 0.0))
+    assert compose(pose, invert(pose)) == pytest.approx((0.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import command, short, write_text
@@ -27,23 +28,34 @@ DIFFERENT, STOPPED = 1, 130
 
 def prepare(overrides: list[str]) -> Recipe:
     """For resume=FOLDER: what that run played, then the new words."""
+    return prepare_again(overrides, KEPT)
+
+
+def prepare_again(overrides: list[str], kept: tuple[str, ...]) -> Recipe:
+    """The words, after the settings `kept` of the run that is gone on with, if one is."""
     place = find_override(overrides, "resume")
     if place is None:
         return Recipe(overrides)
     from maexp.agents.suites import folder as files
 
-    if changed := [name for name in (*KEPT, "hydra.run.dir") if find_override(overrides, name) is not None]:
+    if changed := [name for name in (*kept, "hydra.run.dir") if find_override(overrides, name) is not None]:
         raise UserError(f"resume={place} keeps what was played and where: leave {changed[0]} out.")
     saved = files.read_json(Path(place).expanduser() / files.RUN)["settings"]
-    return Recipe(overrides, values={name: saved[name] for name in KEPT}, source=place)
+    if missing := [name for name in kept if name not in saved]:
+        raise UserError(f"{place} is no run of this command (it has no {missing[0]}): resume it as it was begun.")
+    return Recipe(overrides, values={name: saved[name] for name in kept}, source=place)
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
-    """A run has a new folder, or that of the run that it goes on with; the other tasks write none."""
+    return claim_for(overrides, claim, "run")
+
+
+def claim_for(overrides: list[str], claim: Callable[[], Path], task: str) -> Path | None:
+    """`task` has a new folder, or that of the run that it goes on with; the other tasks write none."""
     place = find_override(overrides, "resume")
     if place is not None:
         return Path(place).expanduser().absolute()
-    return claim() if find_override(overrides, "task") == "run" else None
+    return claim() if find_override(overrides, "task") == task else None
 
 
 def check(cfg: SuiteSettings) -> None:
@@ -87,36 +99,47 @@ def _show(cfg: SuiteSettings, where: None) -> int:
 
 
 def _run(cfg: SuiteSettings, where: Path) -> int:
-    from maexp.agents.build import pick_device
-    from maexp.agents.suites import folder as files
-    from maexp.agents.suites import report
     from maexp.agents.suites.players import Player
-    from maexp.agents.suites.run import SuiteRun
 
     suite = load_suite(cfg.place)
     suite.check()
     limit = suite.decision_limit if cfg.decision_limit is None else cfg.decision_limit
     player = Player(cfg.policy, limit, cfg.patience)
-    with blame_input():
-        device = pick_device(cfg.device)
     settings = {name: cfg[name] for name in KEPT} | {"decision_limit": limit}
     if player.hosted and not cfg.resume:
         settings["num_envs"] = min(cfg.num_envs, cfg.workers or os.cpu_count() or 1)
-    with lock(where, "maexp suite"):
+    return play(suite, player, where, settings, cfg.device, "suite run")
+
+
+def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], device: str, words: str) -> int:
+    """Play a suite, or what is left of it, and say what came of it.
+
+    Args:
+        player: as `maexp.agents.suites.players.Player`.
+        settings: what a resumed run keeps, with `seed` and `num_envs`.
+        words: that go on with it, as "suite run".
+    """
+    from maexp.agents.build import pick_device
+    from maexp.agents.suites import folder as files
+    from maexp.agents.suites import report
+    from maexp.agents.suites.run import SuiteRun
+
+    seed = settings["seed"]
+    with blame_input():
+        device = pick_device(device)
+    with lock(where, f"maexp {words.split()[0]}"):
         if (where / files.RUN).exists():
             _check_same_suite(where, suite)
         else:
-            content = {"format": files.FORMAT, "suite": files.describe_suite(suite, cfg.seed), "settings": settings}
+            content = {"format": files.FORMAT, "suite": files.describe_suite(suite, seed), "settings": settings}
             write_text(where / files.RUN, files.dump(content) + "\n")
         try:
             total = len(suite.parts) * suite.episodes
             with Progress(f"{player.name} on {suite.name}", total) as progress:
-                playing = SuiteRun(
-                    suite, player, where, cfg.seed, settings["num_envs"], device, progress.advance
-                )
+                playing = SuiteRun(suite, player, where, seed, settings["num_envs"], device, progress.advance)
                 results = playing.play()
         except KeyboardInterrupt:
-            again = command("suite", "run", f"resume={short(where)}")
+            again = command(*words.split(), f"resume={short(where)}")
             print(f"maexp: stopped. Go on with: {again}", file=sys.stderr)
             return STOPPED
         report.print_table(suite, results)

@@ -107,21 +107,32 @@ class Wire:
                 f"DDS does not start in domain {number} ({error.msg or error}): check CYCLONEDDS_URI and the network"
             ) from error
         self.conditions: list[Any] = []
+        self.writers: dict[str, Writer] = {}
+        self.readers: dict[str, Reader] = {}
 
-    def writer(self, name: str, kind: str | None = None) -> Writer:
-        """Writes to a topic, /robot1/map; `kind`: of `TOPICS`, else the last part of the name."""
-        found, topic = self._open(name, kind)
-        return Writer(DataWriter(self.participant, topic, qos=quality(found, reads=False)), CLASSES[found.message])
+    def writer(self, name: str) -> Writer:
+        """Writes to a topic, /robot1/map: always the same one."""
+        if name not in self.writers:
+            kind, topic = self._open(name, "")
+            writer = DataWriter(self.participant, topic, qos=quality(kind, reads=False))
+            self.writers[name] = Writer(writer, CLASSES[kind.message])
+        return self.writers[name]
 
-    def reader(self, name: str, kind: str | None = None) -> Reader:
-        """Reads from a topic; `wait` wakes up when something comes."""
-        found, topic = self._open(name, kind)
-        reader = DataReader(self.participant, topic, qos=quality(found, reads=True))
-        self.conditions.append(ReadCondition(reader, ALL))
-        self.waits.attach(self.conditions[-1])
-        return Reader(reader)
+    def reader(self, name: str, kind: str = "") -> Reader:
+        """Reads from a topic, always the same one; `wait` wakes up when something comes.
 
-    def _open(self, name: str, kind: str | None) -> tuple[Kind, Topic]:
+        Args:
+            kind: one of `TOPICS`, if it is not the last part of the name.
+        """
+        if name not in self.readers:
+            found, topic = self._open(name, kind)
+            reader = DataReader(self.participant, topic, qos=quality(found, reads=True))
+            self.conditions.append(ReadCondition(reader, ALL))
+            self.waits.attach(self.conditions[-1])
+            self.readers[name] = Reader(reader)
+        return self.readers[name]
+
+    def _open(self, name: str, kind: str) -> tuple[Kind, Topic]:
         found = TOPICS[kind or name.rpartition("/")[2]]
         return found, Topic(self.participant, f"rt{name}", CLASSES[found.message])
 

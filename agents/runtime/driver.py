@@ -18,6 +18,7 @@ from .frames import (
     Pose,
     compose,
     heading_of,
+    invert,
     merge_grids,
     place_grid,
     read_map,
@@ -65,13 +66,14 @@ class Order:
 
     Attributes:
         goal: float64 [2] in the team's frame [m]; where the robot is to stop if `stop`.
-        heading: at the goal [rad].
+        pose: the goal in `frame`, one that the robot knows.
         stop: its goal is cancelled.
     """
 
     name: str
     goal: np.ndarray
-    heading: float
+    frame: str
+    pose: Pose
     stop: bool = False
 
 
@@ -101,29 +103,36 @@ class TeamDriver:
 
     def __init__(self, settings: DriverSettings):
         self.settings = settings
-        self.robots, count = settings.robots, len(settings.robots)
-        if not count or len(set(self.robots)) < count or not all(self.robots):
-            raise ValueError(f"robots={','.join(self.robots)} must name the robots of the team, each once")
-        self.topics = settings.map_topics or tuple(f"/{name}/map" for name in self.robots)
+        robots, count = settings.robots, len(settings.robots)
+        if not count or len(set(robots)) < count or not all(robots):
+            raise ValueError(f"robots={','.join(robots)} must name the robots of the team, each once")
+        self.topics = settings.map_topics or tuple(f"/{name}/map" for name in robots)
         if len(self.topics) not in (1, count):
             raise ValueError(f"map_topics={','.join(self.topics)} must be one for the team, or one for each robot")
         for name, sizes in (("offsets", (0, 3 * len(self.topics))), ("robot_radius", (0, 1, count))):
             if len(getattr(settings, name)) not in sizes:
                 wanted = " or ".join(map(str, sizes[1:]))
                 raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
+        self.shared, self.own = Frames(), {name: Frames() for name in robots}
         self.begin()
 
-    def begin(self, episode: dict[str, Any] | None = None) -> None:
-        """Forget everything; `episode`: what an arena tells of the one that begins, instead of settings not given."""
-        self.episode = episode
+    def begin(self, episode: dict[str, Any] | None = None, now: float | None = None) -> None:
+        """Forget everything but frames.
+
+        Args:
+            episode: what an arena tells of the one that begins, instead of settings that are not given; only the robots
+                that it names take part.
+            now: when it begins [s]; None: with the first decision.
+        """
+        self.episode, given = episode, self.settings.robots
+        self.robots = given if episode is None else tuple(name for name in given if name in episode["robots"])
         self.planner = TeamPlanner(self.settings.policy, **self._options())
         self.maps: dict[str, Any] = {}
-        self.shared, self.own = Frames(), {name: Frames() for name in self.robots}
         self.speeds: dict[str, float] = {}
         self.goals: dict[str, np.ndarray] = {}  # that robots drive to
         self.sent: dict[str, float] = {}  # when [s]
         self.places: dict[str, np.ndarray] = {}  # where robots were seen last
-        self.begun: float | None = None
+        self.begun = now
 
     def _options(self) -> dict[str, Any]:
         given, own = self.settings, {} if self.episode is None else planner_options(self.episode)
@@ -131,8 +140,8 @@ class TeamDriver:
             own.setdefault(name, getattr(given, name))
         own |= {name: value for name in ("radar_range", "max_speed") if (value := getattr(given, name)) is not None}
         if radius := given.robot_radius:
-            each = radius if len(radius) > 1 else radius * len(self.robots)
-            own["robot_radius"] = dict(zip(self.robots, each, strict=True))
+            each = radius if len(radius) > 1 else radius * len(given.robots)
+            own["robot_radius"] = dict(zip(given.robots, each, strict=True))
         return own
 
     def take_map(self, topic: str, message) -> None:
@@ -228,7 +237,7 @@ class TeamDriver:
 
     def _find(self, name: str, now: float, notes: list[str]) -> Pose | None:
         """Where a robot is in the team's frame; None: unknown, or not known since `pose_age`."""
-        topic = self.topics[0] if len(self.topics) == 1 else self.topics[self.robots.index(name)]
+        topic = self.topic_of(name)
         message = self.maps.get(topic)
         frame = self._root if message is None else message.header.frame_id.lstrip("/")
         found = self._chain(name, {frame, self._root} if not self.settings.offsets else {frame})
@@ -260,10 +269,21 @@ class TeamDriver:
             if plan.active[k]:
                 if self._is_new(name, goals[k], now):
                     self.goals[name], self.sent[name] = goals[k].copy(), now
-                    orders.append(Order(name, self.goals[name], heading_of(plan.ways[k])))
+                    orders.append(self._order(name, self.goals[name], heading_of(plan.ways[k])))
             elif name in self.places and (self.goals.pop(name, None) is not None or self.episode is not None):
-                orders.append(Order(name, self.places[name], 0.0, stop=True))
+                orders.append(self._order(name, self.places[name], 0.0, stop=True))
         return orders
+
+    def _order(self, name: str, goal: np.ndarray, heading: float, stop: bool = False) -> Order:
+        pose, topic = (float(goal[0]), float(goal[1]), heading), self.topic_of(name)
+        if not self.settings.offsets or topic not in self.maps:
+            return Order(name, goal, self._root, pose, stop)
+        own = self.maps[topic].header.frame_id
+        return Order(name, goal, own, compose(invert(self._place(own, topic)), pose), stop)
+
+    def topic_of(self, name: str) -> str:
+        """Of the map that a robot is on."""
+        return self.topics[0] if len(self.topics) == 1 else self.topics[self.settings.robots.index(name)]
 
     def _is_new(self, name: str, goal: np.ndarray, now: float) -> bool:
         last, resend = self.goals.get(name), self.settings.resend

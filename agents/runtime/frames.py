@@ -79,6 +79,13 @@ def compose(pose: Pose, inner: Pose) -> Pose:
     return x + c * inner[0] - s * inner[1], y + s * inner[0] + c * inner[1], yaw + inner[2]
 
 
+def invert(pose: Pose) -> Pose:
+    """Where the outer frame stands in the inner one."""
+    x, y, yaw = pose
+    c, s = math.cos(yaw), math.sin(yaw)
+    return -c * x - s * y, s * x - c * y, -yaw
+
+
 class Frames:
     """Where frames stand in their parents, as was told last. There is no interpolation: robots are slow."""
 

@@ -15,7 +15,7 @@ PATHS = (
     "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results", "suite",
     "hydra.run.dir", "hydra.sweep.dir",
 )  # fmt: skip
-WORDS = (("suite", "policy"),)
+WORDS = (("suite", "policy"), ("ros2", "policy"))
 """Commands of other programs, taken as they stand."""
 POLICIES = {"evaluate": ("policy",), "benchmark": ("policies",), "train": ("classical",)}
 """Settings that name several policies, by the verb: names, folders, module:function."""
@@ -26,6 +26,7 @@ LISTS = {
     "export": ("num_robots",),
     "evaluate": ("num_robots", "policy"),
     "bench": ("num_robots", "axes"),
+    "ros2": ("robots", "map_topics", "offsets", "robot_radius"),
     "benchmark": ("scenarios", "algorithms", "policies", "seeds", "maps"),
 }
 

@@ -16,6 +16,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig
 
 from maexp.agents.runtime.choices import CHOICES
+from maexp.agents.runtime.driver import DriverSettings
 from maexp.agents.settings.algorithms import TUNINGS, find_tunings
 from maexp.agents.settings.model import SIZES, SUMMARIES, ModelConfig
 from maexp.envs.config import (
@@ -370,6 +371,31 @@ class SuiteSettings:
     device: str = setting("cpu", "run: cpu, cuda, ...; bits are promised on one platform alone")
 
 
+DriveSettings = make_dataclass(
+    "DriveSettings",
+    [(one.name, Any, setting(None if one.default == () else one.default, f"team: {one.metadata['help']}"))
+     for one in fields(DriverSettings)],
+)  # fmt: skip
+
+
+@dataclass
+class Ros2Settings(DriveSettings):
+    """`maexp ros2`."""
+
+    task: str = MISSING
+    place: str | None = setting(None, "serve: the suite, or the .yaml file of one")
+    domain: int | None = setting(None, "number of DDS's domain; default: ROS_DOMAIN_ID, or 0")
+    answer: float = setting(60.0, "how long the other side may be silent before this ends [s]")
+    robots: Any = setting(None, "namespaces, a,b,c; serve: default robot1,robot2,...")
+    name: str = setting("ros2", "serve: what results call those who play")
+    seed: int | None = setting(None, "serve: plays other maps and starts than the frozen ones, those of this seed")
+    resume: str | None = setting(None, "serve: folder of a run to go on with")
+    tf: str = setting("shared", "serve: /tf with frames NAME/base_link; own: /NAME/tf with base_link")
+    wait_for: str = setting("all", "serve: the clock waits until all robots have a new goal; idle: those without one")
+    stands: float = setting(5.0, "serve: how long the clock stands still for goals [s]")
+    limit: float = setting(10.0, "serve: how long it runs on then, before robots without a goal stay [s]")
+
+
 @dataclass
 class LeaderboardSettings:
     """`maexp leaderboard`."""
@@ -434,6 +460,7 @@ SCHEMAS = {
     "maps": MapsSettings,
     "irsim": IrsimSettings,
     "suite": SuiteSettings,
+    "ros2": Ros2Settings,
     "leaderboard": LeaderboardSettings,
     "bench": BenchSettings,
     "benchmark": BenchmarkSettings,

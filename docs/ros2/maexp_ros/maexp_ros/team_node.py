@@ -85,9 +85,9 @@ class TeamNode(Node):
             self.get_logger().warning(f"{order.name}: nav2 is not there yet", throttle_duration_sec=10.0)
             return
         message = NavigateToPose.Goal()
-        message.pose.header.frame_id = self.frame
+        message.pose.header.frame_id = order.frame
         message.pose.header.stamp = self.get_clock().now().to_msg()
-        fill_pose(message.pose.pose, order.goal[0], order.goal[1], order.heading)
+        fill_pose(message.pose.pose, *order.pose)
         client.send_goal_async(message).add_done_callback(partial(self._answered, order))
 
     def _answered(self, order: Order, future) -> None:

@@ -1,0 +1,160 @@
+"""A ROS 2 team driven over DDS: maps, frames and odometry in, goals out. All thinking is in `maexp.agents.runtime`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from maexp.agents.errors import UserError
+from maexp.agents.ros2.convert import SECOND, fill_header, read_nanoseconds
+from maexp.agents.ros2.dds import EPISODE, Wire
+from maexp.agents.runtime.driver import Decision, TeamDriver
+from maexp.agents.runtime.frames import fill_pose
+
+POLL = 0.1  # seconds between two looks where nothing comes
+
+
+@dataclass
+class Course:
+    """What a team did.
+
+    Attributes:
+        plans: made.
+        seconds: of processor time that they took.
+        episodes: of an arena that were played.
+    """
+
+    plans: int = 0
+    seconds: float = 0.0
+    episodes: int = 0
+
+
+class Ros2Team:
+    """A `TeamDriver` on DDS.
+
+    Where an arena tells of an episode, the team decides whenever all robots have a new map, once: in lockstep. Else it
+    decides every `period` seconds of the time of ROS: that of /clock where somebody publishes it.
+
+    Args:
+        answer: how long the first map and pose are waited for, and new ones after the last [s by the wall].
+        tell: called with a sentence.
+    """
+
+    def __init__(self, driver: TeamDriver, wire: Wire, answer: float = 60.0, tell: Callable[[str], None] = print):
+        self.driver, self.wire, self.answer, self.tell = driver, wire, answer, tell
+        robots = driver.settings.robots
+        self.maps = {topic: wire.reader(topic, "map") for topic in driver.topics}
+        self.frames = {
+            (place, still): wire.reader(f"{'' if place is None else f'/{place}'}/{'tf_static' if still else 'tf'}")
+            for place in (None, *robots) for still in (True, False)
+        }  # fmt: skip
+        self.odometry = {name: wire.reader(f"/{name}/odom") for name in robots}
+        self.clock, self.episode = wire.reader("/clock"), wire.reader(EPISODE)
+        self.goals = {name: wire.writer(f"/{name}/goal_pose") for name in robots}
+        self.time: int | None = None  # that /clock showed last [ns]
+        self.planned: float | None = None  # time of the last decision [s]
+        self.said: set[str] = set()
+        self.course = Course()
+
+    def run(self) -> Course:
+        """Drive until the arena is over, or nobody publishes maps any more.
+
+        Raises:
+            UserError: nobody answers, or the maps cannot be put together.
+        """
+        heard = time.monotonic()
+        while True:
+            self.wire.wait(POLL)
+            maps = self._take_maps()  # first: what belongs to them has come before
+            told = [json.loads(message.data) for message in self.episode.take()]
+            if told and told[-1].get("over"):
+                return self.course
+            if told:
+                self._begin(told[-1])
+            self._take_others()
+            for topic, message in maps.items():
+                self.driver.take_map(topic, message)
+            heard = time.monotonic() if maps else heard
+            now = self._due()
+            if now is not None and self.driver.maps:
+                self._decide(now)
+            elif time.monotonic() - heard > self.answer and not any(one.matched for one in self.maps.values()):
+                return self._end()
+
+    def _end(self) -> Course:
+        if self.course.plans:
+            self.tell(f"Nobody publishes {', '.join(self.maps)} any more.")
+            return self.course
+        raise UserError(
+            f"Nobody publishes {', '.join(self.maps)} in {self.answer:g} s: start the robots, and check that both have "
+            "the same ROS_DOMAIN_ID and network (answer=SECONDS waits longer, map_topics= names other topics)."
+        )
+
+    def _take_maps(self) -> dict[str, Any]:
+        """The newest of each topic that came since."""
+        found = {}
+        for topic, reader in self.maps.items():
+            for message in reader.take():
+                found[topic] = message
+        return found
+
+    def _take_others(self) -> None:
+        for (robot, still), reader in self.frames.items():
+            for message in reader.take():
+                self.driver.take_frames(message, robot, still)
+        for robot, reader in self.odometry.items():
+            for message in reader.take():
+                self.driver.take_odometry(robot, message)
+        for message in self.clock.take():
+            self.time = read_nanoseconds(message.clock)
+
+    def _begin(self, episode: dict[str, Any]) -> None:
+        """Another episode of the arena."""
+        self.driver.begin(episode, episode["begins"] / SECOND)
+        self.planned = None
+        self.course.episodes += 1
+
+    def _due(self) -> float | None:
+        """The time of the decision that is to be made now [s]; None: none is."""
+        episode = self.driver.episode
+        if episode is not None:
+            topics = [self.driver.topic_of(name) for name in self.driver.robots]
+            stamps = {self._stamp(topic) for topic in topics}
+            now = stamps.pop() if len(stamps) == 1 else None
+            return None if now is None or now / SECOND == self.planned or now < episode["begins"] else now / SECOND
+        if self.time is None and self.clock.matched:
+            return None
+        now = time.time() if self.time is None else self.time / SECOND
+        early = self.planned is not None and 0.0 <= now - self.planned < self.driver.settings.period
+        return None if early else now
+
+    def _stamp(self, topic: str) -> int | None:
+        message = self.driver.maps.get(topic)
+        return None if message is None else read_nanoseconds(message.header.stamp)
+
+    def _decide(self, now: float) -> None:
+        begin = time.process_time()
+        try:
+            decision = self.driver.decide(now)
+        except ValueError as error:
+            raise UserError(f"{error}.") from error
+        self.planned = now
+        if decision.plan is not None:
+            self.course.plans += 1
+            self.course.seconds += time.process_time() - begin
+        self._send(decision, now)
+        for note in decision.notes:
+            if note not in self.said:
+                self.tell(f"{now:.1f} s: {note}")
+        self.said = set(decision.notes)
+
+    def _send(self, decision: Decision, now: float) -> None:
+        """Goals, and for robots that are to stop, where they are: /goal_pose knows no cancelling."""
+        for order in decision.orders:
+            message = self.goals[order.name].make()
+            fill_header(message.header, order.frame, round(now * SECOND))
+            fill_pose(message.pose, *order.pose)
+            self.goals[order.name].write(message)
