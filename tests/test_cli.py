@@ -49,8 +49,8 @@ def test_alone_it_lists_the_verbs_with_examples(capsys):
 def test_help_names_settings_and_choices(verb, capsys):
     assert main([verb, "--help"]) == 0
     text = capsys.readouterr().out
-    assert "num_robots=" in text or verb in ("policies", "suite", "leaderboard")
-    if verb not in ("maps", "irsim", "export", "policies", "suite", "leaderboard"):
+    assert "num_robots=" in text or verb in ("policies", "suite", "ros2", "leaderboard")
+    if verb not in ("maps", "irsim", "export", "policies", "suite", "ros2", "leaderboard"):
         assert "maze_small" in text and "wavefront" in text and "camera" in text
 
 
@@ -68,6 +68,7 @@ def test_help_waits_for_no_heavy_library(verb):
     ["train", "scenario=labyrinth"], ["train", "-m", "algorithm=ippo,mapo"], ["train", "num_robots=0"],
     ["train", "robot.radius=0.3", "robot.length=1"], ["evaluate", "policy=clever"], ["benchmark", "scenario=labyrinth"],
     ["evaluate", "checkpoint=gone", "polcy=random"], ["maps", "import", "x.png", "impoting.up=y"],
+    ["ros2", "serve", "minivall"],
 ])  # fmt: skip
 def test_a_wrong_word_waits_for_no_heavy_library(words):
     program = (

@@ -12,7 +12,7 @@ from maexp.agents.runtime.frames import NOWHERE, Pose, fill_pose, fill_turn
 
 SECOND = 10**9
 BEAMS = 360
-HALF_CELL = 0.5  # cells between two looks along a beam
+STEP = 0.1  # cells between two looks along a beam
 TRANSFORM = CLASSES["geometry_msgs/msg/TransformStamped"]
 
 
@@ -74,7 +74,7 @@ def fill_scan(message, frame: str, now: int, ranges: np.ndarray, reach: float) -
 def look(floor: Floor, pose: Pose, reach: float, beams: int = BEAMS) -> np.ndarray:
     """How far each beam is free, float [beams] [m]; infinite where it meets nothing within `reach`."""
     angles = pose[2] - math.pi + 2.0 * math.pi / beams * np.arange(beams)
-    far = np.arange(0.0, reach, HALF_CELL * floor.cell)
+    far = np.arange(0.0, reach, STEP * floor.cell)
     points = np.array(pose[:2]) + np.stack([np.cos(angles), np.sin(angles)], -1)[:, None] * far[:, None]
     cells = floor.index(points)
     solid = ~floor.free[cells[..., 0], cells[..., 1]]

@@ -57,6 +57,7 @@ class Ros2Team:
         self.time: int | None = None  # that /clock showed last [ns]
         self.planned: float | None = None  # time of the last decision [s]
         self.said: set[str] = set()
+        self.heard = time.monotonic()
         self.course = Course()
 
     def run(self) -> Course:
@@ -65,29 +66,38 @@ class Ros2Team:
         Raises:
             UserError: nobody answers, or the maps cannot be put together.
         """
-        heard = time.monotonic()
-        while True:
-            self.wire.wait(POLL)
-            maps = self._take_maps()  # first: what belongs to them has come before
-            told = [json.loads(message.data) for message in self.episode.take()]
-            if told and told[-1].get("over"):
-                return self.course
-            if told:
-                self._begin(told[-1])
-            self._take_others()
-            for topic, message in maps.items():
-                self.driver.take_map(topic, message)
-            heard = time.monotonic() if maps else heard
-            now = self._due()
-            if now is not None and self.driver.maps:
-                self._decide(now)
-            elif time.monotonic() - heard > self.answer and not any(one.matched for one in self.maps.values()):
-                return self._end()
+        while not self.step():
+            pass
+        return self.course
 
-    def _end(self) -> Course:
+    def step(self) -> bool:
+        """Wait for messages, but not for long, and decide if it is time; whether there is nothing more to do.
+
+        Raises:
+            UserError: as `run`.
+        """
+        self.wire.wait(POLL)
+        maps = self._take_maps()  # first: what belongs to them has come before
+        told = [json.loads(message.data) for message in self.episode.take()]
+        if told and told[-1].get("over"):
+            return True
+        if told:
+            self._begin(told[-1])
+        self._take_others()
+        for topic, message in maps.items():
+            self.driver.take_map(topic, message)
+        self.heard = time.monotonic() if maps else self.heard
+        now = self._due()
+        if now is not None and self.driver.maps:
+            self._decide(now)
+            return False
+        silent = time.monotonic() - self.heard > self.answer
+        return silent and not any(reader.matched for reader in self.maps.values()) and self._end()
+
+    def _end(self) -> bool:
         if self.course.plans:
             self.tell(f"Nobody publishes {', '.join(self.maps)} any more.")
-            return self.course
+            return True
         raise UserError(
             f"Nobody publishes {', '.join(self.maps)} in {self.answer:g} s: start the robots, and check that both have "
             "the same ROS_DOMAIN_ID and network (answer=SECONDS waits longer, map_topics= names other topics)."
