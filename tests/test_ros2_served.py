@@ -310,10 +310,11 @@ def folders(tmp_path_factory):
         for name, value in surroundings().items():
             patch.setenv(name, value)
         words = ["ros2", "team", "robots=robot1,robot2,robot3", "policy=cost_utility", "answer=300"]
-        command = [sys.executable, "-m", "maexp.agents.cli", *words]
+        program = "import sys; from maexp.agents.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", program, *words]
         other = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=place)
         try:
-            words = [f"hydra.run.dir={place / 'dds'}", "answer=300", "stands=120"]
+            words = [f"hydra.run.dir={place / 'dds'}", "answer=120", "stands=120"]
             assert main(["ros2", "serve", str(suite), *words]) == 0
             said, _ = other.communicate(timeout=60)
         finally:
