@@ -5,10 +5,12 @@ Needs neither ROS nor DDS: whoever uses it hands over the messages, and sends th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+
+from maexp.envs.fields import setting
 
 from .agent import go_beyond, planner_options
 from .frames import (
@@ -31,33 +33,29 @@ ODOMETRY = "odometry of "
 SERVED_AGE = 0.05  # seconds; an arena tells everything of one moment
 
 
-def _setting(default: Any, text: str) -> Any:
-    return field(default=default, metadata={"help": text})
-
-
 @dataclass(frozen=True)
 class DriverSettings:
     """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
 
-    robots: tuple[str, ...] = _setting((), "namespaces of the robots: a,b,c")
-    policy: str = _setting("cost_utility", "a planner, a trained policy that ships, or the folder of one")
-    map_topics: tuple[str, ...] = _setting((), "the team's map, or one of each robot; default: /NAME/map of each")
-    global_frame: str = _setting("map", "all maps and poses are brought into this frame")
-    base_frame: str = _setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")
-    offsets: tuple[float, ...] = _setting((), "x, y, yaw of each robot's map in the team's frame; zeros: they are one")
-    period: float = _setting(2.0, "between two decisions [s]")
-    radar_range: float | None = _setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
-    robot_radius: tuple[float, ...] = _setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
-    clearance_factor: float = _setting(2.0, "radii that ways keep from obstacles twice over, where there is room")
-    occupied: float = _setting(65.0, "cells with so many percent and more are obstacles")
-    bounded: bool = _setting(False, "the map shows the whole place")
-    patience: float = _setting(10.0, "how long a robot may stand still on its way [s]")
-    pause: float = _setting(60.0, "how long a target is given up [s]")
-    max_speed: float | None = _setting(None, "of the robots [m/s], told to trained policies; default: as trained")
-    time_limit: float | None = _setting(None, "for the whole exploration [s]; policies are told what is left of it")
-    pose_age: float = _setting(2.0, "a pose older than this is not believed [s]")
-    goal_change: float = _setting(0.5, "a goal is sent again when it has moved farther than this [m]")
-    resend: float | None = _setting(None, "a goal is sent again after so long [s]; default: never")
+    robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
+    policy: str = setting("cost_utility", "a planner, a trained policy that ships, or the folder of one")
+    map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
+    global_frame: str = setting("map", "all maps and poses are brought into this frame")
+    base_frame: str = setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")
+    offsets: tuple[float, ...] = setting((), "x, y, yaw of each robot's map in the team's frame; zeros: they are one")
+    period: float = setting(2.0, "between two decisions [s]")
+    radar_range: float | None = setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
+    robot_radius: tuple[float, ...] = setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
+    clearance_factor: float = setting(2.0, "radii that ways keep from obstacles twice over, where there is room")
+    occupied: float = setting(65.0, "cells with so many percent and more are obstacles")
+    bounded: bool = setting(False, "the map shows the whole place")
+    patience: float = setting(10.0, "how long a robot may stand still on its way [s]")
+    pause: float = setting(60.0, "how long a target is given up [s]")
+    max_speed: float | None = setting(None, "of the robots [m/s], told to trained policies; default: as trained")
+    time_limit: float | None = setting(None, "for the whole exploration [s]; policies are told what is left of it")
+    pose_age: float = setting(2.0, "a pose older than this is not believed [s]")
+    goal_change: float = setting(0.5, "a goal is sent again when it has moved farther than this [m]")
+    resend: float | None = setting(None, "a goal is sent again after so long [s]; default: never")
 
 
 @dataclass(frozen=True)
