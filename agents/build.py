@@ -33,22 +33,17 @@ from maexp.agents.settings.schema import (
     ScenarioSettings,
     TrainSettings,
     read,
+    read_free_groups,
 )
 from maexp.envs import (
-    CommConfig,
     ExplorationEnv,
-    FaultsConfig,
-    LookaheadConfig,
-    ObservationConfig,
     PointCloudMap,
     RadarConfig,
-    RewardConfig,
     RobotConfig,
-    TargetsConfig,
     make_map,
 )
-from maexp.envs.config import STARTS
-from maexp.envs.scenarios import SCENARIOS, find_scenario
+from maexp.envs.config import STARTS, EnvSettings
+from maexp.envs.scenarios import SCENARIOS, Scenario, find_scenario
 from maexp.envs.starts import read_starts
 
 
@@ -145,30 +140,25 @@ def make_env(
     Raises:
         ValueError: a setting out of range; MapError: no room for the team.
     """
-    scenario = cfg.scenario
+    settings = env_settings(cfg, find_scenario(maps[0].scenario), num_robots, num_envs or cfg.num_envs)
+    return ExplorationEnv(maps, **(vars(settings) | {"starts": choose_starts(cfg, num_robots)} | others))
+
+
+def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int, num_envs: int) -> EnvSettings:
+    """The settings of an env on maps of a scenario."""
     robot, radar = team_configs(cfg, num_robots)
-    settings = {"device": pick_device(cfg.device), "num_threads": cfg.num_threads} | others
-    settings.setdefault("starts", choose_starts(cfg, num_robots))
-    return ExplorationEnv(
-        maps,
-        num_envs=num_envs or cfg.num_envs,
+    same = ("local_steps", "macro_steps", "collision", "success_coverage", "done")
+    return EnvSettings(
+        num_envs=num_envs,
         num_robots=num_robots,
+        device=pick_device(cfg.device),
         seed=cfg.seed,
+        num_threads=cfg.num_threads,
         robot=robot,
         radar=radar,
-        planner=planner_config(cfg, find_scenario(maps[0].scenario)),
-        reward=read(RewardConfig, cfg.reward),
-        observation=read(ObservationConfig, cfg.observation),
-        comm=read(CommConfig, cfg.comm),
-        faults=read(FaultsConfig, cfg.faults),
-        targets=read(TargetsConfig, cfg.targets),
-        lookahead=read(LookaheadConfig, cfg.lookahead),
-        local_steps=scenario.local_steps,
-        macro_steps=scenario.macro_steps,
-        collision=scenario.collision,
-        success_coverage=scenario.success_coverage,
-        done=scenario.done,
-        **settings,
+        planner=planner_config(cfg, row),
+        **{name: cfg.scenario[name] for name in same},
+        **read_free_groups(cfg),
     )
 
 

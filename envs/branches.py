@@ -37,7 +37,7 @@ def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig 
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
         env.settings, num_envs=count, comm=comm, limited=limited,
-        faults=FaultsConfig(), radars=tuple(map(perfect, env.settings.radars)),  # nobody foresees what chance does
+        faults=FaultsConfig(), radar=tuple(map(perfect, env.settings.radar)),  # nobody foresees what chance does
         observation=replace(env.settings.observation, pictures=False),
     )  # fmt: skip
     made = ExplorationEnv.__new__(ExplorationEnv)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 from maexp.envs.fields import check_settings, check_value, kinds, setting, words_of
 from maexp.envs.scenarios import Scenario
@@ -244,10 +244,55 @@ class LookaheadConfig:
     )
 
 
+@dataclass(frozen=True)
+class EnvSettings:
+    """What an `ExplorationEnv` is, besides its maps and starts; None: what the scenario of the first map says.
+
+    `maexp.envs.settings.complete_settings` checks and fills in; then nothing is None, and ``robot``, ``radar`` are
+    tuples with one config per robot.
+    """
+
+    num_envs: int = setting(1, "teams in the batch, E", low=1)
+    num_robots: int = setting(3, "robots in a team, N", low=1)
+    device: Any = setting("cpu", "cpu or cuda")
+    seed: int = setting(0, "key of all random numbers: env i's episode k depends on (seed, first_env + i, k) alone")
+    robot: RobotConfig | Sequence[RobotConfig] = setting(RobotConfig(), "or a list with one for each robot")
+    radar: RadarConfig | Sequence[RadarConfig] = setting(RadarConfig(), "or a list with one for each robot")
+    planner: PlannerConfig = setting(PlannerConfig(), "how robots drive to their goals")
+    reward: RewardConfig = setting(RewardConfig(), "weights of the reward")
+    observation: ObservationConfig = setting(ObservationConfig(), "what robots see")
+    comm: CommConfig = setting(CommConfig(), "who hears whom")
+    faults: FaultsConfig = setting(FaultsConfig(), "robots that fail")
+    targets: TargetsConfig = setting(TargetsConfig(), "how robots share targets out")
+    lookahead: LookaheadConfig = setting(LookaheadConfig(), "how `policy=lookahead` plans")
+    local_steps: int | None = setting(None, "control steps of 0.1 s in one `env.step`", low=1)
+    macro_steps: int | None = setting(None, "`env.step` calls in an episode before it is truncated", low=1)
+    collision: Literal["centre", "footprint"] = setting(
+        "centre", "of centres with walls and centres, or footprint: of oriented rectangles"
+    )
+    success_coverage: float = setting(
+        0.95, "share of the free points that ends an episode, up to 1; 0.99 with more macro_steps: to the end",
+        above=0, high=1,
+    )  # fmt: skip
+    done: Literal["union", "base", "everyone"] = setting(
+        "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
+    )
+    num_threads: int | None = setting(None, "CPU threads of the simulation; results do not depend on it")
+    first_env: int = setting(
+        0, "number of the first env in the random keys, where processes share one batch of envs", low=0
+    )
+    limited: bool = setting(False, "robots may know different things; true where comm or faults make it so")
+
+    @property
+    def episode_steps(self) -> int:
+        """Local steps of a whole episode."""
+        return self.local_steps * self.macro_steps
+
+
 ROBOT_KINDS = words_of(RobotConfig, "kind")
 TIME_ON = words_of(RewardConfig, "time_on")  # numbered as in kernels/reward.py
 STRATEGIES = words_of(CommConfig, "strategy")
-DONE = ("union", "base", "everyone")
+DONE = words_of(EnvSettings, "done")
 """Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
 station knows, or what every robot knows that has neither collided nor failed."""
 BODY = ("length", "width", "collision_threshold")
@@ -389,9 +434,7 @@ def check_faults(config: FaultsConfig, num_robots: int | None = None) -> FaultsC
 
 
 def check_done(done: str, comm: CommConfig) -> str:
-    """Whose coverage ends an episode must be known, and there."""
-    if done not in DONE:
-        raise ValueError(f"done={done!r} is unknown: choose one of {', '.join(DONE)}")
+    """Whose coverage ends an episode must be there."""
     if done == "base" and not comm.has_base:
         raise ValueError("done='base' needs a base station: add comm.base_station=true")
     return done

@@ -5,7 +5,6 @@ Warp's arrays and recorded launches belong to the process that made them, and ca
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,11 +16,7 @@ if TYPE_CHECKING:
 
 def describe(env: ExplorationEnv) -> tuple[type, list[PointCloudMap], dict[str, Any], dict[str, torch.Tensor]]:
     """What `rebuild` makes the same env of: its class, maps, settings and state."""
-    settings = env.settings
-    follows = ("scenario", "limited")  # from the others
-    chosen = {one.name: getattr(settings, one.name) for one in fields(settings) if one.name not in follows}
-    chosen |= {"robot": chosen.pop("robots"), "radar": chosen.pop("radars"), "starts": env.starts}
-    return type(env), env.maps, chosen, env.state_dict()
+    return type(env), env.maps, vars(env.settings) | {"starts": env.starts}, env.state_dict()
 
 
 def rebuild(

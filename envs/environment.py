@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,19 +12,12 @@ from torchrl.envs import EnvBase
 from maexp.envs.bank import MapBank, build_bank
 from maexp.envs.config import (
     STARTS,
-    CommConfig,
-    FaultsConfig,
-    LookaheadConfig,
-    ObservationConfig,
-    PlannerConfig,
-    RadarConfig,
-    RewardConfig,
-    RobotConfig,
-    TargetsConfig,
+    EnvSettings,
 )
 from maexp.envs.copies import describe, rebuild
 from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.settings import EnvSettings, complete_settings, positive_count
+from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.settings import complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
 from maexp.envs.snapshot import take_snapshot
 from maexp.envs.specs import REWARD_TERMS, action_spec, done_spec, info_shapes, observation_spec, reward_spec
@@ -48,27 +42,14 @@ def _setting(name: str, meaning: str) -> property:
 class ExplorationEnv(EnvBase):
     """``num_envs`` teams of ``num_robots`` robots, each on one of ``maps``, chosen anew at every reset.
 
-    Settings left None take the values of the scenario of the first map. ``robot`` and ``radar`` may be
-    lists with one config per robot.
-
     Args:
         maps: one map or several; they may differ in size.
-        num_envs: teams in the batch, E.
-        num_robots: robots in a team, N.
-        device: "cpu" or "cuda".
-        seed: key of all random numbers: env i's episode k depends on (seed, first_env + i, k) alone.
-        robot, radar, planner, reward, observation, comm, faults, targets, lookahead: see `maexp.envs.config`.
-        local_steps: control steps of 0.1 s in one ``env.step``.
-        macro_steps: ``env.step`` calls in an episode before it is truncated.
-        collision: "centre" (distance of centres) or "footprint" (oriented rectangles).
-        success_coverage: coverage that ends an episode as a success.
-        done: whose coverage that is: "union", what the team has seen together; "base", what the base station knows;
-            "everyone", what every robot knows that has neither collided nor failed.
-        num_threads: CPU threads of the simulation; results do not depend on it.
-        first_env: number of the first env in the random keys, where several processes share one batch of envs.
+        num_envs, num_robots, device, seed: the first fields of `maexp.envs.EnvSettings`.
         starts: "drawn" anew at every reset; "together": a place for the team is drawn at every reset, in which robots
             stand beside each other, as far from walls and from each other as always; "fixed": drawn once for each map,
             from (seed, map) alone, and kept; or poses, as for `set_starts`.
+        settings: its other fields by name. What is None takes the value of the scenario of the first map; ``robot``
+            and ``radar`` may be lists with one config per robot.
 
     Raises:
         ValueError: a setting is out of its range (named, with its value).
@@ -77,7 +58,6 @@ class ExplorationEnv(EnvBase):
 
     batch_locked = True
 
-    scenario = _setting("scenario", "Row of the table of scenarios that filled in what was not given.")
     num_envs = _setting("num_envs", "Teams in the batch, E.")
     num_robots = _setting("num_robots", "Robots in a team, N.")
     local_steps = _setting("local_steps", "Control steps of 0.1 s in a macro step.")
@@ -85,8 +65,8 @@ class ExplorationEnv(EnvBase):
     collision = _setting("collision", '"centre" or "footprint".')
     done_by = _setting("done", "Whose coverage ends an episode.")
     success_coverage = _setting("success_coverage", "Coverage that ends an episode.")
-    robot_configs = _setting("robots", "One `RobotConfig` per robot.")
-    radar_configs = _setting("radars", "One `RadarConfig` per robot.")
+    robot_configs = _setting("robot", "One `RobotConfig` per robot.")
+    radar_configs = _setting("radar", "One `RadarConfig` per robot.")
     planner_config = _setting("planner", "The `PlannerConfig`.")
     reward_config = _setting("reward", "The `RewardConfig`.")
     observation_config = _setting("observation", "The `ObservationConfig`.")
@@ -102,34 +82,14 @@ class ExplorationEnv(EnvBase):
         device: str | torch.device = "cpu",
         seed: int = 0,
         *,
-        robot: RobotConfig | Sequence[RobotConfig] | None = None,
-        radar: RadarConfig | Sequence[RadarConfig] | None = None,
-        planner: PlannerConfig | None = None,
-        reward: RewardConfig | None = None,
-        observation: ObservationConfig | None = None,
-        comm: CommConfig | None = None,
-        faults: FaultsConfig | None = None,
-        targets: TargetsConfig | None = None,
-        lookahead: LookaheadConfig | None = None,
-        local_steps: int | None = None,
-        macro_steps: int | None = None,
-        collision: str = "centre",
-        success_coverage: float = 0.95,
-        done: str = "union",
-        num_threads: int | None = None,
-        first_env: int = 0,
         starts: str | np.ndarray | torch.Tensor = "drawn",
+        **settings: Any,
     ):
         maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
-        settings = complete_settings(
-            maps, num_envs, num_robots, device, seed, robot=robot, radar=radar, planner=planner, reward=reward,
-            observation=observation, comm=comm, faults=faults, targets=targets, lookahead=lookahead,
-            local_steps=local_steps, macro_steps=macro_steps, collision=collision, success_coverage=success_coverage,
-            done=done, num_threads=num_threads, first_env=first_env,
-        )  # fmt: skip
+        settings = complete_settings(EnvSettings(num_envs, num_robots, device, seed, **settings), maps)
         for m in maps:
-            check_room(m, [r.collision_threshold for r in settings.robots])
-        self._set_up(settings, build_bank(maps, settings.radars), starts)
+            check_room(m, [r.collision_threshold for r in settings.robot])
+        self._set_up(settings, build_bank(maps, settings.radar), starts)
 
     def _set_up(self, settings: EnvSettings, bank: MapBank, starts: str | np.ndarray | torch.Tensor = "drawn") -> None:
         """Build everything of an env from its complete settings and its maps."""
@@ -139,7 +99,7 @@ class ExplorationEnv(EnvBase):
         together = isinstance(starts, str) and starts == "together"
         if together:
             for m in self.maps:
-                check_gathering(m, [r.collision_threshold for r in settings.robots])
+                check_gathering(m, [r.collision_threshold for r in settings.robot])
         self.simulation = build_simulation(settings, self.bank, together)
         self._hook: tuple[Callable, int] | None = None
         self.starts = starts if isinstance(starts, str) else "drawn"  # unless poses are given
@@ -159,6 +119,11 @@ class ExplorationEnv(EnvBase):
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
+
+    @property
+    def scenario(self) -> Scenario:
+        """Row of the table of scenarios that filled in what was not given."""
+        return find_scenario(self.maps[0].scenario)
 
     # Reset and step
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
 from functools import cache
+from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -44,6 +45,11 @@ def setting(
     return field(default=default, metadata=metadata)
 
 
+def same(cls: type, name: str) -> Any:
+    """The setting of another dataclass."""
+    return replaced(cls, name, cls.__dataclass_fields__[name].default)
+
+
 def replaced(cls: type, name: str, default: Any) -> Any:
     """The setting of another dataclass, with another default."""
     return field(default=default, metadata=cls.__dataclass_fields__[name].metadata)
@@ -60,7 +66,7 @@ def describe(cls: type) -> list[str]:
     rows = []
     for one in fields(cls) if is_dataclass(cls) else ():
         if one.metadata.get("help"):
-            default = "" if one.default in (None, MISSING) else f" = {one.default}"
+            default = f" = {one.default}" if isinstance(one.default, PRIMITIVES) else ""
             rows.append(f"- ``{one.name}{default}``: {explain(one.metadata)}")
     return ["", *rows, ""] if rows else []
 
@@ -106,9 +112,9 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return type(value) in allowed
     if isinstance(value, str):
         return str in allowed or value in words
-    if float not in allowed and not (int in allowed and isinstance(value, int) and value <= WHOLE_LIMIT):
+    if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
-    if not isinstance(value, int | float):
+    if float not in allowed and low is not None and value > WHOLE_LIMIT:
         return False
     inside = (low is None or value >= low) and (high is None or value <= high)
     inside = inside and (above is None or value > above) and (below is None or value < below)
@@ -137,4 +143,6 @@ def _between(low, high, above, below) -> str:
         return f" above {above:g} and below {below:g}"
     if low is not None:
         return f", {low:g} or more"
-    return "" if above is None else f" above {above:g}"
+    if above is not None:
+        return f" above {above:g}" + (f" and up to {high:g}" if high is not None else "")
+    return ""

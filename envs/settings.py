@@ -1,14 +1,15 @@
-"""All settings of an env in one frozen object: checked and completed once, before anything is built from them."""
+"""The settings of an env, checked and completed once, before anything is built from them."""
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from maexp.envs.config import (
     CommConfig,
+    EnvSettings,
     FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
@@ -31,142 +32,75 @@ from maexp.envs.config import (
     one_config,
     per_robot,
 )
+from maexp.envs.fields import check_settings
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
-from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
+from maexp.envs.scenarios import default_macro_steps, find_scenario
 from maexp.kernels.sensing import return_chance
 
 LEAST_RETURNS = 0.01  # share of the returns in view that has to count
 
 
-@dataclass(frozen=True)
-class EnvSettings:
-    """What an `ExplorationEnv` is, without its maps. No value is None any more."""
-
-    scenario: Scenario  # of the first map: its values stand for what was not given
-    num_envs: int  # teams, E
-    num_robots: int  # robots of a team, N
-    device: torch.device
-    seed: int
-    first_env: int  # number of the first env in the random keys
-    num_threads: int  # CPU threads of the simulation
-    local_steps: int  # control steps of 0.1 s in a macro step
-    macro_steps: int  # of an episode
-    collision: str  # "centre" or "footprint"
-    success_coverage: float  # share that ends an episode
-    done: str  # whose: "union", "base" or "everyone"
-    robots: tuple[RobotConfig, ...]  # one per robot
-    radars: tuple[RadarConfig, ...]  # one per robot
-    planner: PlannerConfig
-    reward: RewardConfig
-    observation: ObservationConfig
-    comm: CommConfig
-    faults: FaultsConfig
-    limited: bool  # whether robots may know different things
-    targets: TargetsConfig
-    lookahead: LookaheadConfig
-
-    @property
-    def episode_steps(self) -> int:
-        """Local steps of a whole episode."""
-        return self.local_steps * self.macro_steps
-
-
-def complete_settings(
-    maps: Sequence[PointCloudMap],
-    num_envs: int,
-    num_robots: int,
-    device: str | torch.device,
-    seed: int,
-    *,
-    robot: RobotConfig | Sequence[RobotConfig] | None,
-    radar: RadarConfig | Sequence[RadarConfig] | None,
-    planner: PlannerConfig | None,
-    reward: RewardConfig | None,
-    observation: ObservationConfig | None,
-    comm: CommConfig | None,
-    faults: FaultsConfig | None,
-    targets: TargetsConfig | None,
-    lookahead: LookaheadConfig | None,
-    local_steps: int | None,
-    macro_steps: int | None,
-    collision: str,
-    success_coverage: float,
-    done: str,
-    num_threads: int | None,
-    first_env: int,
-) -> EnvSettings:
-    """Check what `ExplorationEnv` was given, and fill in what the scenario of the first map fixes.
+def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> EnvSettings:
+    """Check the settings of an env, and fill in what the scenario of the first map fixes.
 
     Raises:
         ValueError: a setting is out of its range (named, with its value).
         MapError: a map has fewer points than the team has robots.
     """
+    num_robots = settings.num_robots
     if not maps:
         raise ValueError("maps=[] is empty: give at least one map")
-    num_envs, num_robots = positive_count("num_envs", num_envs), positive_count("num_robots", num_robots)
     for m in maps:
         if not isinstance(m, PointCloudMap):
             raise ValueError(f"maps holds {m!r}: give PointCloudMaps, from make_map or import_map")
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer):
-        raise ValueError(f"seed={seed!r} must be a whole number")
-    if isinstance(first_env, bool) or not isinstance(first_env, int | np.integer) or first_env < 0:
-        raise ValueError(f"first_env={first_env!r} must be a whole number, 0 or more")
+    check_settings(settings)
     fewest = min(maps, key=lambda m: len(m.free))
     if num_robots > len(fewest.free):
         raise MapError(
             f"map {fewest.name} has {len(fewest.free)} free points and no room for num_robots={num_robots}: "
             "use fewer robots or a larger map"
         )
-    scenario = find_scenario(maps[0].scenario)
-    device = _device(device)
-    local_steps = positive_count("local_steps", scenario.local_steps if local_steps is None else local_steps)
-    if collision not in ("centre", "footprint"):
-        raise ValueError(f"collision={collision!r} is unknown: choose centre or footprint")
-    if not 0.0 < success_coverage <= 1.0:
-        raise ValueError(f"success_coverage={success_coverage} must lie in (0, 1]")
-    robots = tuple(complete_robot(r, scenario) for r in per_robot("robot", robot, RobotConfig, num_robots))
-    radars = tuple(complete_radar(r, scenario) for r in per_robot("radar", radar, RadarConfig, num_robots))
+    scenario, device = find_scenario(maps[0].scenario), _device(settings.device)
+    local_steps = int(scenario.local_steps if settings.local_steps is None else settings.local_steps)
+    robots = tuple(complete_robot(r, scenario) for r in per_robot("robot", settings.robot, RobotConfig, num_robots))
+    radars = tuple(complete_radar(r, scenario) for r in per_robot("radar", settings.radar, RadarConfig, num_robots))
+    macro_steps = settings.macro_steps
     if macro_steps is None:
         team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
         macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario, team, local_steps)
-    macro_steps = positive_count("macro_steps", macro_steps)
     check_bodies(maps, robots)
-    planner = complete_planner(one_config("planner", planner, PlannerConfig), scenario)
-    reward = check_reward(one_config("reward", reward, RewardConfig))
-    observation = one_config("observation", observation, ObservationConfig)
+    planner = complete_planner(one_config("planner", settings.planner, PlannerConfig), scenario)
+    observation = one_config("observation", settings.observation, ObservationConfig)
     check_observation(observation, planner)
-    comm = check_comm(one_config("comm", comm, CommConfig))
-    faults = check_faults(one_config("faults", faults, FaultsConfig), num_robots)
+    comm = check_comm(one_config("comm", settings.comm, CommConfig))
     check_strategy(comm, num_robots, planner)
     check_base(maps, comm)
     check_noise(maps, radars)
-    targets = check_targets(one_config("targets", targets, TargetsConfig))
-    lookahead = check_lookahead(one_config("lookahead", lookahead, LookaheadConfig))
-    threads = num_threads or max(1, min(len(os.sched_getaffinity(0)), num_envs // 4))
-    return EnvSettings(
-        scenario=scenario,
-        num_envs=num_envs,
-        num_robots=num_robots,
+    check_done(settings.done, comm)
+    faults = check_faults(one_config("faults", settings.faults, FaultsConfig), num_robots)
+    threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
+    return replace(
+        settings,
+        num_envs=int(settings.num_envs),
+        num_robots=int(num_robots),
         device=device,
-        seed=int(seed),
-        first_env=int(first_env),
+        seed=int(settings.seed),
+        first_env=int(settings.first_env),
         num_threads=threads if device.type == "cpu" else 1,
         local_steps=local_steps,
-        macro_steps=macro_steps,
-        collision=collision,
-        success_coverage=float(success_coverage),
-        done=check_done(done, comm),
-        robots=robots,
-        radars=radars,
+        macro_steps=int(macro_steps),
+        success_coverage=float(settings.success_coverage),
+        robot=robots,
+        radar=radars,
         planner=planner,
-        reward=reward,
+        reward=check_reward(one_config("reward", settings.reward, RewardConfig)),
         observation=observation,
         comm=comm,
         faults=faults,
-        limited=comm.limited or faults.some,
-        targets=targets,
-        lookahead=lookahead,
+        limited=settings.limited or comm.limited or faults.some,
+        targets=check_targets(one_config("targets", settings.targets, TargetsConfig)),
+        lookahead=check_lookahead(one_config("lookahead", settings.lookahead, LookaheadConfig)),
     )
 
 

@@ -9,9 +9,8 @@ import torch
 import warp as wp
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, RobotConfig
+from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
 from maexp.envs.nav_grid import bank_nav_grids, build_nav_grid, grid_shape, open_cells
-from maexp.envs.settings import EnvSettings
 from maexp.kernels.blocks import block_memory_per_env, block_sides
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
@@ -65,7 +64,7 @@ def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = Fals
 
 def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
     """Parameters of every robot, [E, N] each (fields of `kernels.types.Robots`)."""
-    robots, radars = settings.robots, settings.radars
+    robots, radars = settings.robot, settings.radar
     factor = settings.planner.clearance_factor
     same = [one.name for one in fields(RobotConfig) if one.name in Robots.vars]
     columns = {name: [getattr(r, name) for r in robots] for name in same} | {
@@ -100,22 +99,22 @@ def radio_struct(settings: EnvSettings) -> Radio:
     """The radios as the kernels read them."""
     comm, radio = settings.comm, Radio()
     radio.power, radio.threshold, radio.noise = comm.power, comm.threshold, comm.noise
-    reach = max(one.range for one in settings.radars)
+    reach = max(one.range for one in settings.radar)
     radio.cell = reach / CELLS_OF_RADAR if comm.cell == "auto" else comm.cell
     return radio
 
 
 def perfect_radars(settings: EnvSettings) -> bool:
     """Whether robots know at once all that is in view."""
-    return all(one.perfect for one in settings.radars)
+    return all(one.perfect for one in settings.radar)
 
 
 def radar_sensing(settings: EnvSettings, bank: MapBank) -> Sensing:
     """What radars miss, as the kernels read it."""
-    chance = [[return_chance(one.missed, one.noise, m.resolution) for one in settings.radars] for m in bank.maps]
+    chance = [[return_chance(one.missed, one.noise, m.resolution) for one in settings.radar] for m in bank.maps]
     sensing, device = Sensing(), str(settings.device)
     sensing.chance = wp.array(chance, dtype=wp.float32, device=device)
-    sensing.needed = wp.array([one.evidence for one in settings.radars], dtype=wp.int32, device=device)
+    sensing.needed = wp.array([one.evidence for one in settings.radar], dtype=wp.int32, device=device)
     return sensing
 
 
@@ -167,7 +166,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     finest = min(m.resolution for m in bank.maps)
     pixel = float(bank.arrays["pixel_size"].min())
     outline = sum(
-        2 * (max(2, math.ceil(r.length / finest)) + max(2, math.ceil(r.width / finest))) + 4 for r in settings.robots
+        2 * (max(2, math.ceil(r.length / finest)) + max(2, math.ceil(r.width / finest))) + 4 for r in settings.robot
     )
     return axis_sizes(
         settings.num_envs,
@@ -181,7 +180,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         limited=settings.limited,
         base_station=settings.comm.has_base,
         sensing=not perfect_radars(settings),
-        body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robots),
+        body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robot),
     )
 
 
@@ -208,7 +207,7 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     cells = max(width * height for width, height in shapes)
     return {
         "cells": cells, "robots": robots, "known_rows": robots if limited else 1,
-        "masks": robots if limited else len({one.collision_threshold for one in settings.robots}),
+        "masks": robots if limited else len({one.collision_threshold for one in settings.robot}),
         "points": bank.max_free + bank.max_boundary, "news": news_capacity(cells),
         "wall_words": max(-(-width // 32) * height for width, height in shapes),
     }  # fmt: skip
@@ -216,7 +215,7 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
 
 def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
     """What a `Navigation` and the targets that it finds keep of one env."""
-    grids, reach = grid_sizes(settings, bank), min(one.range for one in settings.radars)
+    grids, reach = grid_sizes(settings, bank), min(one.range for one in settings.radar)
     blocks = 0
     for one in bank.maps:
         side = int(block_sides(np.float32(one.resolution), reach))

@@ -3,8 +3,8 @@
 import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
+from maexp.envs.config import EnvSettings
 from maexp.envs.features import FEATURES
-from maexp.envs.settings import EnvSettings
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.types import REGIONS

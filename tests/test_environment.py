@@ -19,6 +19,7 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
+from maexp.envs.settings import complete_settings
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
 from maexp.kernels.types import PICTURE_CHANNELS
 
@@ -274,7 +275,7 @@ def test_bad_actions(maps):
         (dict(comm=CommConfig(base_station=(1.0, 2.0, 3.0))), "comm.base_station="),
         (dict(comm=CommConfig(base_station=(-900.0, 0.0))), "-900.0, 0.0. is no free ground of map maze"),
         (dict(done="base"), "done='base' needs a base station"),
-        (dict(done="nobody"), "done='nobody' is unknown"),
+        (dict(done="nobody"), "done='nobody' must be one of union"),
         (dict(num_envs=10**7), "lower num_envs"),
         (dict(maps=[]), "maps=\\[\\]"),
         (dict(maps=["maze"]), "maze"),
@@ -286,6 +287,16 @@ def test_bad_actions(maps):
 def test_bad_settings_are_named(maps, settings, words):
     with pytest.raises(ValueError, match=words):
         ExplorationEnv(**{"maps": maps[0], **settings})
+
+
+def test_an_env_is_made_of_its_settings(maps):
+    team = [RobotConfig(), RobotConfig(kind="differential"), RobotConfig(max_speed=1.0)]
+    env = ExplorationEnv(maps[0], 2, robot=team)
+    again = ExplorationEnv(maps[0], **vars(env.settings))
+    assert again.settings == env.settings == complete_settings(env.settings, env.maps)
+    assert env.settings.local_steps == env.scenario.local_steps and len(env.settings.radar) == 3
+    with pytest.raises(TypeError, match="num_robot"):
+        ExplorationEnv(maps[0], num_robot=3)
 
 
 def test_no_room_for_the_team():

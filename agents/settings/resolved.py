@@ -11,18 +11,20 @@ from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import CommonSettings, LearnerSettings, ScenarioSettings, helps, read, schema
+from maexp.agents.settings.schema import (
+    CommonSettings,
+    LearnerSettings,
+    ScenarioSettings,
+    helps,
+    read,
+    read_free_groups,
+    schema,
+)
 from maexp.envs.config import (
     BODY,
-    CommConfig,
-    FaultsConfig,
-    LookaheadConfig,
-    ObservationConfig,
     PlannerConfig,
     RadarConfig,
-    RewardConfig,
     RobotConfig,
-    TargetsConfig,
     check_comm,
     check_faults,
     check_lookahead,
@@ -38,6 +40,14 @@ from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
 
 FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig}
 """Groups with settings that the scenario supplies where they are null."""
+CHECKS = {
+    "reward": check_reward,
+    "observation": lambda config: config,  # with the planner, where the env is made
+    "comm": check_comm,
+    "faults": check_faults,
+    "targets": check_targets,
+    "lookahead": check_lookahead,
+}
 PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
 
 
@@ -79,12 +89,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
             )
         if known:
             settings["planner"] = _resolve_planner(cfg, row)
-        settings["reward"] = asdict(check_reward(read(RewardConfig, cfg.reward)))
-        settings["observation"] = asdict(read(ObservationConfig, cfg.observation))
-        settings["comm"] = asdict(check_comm(read(CommConfig, cfg.comm)))
-        settings["faults"] = asdict(check_faults(read(FaultsConfig, cfg.faults)))
-        settings["targets"] = asdict(check_targets(read(TargetsConfig, cfg.targets)))
-        settings["lookahead"] = asdict(check_lookahead(read(LookaheadConfig, cfg.lookahead)))
+        settings |= {name: asdict(CHECKS[name](one)) for name, one in read_free_groups(cfg).items()}
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:

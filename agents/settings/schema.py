@@ -23,6 +23,7 @@ from maexp.envs.config import (
     CLEARANCE,
     PLANNERS,
     CommConfig,
+    EnvSettings,
     FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
@@ -32,7 +33,7 @@ from maexp.envs.config import (
     RobotConfig,
     TargetsConfig,
 )
-from maexp.envs.fields import explain, kinds, setting
+from maexp.envs.fields import explain, kinds, same, setting
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import SCENARIOS, Scenario
 
@@ -112,6 +113,15 @@ def helps(cls: type, settings: dict[str, Any], prefix: str = "") -> dict[str, st
     return found
 
 
+FREE_GROUPS = ("reward", "observation", "comm", "faults", "targets", "lookahead")
+"""Groups of `EnvSettings` in which a scenario supplies nothing."""
+
+
+def read_free_groups(cfg: DictConfig) -> dict[str, Any]:
+    """The settings of these groups as the objects that an env takes."""
+    return {name: read(kinds(EnvSettings)[name][0], cfg[name]) for name in FREE_GROUPS}
+
+
 RobotSettings = storable(RobotConfig, team=Any)  # team: a list of settings, one per robot
 ModelSettings = storable(ModelConfig)
 RadarSettings = storable(RadarConfig)
@@ -150,13 +160,9 @@ class ScenarioSettings(optional_settings(Scenario)):
     starts: str = setting(
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
     )
-    success_coverage: float = setting(
-        0.95, "share of the free points that ends an episode, up to 1; 0.99 with more macro_steps: to the end"
-    )
-    done: str = setting(
-        "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
-    )
-    collision: str = setting("centre", "of centres with walls and centres, or footprint: of oriented rectangles")
+    success_coverage: float = same(EnvSettings, "success_coverage")
+    done: str = same(EnvSettings, "done")
+    collision: str = same(EnvSettings, "collision")
     importing: ImportSettings = import_settings(robot_radius="${robot.radius}")
 
 
