@@ -68,7 +68,8 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     leave_out += ("preset", "tuning") * (verb != "train")
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
     left_out += HELD_OUT if {*HELD_OUT} & {*set_names(new)} else ()
-    kept, defaults = without(saved["overrides"], *left_out), []
+    said_anew = [name for name in set_names(new) if name not in GROUPS]  # the command to begin anew says it once
+    kept, defaults = without(saved["overrides"], *left_out, *said_anew), []
     followed = "planner.clearance_factor" in saved["followers"] and values["planner.name"] == "dwa"
     if followed and "planner" not in chosen:  # the paper's DWA: of a new scenario, too, that scenario's clearance
         defaults.append("planner.clearance_factor=${scenario.clearance_factor}")
