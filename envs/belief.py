@@ -197,6 +197,9 @@ class Beliefs(Branches):
     def _make_env(self, count: int) -> ExplorationEnv:
         return branch_env(self.origin, count, imagined_bank(self.origin, self.sizes, self.worlds), CommConfig())
 
+    def _source(self) -> dict[str, torch.Tensor]:
+        return self.origin.simulation.believed
+
     def _fill_tables(self) -> None:
         """For every true map what its imagined ones have one of, on the device."""
         sizes, true = self.sizes, self.origin.bank.arrays

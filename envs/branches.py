@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.bank import MapBank
-from maexp.envs.config import CommConfig, FaultsConfig, RadarConfig
+from maexp.envs.config import CommConfig, FaultsConfig, OdometryConfig, RadarConfig
 from maexp.kernels.state import STATE
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ OF_POINTS = ("seen_free", "seen_boundary", "viewers_free", "viewers_boundary", "
 NOT_COPIED = (
     "track", "starts", "seed", "map_id", "milestone_step", "milestone_overlap", "milestone_path", "path_length",
     "terms", "unscaled", "episode_reward", "base_sum", "worst_sum", "told_step", "connected",
-    "evidence_free", "evidence_boundary",
+    "evidence_free", "evidence_boundary", "odometry_error", "pose_estimate", "center_estimate",
 )  # fmt: skip
 """State that no branch needs, for nobody asks it for metrics, or that is its own."""
 
@@ -37,7 +37,8 @@ def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig 
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
         env.settings, num_envs=count, comm=comm, limited=limited,
-        faults=FaultsConfig(), radar=tuple(map(perfect, env.settings.radar)),  # nobody foresees what chance does
+        faults=FaultsConfig(), odometry=OdometryConfig(),  # nobody foresees what chance does
+        radar=tuple(map(perfect, env.settings.radar)),
         observation=replace(env.settings.observation, pictures=False),
     )  # fmt: skip
     made = ExplorationEnv.__new__(ExplorationEnv)
@@ -68,7 +69,7 @@ class Branches:
         self.one_world = True
         self.env = self._make_env(teams * copies)
         names = [name for name in STATE if name not in NOT_COPIED and name not in self._own]
-        self._copied = {name: (env.simulation.tensors[name], self.env.simulation.tensors[name]) for name in names}
+        self._copied = {name: (self._source()[name], self.env.simulation.tensors[name]) for name in names}
         self.env.simulation.tensors["seed"].copy_(env.simulation.tensors["seed"])
 
     _own: tuple[str, ...] = ()
@@ -76,6 +77,10 @@ class Branches:
 
     def _make_env(self, count: int) -> ExplorationEnv:
         return branch_env(self.origin, count, self.origin.bank)
+
+    def _source(self) -> dict[str, torch.Tensor]:
+        """State of the teams that branches take up."""
+        return self.origin.simulation.tensors
 
     def look(self, teams: torch.Tensor) -> None:
         """Take up what the teams know now: before `branch`."""

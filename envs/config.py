@@ -199,6 +199,22 @@ class FaultsConfig:
 
 
 @dataclass(frozen=True)
+class OdometryConfig:
+    """How far robots are from where they believe to be (docs/conditions.md): normal errors, whose spread grows with the
+    root of the way driven, and jumps."""
+
+    drift: float = setting(0.0, "spread of a robot's error along each axis after one metre", unit="m", low=0)
+    turn: float = setting(0.0, "the same of its heading", unit="rad", low=0)
+    jump: float = setting(0.0, "spread of a jump along each axis", unit="m", low=0)
+    jump_rate: float = setting(0.0, "how often a robot jumps", unit="1/s", low=0, high=10)
+
+    @property
+    def some(self) -> bool:
+        """Whether robots may be elsewhere than they believe."""
+        return self.drift > 0.0 or self.turn > 0.0 or self.jump > 0.0
+
+
+@dataclass(frozen=True)
 class TargetsConfig:
     """How robots share targets out, with any policy that chooses among them."""
 
@@ -263,6 +279,7 @@ class EnvSettings:
     observation: ObservationConfig = setting(ObservationConfig(), "what robots see")
     comm: CommConfig = setting(CommConfig(), "who hears whom")
     faults: FaultsConfig = setting(FaultsConfig(), "robots that fail")
+    odometry: OdometryConfig = setting(OdometryConfig(), "how far robots are from where they believe to be")
     targets: TargetsConfig = setting(TargetsConfig(), "how robots share targets out")
     lookahead: LookaheadConfig = setting(LookaheadConfig(), "how `policy=lookahead` plans")
     local_steps: int | None = setting(None, "control steps of 0.1 s in one `env.step`", low=1)
@@ -431,6 +448,17 @@ def check_faults(config: FaultsConfig, num_robots: int | None = None) -> FaultsC
             raise ValueError(f"faults.at: the moment of robot {robot}={seconds!r} must be 0 or more seconds")
         found[robot] = float(seconds)
     return replace(config, at=tuple(found.items()))
+
+
+def check_odometry(config: OdometryConfig) -> OdometryConfig:
+    """Check every value; jumps need a spread and a rate."""
+    check_settings(config, "odometry")
+    if (config.jump > 0.0) != (config.jump_rate > 0.0):
+        raise ValueError(
+            f"odometry.jump={config.jump:g} m and odometry.jump_rate={config.jump_rate:g} 1/s: jumps need both, "
+            "or neither"
+        )
+    return config
 
 
 def check_done(done: str, comm: CommConfig) -> str:

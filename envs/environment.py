@@ -266,6 +266,8 @@ class ExplorationEnv(EnvBase):
             info[f"reward_{term}"] = s["terms"][:, :, k].clone()
         if self.settings.faults.some:
             info["failed"] = s["failed"] != 0
+        if self.settings.odometry.some:
+            info["odometry_error"] = (self.simulation.believed["center"] - s["center"]).norm(dim=-1)
         return info | (self._radio_info(total) if self.settings.limited else {})
 
     def _radio_info(self, total: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -41,7 +41,8 @@ def episode_metrics(
         ``reward_variance`` is the population standard deviation over robots of the episode's reward without
         the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m],
         ``longest_path`` the way of the robot that drove farthest. Where communication is limited: `RADIO`,
-        ``connected`` and ``told_step_95``; where robots may fail: ``failed``, how many have at the end.
+        ``connected`` and ``told_step_95``; where robots may fail: ``failed``, how many have at the end; where
+        odometry drifts: ``odometry_error`` [m], how far robots then are from where they believe to be, on average.
         Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
@@ -58,6 +59,8 @@ def episode_metrics(
     metrics |= {name: info[name][:, 0] for name in RADIO if name in info}
     if "failed" in info:
         metrics["failed"] = info["failed"].sum(axis=1)
+    if "odometry_error" in info:
+        metrics["odometry_error"] = info["odometry_error"].mean(axis=1)
     if "connected" in info:
         metrics["connected"] = info["connected"].mean(axis=1)
         steps = info["told_step_95"][:, 0]

@@ -70,7 +70,7 @@ class Navigation:
         sim = env.simulation
         refuse_too_many(env.settings, navigation_bytes(env.settings, env.bank))
         self.envs: torch.Tensor | None = None
-        self._state, self.device = sim.tensors, env.device
+        self._state, self.device = sim.believed, env.device
         self.num_envs, self.num_robots = env.num_envs, env.num_robots
         self.launch = launch_on(env.device)
         nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
@@ -178,7 +178,7 @@ class Navigation:
 
     @property
     def state(self) -> dict[str, torch.Tensor] | Rows:
-        """The simulation's tensors."""
+        """The simulation's tensors, with the poses that robots believe to have."""
         return self._state if self.envs is None else Rows(self._state, self.envs)
 
     @property

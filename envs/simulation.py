@@ -133,7 +133,7 @@ def open_ground(bank: MapBank) -> torch.Tensor:
 
 def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
     """What a local step does."""
-    planner, comm, faults = settings.planner, settings.comm, settings.faults
+    planner, comm, faults, odometry = settings.planner, settings.comm, settings.faults, settings.odometry
     base = (math.inf, math.inf) if isinstance(comm.base_station, bool) else comm.base_station
     return Settings(
         planner=planner.name,
@@ -153,6 +153,11 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         faults=faults.some,
         fault_probability=faults.probability,
         fault_steps=max(1, round(min(faults.duration, 1e8) / DT)),
+        drifts=odometry.some,
+        odometry_drift=odometry.drift,
+        odometry_turn=odometry.turn,
+        odometry_jump=odometry.jump,
+        odometry_jump_rate=odometry.jump_rate,
         episode_steps=settings.episode_steps,
         done=DONE.index(settings.done) if settings.limited else 0,  # else all know the same
         draw_known=settings.observation.map == "known",
@@ -180,6 +185,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         limited=settings.limited,
         base_station=settings.comm.has_base,
         sensing=not perfect_radars(settings),
+        drifts=settings.odometry.some,
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robot),
     )
 

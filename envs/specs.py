@@ -53,6 +53,8 @@ def info_shapes(settings: EnvSettings) -> tuple[dict[str, torch.dtype], dict[str
         robot["connected"] = torch.float32
     if settings.faults.some:
         robot["failed"] = torch.bool
+    if settings.odometry.some:
+        robot["odometry_error"] = torch.float32
     return team, robot
 
 

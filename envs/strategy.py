@@ -78,7 +78,7 @@ class Strategy:
 
     def _look(self) -> None:
         """Bring the memory up to date: who is connected with whom now."""
-        self.sim = sim = self.env.simulation.tensors
+        self.sim = sim = self.env.simulation.believed
         s, n = self.state, self.robots
         self.step = sim["macro_step"].view(-1, 1)
         self.known = sim["known_weight"][:, :n]

@@ -234,7 +234,7 @@ def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> Non
         launch, _fit_clearance, "clearance",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
         path=paths.path, path_total=paths.path_total, path_used=paths.path_used,
-        clearance=wavefront.narrowed.clearance,
+        clearance=wavefront.narrowed.clearance, **shard.believed,
     )  # fmt: skip
 
 
@@ -244,5 +244,5 @@ def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     shard.call(
         launch, _hold_back, "waypoint",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        lead_time=settings.horizon * settings.dt,
+        lead_time=settings.horizon * settings.dt, **shard.believed,
     )  # fmt: skip

@@ -83,5 +83,5 @@ def plan(launch: Launch, shard: "Shard") -> None:
     robots = shard.robots if shard.wavefront is None else shard.wavefront.narrowed
     shard.call(
         launch, _plan_dwa, "error control nearby mates",
-        robots=robots, known_boundary=shard.known("boundary"),
+        robots=robots, known_boundary=shard.known("boundary"), **shard.believed,
     )  # fmt: skip

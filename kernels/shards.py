@@ -68,6 +68,12 @@ class Shard:
         prefix = "known" if self.settings.limited else "viewers"
         return getattr(self.view, f"{prefix}_{what}")
 
+    @property
+    def believed(self) -> dict[str, wp.array]:
+        """Poses and centres as robots believe them to be, for kernels that plan and observe."""
+        names = ("pose", "center")
+        return {name: getattr(self.view, f"{name}_estimate" if self.settings.drifts else name) for name in names}
+
     def call(
         self, launch: Launch, kernel: wp.Kernel, writes: str, dim: int | tuple[int, ...] | None = None, **given
     ) -> None:

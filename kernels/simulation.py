@@ -40,6 +40,11 @@ class Settings:
     faults: bool  # whether robots may fail
     fault_probability: float  # of each robot in an episode
     fault_steps: int  # how long that lasts
+    drifts: bool  # whether odometry does
+    odometry_drift: float  # [m/sqrt(m)]
+    odometry_turn: float  # [rad/sqrt(m)]
+    odometry_jump: float  # [m]
+    odometry_jump_rate: float  # [1/s]
     episode_steps: int  # local steps of an episode
     done: int  # whose coverage ends an episode (`radio.UNION`)
     draw_known: bool  # pictures show what robots know, not what they have seen
@@ -50,6 +55,8 @@ class Settings:
 
 class Simulation:
     """Thousands of teams, step by step.
+
+    ``tensors`` holds state and scratch by name; ``believed`` the same with the poses that robots believe to have.
 
     Args:
         maps: static data, every field of `Maps` as a torch tensor on ``device``.
@@ -94,6 +101,9 @@ class Simulation:
         self.radio, self.fault_at, self.sensing = radio, wp.from_torch(fault_at), sensing
         self.open_cells = None if open_cells is None else wp.from_torch(open_cells)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
+        self.believed = self.tensors
+        if settings.drifts:
+            self.believed = self.tensors | {name: self.tensors[f"{name}_estimate"] for name in ("pose", "center")}
         self.tensors["starts"].fill_(torch.inf)
         self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, device=self.device)
         self.map_starts_view = wp.from_torch(self.map_starts, dtype=wp.vec3)

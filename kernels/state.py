@@ -25,6 +25,7 @@ AXES = {
     "H": ("word", "as W where communication is limited, else 1"),
     "P": ("free", "as F where communication is limited, else 1"),
     "Q": ("boundary", "as B where communication is limited, else 1"),
+    "J": ("robot", "as N where odometry drifts, else 1"),
     "A": ("robot", "as N where radars miss returns, else 1"),
     "C": ("free", "as F where radars miss returns, else 1"),
     "I": ("boundary", "as B where radars miss returns, else 1"),
@@ -98,6 +99,11 @@ STATE = {
         "_clear_robots _fail_robots _move_robots _detect_collisions"),
     "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it",
         "_place_team _move_robots"),
+    "odometry_error": Field(wp.vec3, "E J", "m, m, rad", "what the robot takes its pose to be, less what it is: x, y,"
+        " heading of the reference point", "_drift_odometry _estimate_poses"),
+    "pose_estimate": Field(wp.vec4, "E J", "m, m, m/s, rad", "the pose that the robot believes to have, on the map",
+        "_estimate_poses"),
+    "center_estimate": Field(wp.vec3, "E J", "m", "where it believes its centre to be", "_estimate_poses"),
     "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
     "waypoint": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
         "_clear_robots _set_goal _pick_waypoint _hold_back _hold_turns"),
@@ -233,6 +239,7 @@ def axis_sizes(
     body_pixels: int = 1,
     base_station: bool = False,
     sensing: bool = False,
+    drifts: bool = False,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     radios = num_robots + base_station
@@ -240,6 +247,7 @@ def axis_sizes(
     return {
         "E": num_envs, "N": num_robots, "U": radios, "W": words, "F": max(free, 1), "B": max(boundary, 1),
         "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
+        "J": num_robots if drifts else 1,
         "A": num_robots if sensing else 1, "C": max(free, 1) if sensing else 1, "I": max(boundary, 1) if sensing else 1,
         "V": max(visible, 1), "K": max(occluders, 1),
         "O": max(nearby, 1), "G": body_pixels, "T": track, "R": len(REWARD_TERMS), "D": 3 * BINS,

@@ -12,6 +12,7 @@ from maexp.kernels.launches import Launch
 from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track
+from maexp.kernels.odometry import drift_odometry, estimate_poses
 from maexp.kernels.planner import plan
 from maexp.kernels.radio import note_links, place_base
 from maexp.kernels.reset import place_teams, start_episodes
@@ -22,13 +23,15 @@ from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 
 def local_step(launch: Launch, shard: Shard) -> None:
-    """Plan, fail, move, collide, scan, merge, reward, terminate, in the envs that are active."""
+    """Plan, fail, drift, move, collide, scan, merge, reward, terminate, in the envs that are active."""
     active = shard.view.active
     list_near(launch, shard, active)
     plan(launch, shard)
     fail_robots(launch, shard, active)
+    drift_odometry(launch, shard)
     move_robots(launch, shard)
     detect_collisions(launch, shard)
+    estimate_poses(launch, shard, active, begins=0)
     scan(launch, shard, active, ahead=1)
     merge_scan(launch, shard, active)
     share_maps(launch, shard, active)
@@ -53,6 +56,7 @@ def reset(launch: Launch, shard: Shard) -> None:
     place_teams(launch, shard)
     place_base(launch, shard)
     fail_robots(launch, shard, mask)
+    estimate_poses(launch, shard, mask, begins=1)
     list_near(launch, shard, mask)
     scan(launch, shard, mask, ahead=0)
     merge_scan(launch, shard, mask)

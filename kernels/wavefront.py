@@ -291,14 +291,15 @@ def find_paths(launch: Launch, shard: "Shard") -> None:
         s, own = shard.view, shard.wavefront
         own.known.paint(launch)
         own.passable.paint(launch)
-        own.paths.find(launch, s.active, s.collided, s.center, s.goal, s.waypoint)
+        own.paths.find(launch, s.active, s.collided, shard.believed["center"], s.goal, s.waypoint)
 
 
 def pick_waypoints(launch: Launch, shard: "Shard") -> None:
     """Bring `waypoint` and the clearances up to date, if the planner is `wavefront`: every local step."""
     if shard.wavefront is not None:
         s, own = shard.view, shard.wavefront
-        own.paths.pick(launch, s.active, s.collided, s.center, s.goal, shard.robots.radar_range, s.waypoint)
+        center = shard.believed["center"]
+        own.paths.pick(launch, s.active, s.collided, center, s.goal, shard.robots.radar_range, s.waypoint)
         fit_clearance(launch, shard, own)
         hold_back(launch, shard, own)
         hold_turns(launch, shard, own)

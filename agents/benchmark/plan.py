@@ -31,9 +31,9 @@ SUITES = {
     "held_out": "held-out maps", "trained": "training maps", "held_out_together": "held-out maps, starts together"
 }  # fmt: skip
 SECTIONS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "targets", "lookahead", "model",
-    "collector", "algorithm", "action", "tuning", "num_envs", "num_robots", "device", "total_frames",
-    "checkpoint_every", "checkpoint_keep", "num_threads",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
+    "lookahead", "model", "collector", "algorithm", "action", "tuning", "num_envs", "num_robots", "device",
+    "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
 )  # fmt: skip
 """Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
 OWN = ("scenario.name", "algorithm.name")  # each cell has its own

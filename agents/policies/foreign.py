@@ -86,7 +86,7 @@ class TeamSight:
         self.known_grids.paint(self.launch)
         self.known = wp.to_torch(self.known_grids.known).cpu().numpy().reshape(self.env.num_envs, self.rows, -1)
         names = ("map_id", "macro_step", "local_step", "active", "collided", "comm", "pose", "slip", "center")
-        self.now = now = {name: self.env.simulation.tensors[name].cpu().numpy() for name in names}
+        self.now = now = {name: self.env.simulation.believed[name].cpu().numpy() for name in names}
         begins = now["macro_step"] == 0
         self.poses[begins], self.velocities[begins] = np.nan, np.nan
         pose, slip = now["pose"].astype(np.float64), now["slip"].astype(np.float64)[..., None]
@@ -145,7 +145,7 @@ class TeamSight:
         Goals beyond the map are taken to its edge. A robot that stays has its own place as its goal.
         """
         points = torch.from_numpy(np.asarray(goals, np.float32)).to(self.env.device)
-        own = self.env.simulation.tensors["center"][..., :2]
+        own = self.env.simulation.believed["center"][..., :2]
         return to_action(self.env, torch.where(points.isnan().any(-1, keepdim=True), own, points))
 
 

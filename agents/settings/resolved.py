@@ -28,6 +28,7 @@ from maexp.envs.config import (
     check_comm,
     check_faults,
     check_lookahead,
+    check_odometry,
     check_reward,
     check_targets,
     complete_planner,
@@ -45,6 +46,7 @@ CHECKS = {
     "observation": lambda config: config,  # with the planner, where the env is made
     "comm": check_comm,
     "faults": check_faults,
+    "odometry": check_odometry,
     "targets": check_targets,
     "lookahead": check_lookahead,
 }

@@ -15,12 +15,12 @@ from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import schema
 
 GROUPS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "targets", "lookahead",
-    "algorithm", "model",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
+    "lookahead", "algorithm", "model",
 )  # fmt: skip
 PLAYED = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "targets", "lookahead",
-    "num_envs", "num_robots", "seed", "num_threads",
+    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
+    "lookahead", "num_envs", "num_robots", "seed", "num_threads",
 )  # fmt: skip
 """Settings that matter to who only plays."""
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb

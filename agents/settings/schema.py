@@ -27,6 +27,7 @@ from maexp.envs.config import (
     FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
+    OdometryConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
@@ -113,7 +114,7 @@ def helps(cls: type, settings: dict[str, Any], prefix: str = "") -> dict[str, st
     return found
 
 
-FREE_GROUPS = ("reward", "observation", "comm", "faults", "targets", "lookahead")
+FREE_GROUPS = ("reward", "observation", "comm", "faults", "odometry", "targets", "lookahead")
 """Groups of `EnvSettings` in which a scenario supplies nothing."""
 
 
@@ -130,6 +131,7 @@ RewardSettings = storable(RewardConfig)
 ObservationSettings = storable(ObservationConfig)
 CommSettings = storable(CommConfig)
 FaultsSettings = storable(FaultsConfig)
+OdometrySettings = storable(OdometryConfig)
 TargetsSettings = storable(TargetsConfig)
 LookaheadSettings = storable(LookaheadConfig)
 AlgorithmSettings = optional_settings(*{type(row.default): None for row in TUNINGS.values()})
@@ -206,6 +208,7 @@ class CommonSettings:
     observation: ObservationSettings = field(default_factory=ObservationSettings)
     comm: CommSettings = field(default_factory=CommSettings)
     faults: FaultsSettings = field(default_factory=FaultsSettings)
+    odometry: OdometrySettings = field(default_factory=OdometrySettings)
     targets: TargetsSettings = field(default_factory=TargetsSettings)
     lookahead: LookaheadSettings = field(default_factory=LookaheadSettings)
     num_envs: int = setting(32, "teams simulated at once")
