@@ -25,6 +25,7 @@ from maexp.envs.fields import check_settings, setting
 
 IR2 = ("comm=ir2",)
 BASE = (*IR2, "comm.base_station=true")
+ODOMETRY = ("odometry.drift=0.02", "odometry.turn=0.005")
 RADAR = ("radar.missed=0.5", "radar.evidence=3")
 CONDITIONS = {
     "perfect": (),
@@ -34,12 +35,13 @@ CONDITIONS = {
     "ir2_noise": (*IR2, "comm.noise=13"),
     "faults": ("faults.probability=0.5",),
     "radar": RADAR,
+    "odometry": ODOMETRY,
     "base": BASE,
     "base_return": (*BASE, "comm.strategy=return_to_base"),
     "base_rendezvous": (*BASE, "comm.strategy=rendezvous"),
     "base_relay": (*BASE, "comm.strategy=relay"),
     "base_pursuit": (*BASE, "comm.strategy=pursuit"),
-    "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5", *RADAR),
+    "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5", *RADAR, *ODOMETRY),
 }
 """Name -> words of `maexp evaluate`; the others are compared with the first."""
 METRICS = {
@@ -50,6 +52,7 @@ METRICS = {
     "told_step_95_censored": ("steps to all know 95 %", 1.0, 0),
     "mutual_overlap_85": ("overlap [%]", 100.0, 0),
     "connected": ("connected [%]", 100.0, 0),
+    "odometry_error": ("off [m]", 1.0, 2),
     "collisions": ("lost", 1.0, 2),
 }
 """Metric -> column, factor and digits."""

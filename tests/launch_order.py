@@ -97,7 +97,15 @@ def digest(*tensors: torch.Tensor) -> str:
 
 def setups() -> dict:
     """Name -> (settings of an env, policy); between them they launch every kernel of the simulation."""
-    from maexp.envs import CommConfig, FaultsConfig, ObservationConfig, PlannerConfig, RadarConfig, RobotConfig
+    from maexp.envs import (
+        CommConfig,
+        FaultsConfig,
+        ObservationConfig,
+        OdometryConfig,
+        PlannerConfig,
+        RadarConfig,
+        RobotConfig,
+    )
 
     near, sight = CommConfig(range=9.0), CommConfig(range=20.0, line_of_sight=True)
     base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, loss=0.2, base_station=True)
@@ -116,6 +124,9 @@ def setups() -> dict:
         "signals": (dict(planner=wavefront, comm=base, done="everyone", num_robots=6), "cost_utility"),
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
         "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
+        "odometry": (
+            dict(planner=wavefront, odometry=OdometryConfig(drift=0.2, turn=0.1, jump=0.5, jump_rate=1.0)), "hungarian"
+        ),
         "rollouts": (dict(planner=wavefront), "lookahead"),
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),

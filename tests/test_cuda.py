@@ -10,7 +10,7 @@ from worlds import room
 import maexp.kernels as mk
 from maexp.agents.policies import POLICIES
 from maexp.agents.training.collect import make_collector
-from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig, RadarConfig
+from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, OdometryConfig, PlannerConfig, RadarConfig
 
 gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: CPU and GPU are not compared")
 DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
@@ -76,6 +76,16 @@ def test_missed_returns_agree(device):
     torch.testing.assert_close(there["coverage"], here["coverage"], rtol=1e-3, atol=2e-3)
     first = play("cpu", "wavefront")["info", "coverage"][0]
     assert here["coverage"].max() > 0.2 and (here["coverage"][0] < first).all()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_odometry_agrees(device):
+    """How it drifts is drawn from the same keys."""
+    odometry = OdometryConfig(drift=0.1, turn=0.05, jump=0.5, jump_rate=0.5)
+    here, there = (play(one, "wavefront", odometry=odometry) for one in ("cpu", device))
+    for key in (("agents", "observation", "pose"), ("info", "odometry_error"), ("info", "coverage")):
+        torch.testing.assert_close(there[key], here[key], rtol=1e-3, atol=2e-3)
+    assert 0.1 < here["info", "odometry_error"][-1].mean() < 2.0
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -5,7 +5,15 @@ import torch
 from kernel_source import arguments, kernels, uses
 from worlds import act, room
 
-from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, ObservationConfig, PlannerConfig, RadarConfig
+from maexp.envs import (
+    CommConfig,
+    ExplorationEnv,
+    FaultsConfig,
+    ObservationConfig,
+    OdometryConfig,
+    PlannerConfig,
+    RadarConfig,
+)
 from maexp.envs.simulation import TRACK_LENGTH
 from maexp.envs.specs import REWARD_TERMS
 from maexp.kernels import step
@@ -23,7 +31,7 @@ def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=Non
         worlds or [room(22, 19)], num_envs=envs, num_robots=robots, local_steps=3, num_threads=1,
         planner=PlannerConfig(name=planner), comm=CommConfig(range=9.0, signal=True) if limited else None,
         observation=ObservationConfig(map="known"), faults=FaultsConfig(probability=0.5) if limited else None,
-        radar=RadarConfig(evidence=2) if limited else None,
+        radar=RadarConfig(evidence=2) if limited else None, odometry=OdometryConfig(drift=0.1) if limited else None,
     )  # fmt: skip
 
 
