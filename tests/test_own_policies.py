@@ -154,7 +154,7 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
         ("my_robots:no_offset", "policy my_robots.no_offset wrote no offset"),
         ("my_robots:wide", r"wrote a offset of shape \[1, 3, 1\]"),
         ("my_robots:floats", "wrote a region of float32"),
-        ("my_robots:beyond", "wrote region 64 to 64"),
+        ("my_robots:beyond", "wrote region 64, of 64 there are"),
         ("my_robots:not_finite", "wrote a offset that is NaN or infinite"),
         ("my_robots:divides", r"policy my_robots.divides raised ZeroDivisionError in my_robots.py, line \d+"),
         ("my_robots", "policy=my_robots is unknown: choose one of .*or module:function of your own"),

@@ -89,7 +89,7 @@ def _kinds(figure: Figure, coverage: dict[str, list]) -> list:
 
     have = {row[1] for rows in coverage.values() for row in rows}
     have |= {"paper"} if any(row[3] is not None for rows in coverage.values() for row in rows) else set()
-    labels = {"paper": "paper (same map trained and tested)"}
+    labels = {"paper": "paper (same map trained and tested)", "trained": "networks and policies of your own"}
     return [
         Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=5, label=labels.get(kind, kind),
                mfc="none" if kind == "paper" else colour)

@@ -180,7 +180,8 @@ class OwnPolicy:
             if head in whole and (value.is_floating_point() or value.dtype == torch.bool):
                 return f"wrote a {head} of {str(value.dtype).removeprefix('torch.')}"
             if head in whole and not bool(((value >= 0) & (value < whole[head])).all()):
-                return f"wrote {head} {int(value.min())} to {int(value.max())}"
+                wrong = value[(value < 0) | (value >= whole[head])]
+                return f"wrote {head} {int(wrong[0])}, of {whole[head]} there are"
             if head not in whole and not bool(value.isfinite().all()):
                 return f"wrote a {head} that is NaN or infinite"
         return ""

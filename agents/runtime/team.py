@@ -113,7 +113,7 @@ def _read_radius(radius, names: tuple) -> np.ndarray:
     values = [_numbers(one) for one in given]
     for name, one, value in zip(names, given, values, strict=True):
         if value is None or value.ndim or not 0.0 < value < 1e3:
-            raise ValueError(f"robot_radius: {name!r} has {one!r}, and it must be a number of metres above 0")
+            raise ValueError(f"robot_radius of robot {name!r} is {one!r}: give metres above 0")
     return np.array(values, np.float64).reshape(len(names))
 
 
