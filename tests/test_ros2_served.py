@@ -183,6 +183,21 @@ def test_a_clock_that_waits_runs_on_and_then_goes_on_with_what_there_is(served):
         assert policy.begin == 5 * 10**8 + GAP and policy.robots[0].goal is None, "time never goes back"
 
 
+def test_a_robot_that_has_collided_is_silent_and_not_waited_for(served):
+    env, policy, robots = served()
+    with policy:
+        env.reset()
+        env.simulation.tensors["collided"][0, 1] = 1
+        policy.sight.look()
+        policy._begin()
+        robots.send("robot1", 1.0, 1.0)
+        goals = policy._decide()
+    assert policy.idle == 0 and goals[0].tolist() == [1.0, 1.0] and np.isnan(goals[1]).all()
+    heard = robots.listen()
+    assert [one.child_frame_id for one in heard["/tf"][-1].transforms] == ["robot1/base_link"]
+    assert heard["/robot1/odom"] and not heard["/robot2/odom"]
+
+
 def test_robots_that_drive_are_not_waited_for_where_idle_ones_are(served):
     env, policy, robots = served(wait_for="idle")
     with policy:
