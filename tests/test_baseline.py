@@ -94,7 +94,8 @@ def test_the_command_compares_settings(tmp_path, monkeypatch, capsys):
     assert "random less old: +0.0 points of coverage over time [+0.0, +0.0]," in capsys.readouterr().out
     changes = json.loads((tmp_path / "same" / "changes.json").read_text())
     assert changes["nearest_frontier"]["path_length"]["mean"] == 0 and changes["baseline"]["folder"].endswith("old")
-    assert main([*TINY, "hydra.run.dir=slow", "baseline=old", "policy=random", "robot.max_speed=0.5"]) == 0
+    slow = ["evaluate", "policy=random", *TINY[2:], "robot.max_speed=0.5"]
+    assert main([*slow, "hydra.run.dir=slow", "baseline=old"]) == 0
     changes = json.loads((tmp_path / "slow" / "changes.json").read_text())
     assert set(changes) == {"random", "baseline"} and changes["random"]["path_length"]["ci95"][1] < 0
     capsys.readouterr()

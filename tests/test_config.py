@@ -96,7 +96,7 @@ def test_null_is_refused_where_it_means_nothing():
 
 def test_every_verb_composes():
     for verb in SCHEMAS:
-        words = ["task=list"] if verb in ("maps", "policies", "bench", "suite") else []
+        words = ["task=list"] if verb in ("maps", "policies", "bench", "suite", "ros2") else []
         assert compose_config(verb, words).hydra.run.dir.endswith(f"-{verb}")
 
 
