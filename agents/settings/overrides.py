@@ -55,7 +55,7 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         multirun: commas mean a sweep, so they are left alone
 
     Raises:
-        UserError: a bare word too many, one that is no override even when quoted, or a setting with two values.
+        UserError: a bare word too many, one that is no override even when quoted, or policies given twice.
     """
     names = list(positional)
     known = {*schema(verb).__dataclass_fields__, "hydra"}
@@ -75,17 +75,16 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         result.append(_make_override(verb, name, value, multirun))
     if several:
         result.append(f"{names[0].removesuffix('...')}=[{','.join(several)}]")
-    _check_once(result)
+    _check_once(verb, result)
     return result
 
 
-def _check_once(overrides: list[str]) -> None:
-    """Raise UserError for a setting with two values, one of which Hydra would drop without a word."""
-    first: dict[str, str] = {}
-    for word in overrides:
-        name = word.partition("=")[0]
-        if first.setdefault(name, word) != word:
-            raise UserError(f"{name} is given twice, {first[name]} and {word}: leave one out.")
+def _check_once(verb: str, overrides: list[str]) -> None:
+    """Raise UserError for `policy=a policy=b`, as if both played: of other settings the last counts."""
+    words = [word for word in overrides if verb == "evaluate" and word.startswith("policy=")]
+    if len(words) > 1:
+        values = ",".join(word.partition("=")[2].strip("[]") for word in words)
+        raise UserError(f"policy is given twice, {words[0]} and {words[1]}: write policy={values} to play them all.")
 
 
 def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
