@@ -4,7 +4,6 @@ import importlib.util
 import re
 import shlex
 import shutil
-import signal
 import sys
 from pathlib import Path
 
@@ -126,6 +125,11 @@ def small(line: str) -> list[str]:
     return [*words, *more]
 
 
+def interrupt(*_) -> None:
+    """What Ctrl-C comes to; a signal may be heard in a finalizer, where Python drops what it raises."""
+    raise KeyboardInterrupt
+
+
 def set_stage(words: list[str]) -> None:
     """Earlier commands of a page made what this one reads, and none made what it is to write."""
     mine = words[0] in ("suite", "leaderboard") and "outputs/mine" in "".join(words[2:])
@@ -142,7 +146,7 @@ def set_stage(words: list[str]) -> None:
         elif name == "resume" and place.name == "stopped_evaluation":
             shutil.rmtree(place, ignore_errors=True)
             with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(Progress, "advance", lambda *_: signal.raise_signal(signal.SIGINT))
+                patch.setattr(Progress, "advance", interrupt)
                 evaluate = ["evaluate", *SMALLER["evaluate"], *OWN_MAPS, "policy=random"]
                 assert main([*evaluate, f"hydra.run.dir={place}"]) == 130
         elif name == "resume" and place.name == "stopped_sweep":

@@ -207,7 +207,7 @@ BENCHMARK = [
 
 def test_a_full_disk_during_a_benchmark_names_the_cells(capfd):
     words = [*BENCHMARK, "episodes=300", "hydra.run.dir=b"]
-    with full_disk(7500):  # enough for the plan, too little for a cell's arrays; workers inherit the limit
+    with full_disk(10_000):  # enough for the plan, too little for a cell's arrays; workers inherit the limit
         assert main(["benchmark", *words]) in (1, 2)
     told = "".join(capfd.readouterr())
     assert told.count("free some space") > 1 and "2 cells are not done" in told
