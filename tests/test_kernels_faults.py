@@ -1,6 +1,5 @@
 """Robots that fail: when, what they do then, and that nobody knows before."""
 
-import pickle
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ import torch
 from oracle import faults
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
-from worlds import act, room
+from worlds import act, play_alike, room
 
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig
@@ -118,22 +117,8 @@ def test_a_mate_out_of_reach_may_have_failed(name):
 def test_failures_repeat_in_any_batch_from_a_saved_state_and_in_a_copy():
     some = FaultsConfig(probability=0.7, duration=1.5)
     small, large = make(some, envs=1), make(some, envs=3)
-    for env in (small, large):
-        env.set_episodes(torch.arange(4, 4 + env.num_envs))
-        env.reset()
-    generator, failed = torch.Generator().manual_seed(1), 0
-    for k in range(12):
-        if k == 6:
-            saved = small.state_dict()
-            small = pickle.loads(pickle.dumps(small))
-            small.load_state_dict(saved)
-        action = act(large, generator)
-        small.step(TensorDict({"agents": action["agents"][:1]}, [1]))
-        large.step(action)
-        for name in ("pose", "failed", "known_free"):
-            assert torch.equal(small.simulation.tensors[name][0], large.simulation.tensors[name][0]), name
-        failed += int(small.simulation.tensors["failed"].sum())
-    assert failed
+    teams = play_alike(small, large, 12, ("pose", "failed", "known_free"))
+    assert sum(int(env.simulation.tensors["failed"].sum()) for env in teams)
 
 
 def test_who_has_failed_does_not_keep_an_episode_from_its_end():

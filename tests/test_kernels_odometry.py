@@ -1,14 +1,13 @@
 """Odometry that drifts: the kernels against their definition, and robots that drive by what they believe."""
 
 import math
-import pickle
 
 import pytest
 import torch
 from oracle import odometry
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
-from worlds import act, room
+from worlds import act, play_alike, room
 
 from maexp.agents.policies import POLICIES
 from maexp.envs import (
@@ -157,21 +156,8 @@ def test_nobody_foresees_the_drift():
 
 
 def test_errors_repeat_in_any_batch_from_a_saved_state_and_in_a_copy():
-    small, large = make(SOME, envs=1), make(SOME, envs=3)
-    for env in (small, large):
-        env.set_episodes(torch.arange(4, 4 + env.num_envs))
-        env.reset()
-    generator = torch.Generator().manual_seed(1)
-    for k in range(8):
-        if k == 4:
-            saved = small.state_dict()
-            small = pickle.loads(pickle.dumps(small))
-            small.load_state_dict(saved)
-        action = act(large, generator)
-        small.step(TensorDict({"agents": action["agents"][:1]}, [1]))
-        large.step(action)
-        for name in ("pose", "pose_estimate", "center_estimate", "odometry_error"):
-            assert torch.equal(small.simulation.tensors[name][0], large.simulation.tensors[name][0]), name
+    names = ("pose", "pose_estimate", "center_estimate", "odometry_error")
+    *_, small = play_alike(make(SOME, envs=1), make(SOME, envs=3), 8, names)
     assert small.simulation.tensors["odometry_error"].abs().max() > 0.05
     small.reset()
     assert not small.simulation.tensors["odometry_error"].any()

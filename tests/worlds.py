@@ -1,10 +1,12 @@
 """Small worlds for kernel tests: clouds on a lattice, jittered or rotated, and what an env holds of a moment."""
 
 import math
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from maexp.envs import ExplorationEnv, PointCloudMap
 from maexp.kernels import unpack_flags
@@ -76,6 +78,27 @@ def act(env: ExplorationEnv, generator: torch.Generator):
     td["agents", "action", "region"] = torch.randint(64, (e, n), generator=generator)
     td["agents", "action", "offset"] = torch.rand(e, n, 2, generator=generator) * 2.0 - 1.0
     return td
+
+
+def play_alike(small: ExplorationEnv, large: ExplorationEnv, steps: int, names: tuple[str, ...]):
+    """Episode 4 of a batch of one and of a larger batch with the same random actions; yields the small env after every
+    step, once `names` of its state are found to be the same bits. Halfway it is replaced by a pickled copy with its
+    saved state."""
+    for env in (small, large):
+        env.set_episodes(torch.arange(4, 4 + env.num_envs))
+        env.reset()
+    generator = torch.Generator().manual_seed(1)
+    for k in range(steps):
+        if k == steps // 2:
+            saved = small.state_dict()
+            small = pickle.loads(pickle.dumps(small))
+            small.load_state_dict(saved)
+        action = act(large, generator)
+        small.step(TensorDict({"agents": action["agents"][:1]}, [1]))
+        large.step(action)
+        for name in names:
+            assert torch.equal(small.simulation.tensors[name][0], large.simulation.tensors[name][0]), name
+        yield small
 
 
 def ways_to_blocks(nav) -> torch.Tensor:
