@@ -10,18 +10,55 @@ import itertools
 import logging
 import sys
 import time
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import get_origin
 
 import numpy as np
 
 from maexp.agents.runtime import CHOICES, TeamPlanner, shipped_names
 from maexp.agents.runtime.floors import make_floor, place_team, read_floor
 from maexp.agents.runtime.simulate import MARKS, Course, Floor, explore
+from maexp.envs.config import TargetsConfig
+from maexp.envs.fields import check_value, explain, kinds, replaced, same, setting
 
 ROOM = 8.0  # side of a room of our own floors [m]
 
 
-def measure(given: argparse.Namespace) -> None:
+@dataclass(frozen=True)
+class MeasureSettings:
+    """`python -m maexp.agents.runtime`."""
+
+    metres: float = setting(50.0, "side of the floor", unit="m", above=0)
+    resolution: float = setting(0.1, "edge of a cell, at least", unit="m", above=0)
+    robots: int = setting(3, "of the team", low=1)
+    calls: int = setting(10, "plans for each planner", low=1)
+
+
+@dataclass(frozen=True)
+class SimulateSettings:
+    """`python -m maexp.agents.runtime simulate`."""
+
+    floor: list[str] = setting([], "map_server yamls; default: rooms of our own")
+    metres: float = replaced(MeasureSettings, "metres", 24.0)
+    resolution: float = same(MeasureSettings, "resolution")
+    robots: int = same(MeasureSettings, "robots")
+    policy: str = setting("cost_utility", "one or several: cost_utility,universal")
+    start: tuple[float, float] | None = setting(None, "x y [m] that the team begins near; default: drawn")
+    radius: float = setting(0.35, "of a robot", unit="m", above=0)
+    range: float = setting(6.0, "of its lidar", unit="m", above=0)
+    speed: float = setting(0.6, "of a robot", unit="m/s", above=0)
+    seconds: float = setting(1800.0, "broken off after so many", unit="s", above=0)
+    seed: int = setting(0, "of starts and of choices at random", low=0)
+    runs: int = setting(1, "from so many places, one seed after the other", low=1)
+    spare: str = same(TargetsConfig, "spare")
+    together: bool = setting(False, "robots may share a target")
+    compare: bool = setting(False, "each run both ways, and a table of the differences")
+    notes: bool = setting(False, "print what the planner says")
+    picture: str | None = setting(None, "file to draw the last run in (.png), with its axes in metres")
+
+
+def measure(given: MeasureSettings) -> None:
     """Print milliseconds a plan, the middle and the longest of several, in processor time of one core."""
     grid = make_floor(round(given.metres / given.resolution))
     grid[:, 2 * len(grid) // 3 :] = -1  # not known yet
@@ -37,7 +74,7 @@ def measure(given: argparse.Namespace) -> None:
         print(f"{name:<18}{np.median(spent):7.0f} ms, at most {max(spent):.0f} ms, {len(plan.targets)} targets")
 
 
-def simulate(given: argparse.Namespace) -> None:
+def simulate(given: SimulateSettings) -> None:
     """Print how a team explores floors: one line for each policy and run, with --compare a table of each policy."""
     logging.getLogger("maexp.runtime").setLevel(logging.INFO if given.notes else logging.ERROR)
     courses: dict[tuple[str, bool], list[Course]] = {}
@@ -47,7 +84,7 @@ def simulate(given: argparse.Namespace) -> None:
         print(f"{name or 'rooms'}: {size}; {given.robots} robots of {given.radius:g} m start together")
         seeds = range(given.seed, given.seed + given.runs)
         for policy, seed in itertools.product(given.policy.split(","), seeds):
-            for distinct in (True, False) if given.compare else (given.distinct,):
+            for distinct in (True, False) if given.compare else (not given.together,):
                 course = run(given, grid, cell, policy, seed, distinct)
                 courses.setdefault((policy, distinct), []).append(course)
     if given.compare:
@@ -55,7 +92,7 @@ def simulate(given: argparse.Namespace) -> None:
             print(compare(policy, courses[policy, True], courses[policy, False], given.seconds))
 
 
-def open_floor(given: argparse.Namespace, name: str | None) -> tuple[np.ndarray, float]:
+def open_floor(given: SimulateSettings, name: str | None) -> tuple[np.ndarray, float]:
     """Its grid and the edge of a cell [m]; None: rooms of our own."""
     if name is not None:
         return read_floor(name, given.resolution)
@@ -63,7 +100,7 @@ def open_floor(given: argparse.Namespace, name: str | None) -> tuple[np.ndarray,
     return make_floor(round(given.metres / cell), round(ROOM / cell), max(round(1.0 / cell), 1)), cell
 
 
-def run(given: argparse.Namespace, grid: np.ndarray, cell: float, policy: str, seed: int, distinct: bool) -> Course:
+def run(given: SimulateSettings, grid: np.ndarray, cell: float, policy: str, seed: int, distinct: bool) -> Course:
     """One exploration, told in a line."""
     first = np.random.default_rng(seed) if given.start is None else np.array(given.start)
     places = place_team(grid, cell, given.radius, given.robots, first)
@@ -132,59 +169,47 @@ def draw(path: str, floor: Floor, course: Course, policy: str) -> None:
     FigureCanvasAgg(figure).print_png(path)
 
 
-def read_words(words: list[str]) -> argparse.Namespace:
-    """The command line."""
+def read_words(words: list[str]) -> MeasureSettings | SimulateSettings:
+    """The command line; ends with a sentence for what is out of its range, or a picture that cannot be written."""
     simulates = bool(words) and words[0] == "simulate"
     parser = argparse.ArgumentParser(
         prog="python -m maexp.agents.runtime" + " simulate" * simulates,
         description=simulate.__doc__ if simulates else __doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--metres", type=float, default=24.0 if simulates else 50.0, help="side of the floor [m]")
-    parser.add_argument("--resolution", type=float, default=0.1, help="edge of a cell, at least [m]")
-    parser.add_argument("--robots", type=int, default=3)
-    if simulates:
-        parser.add_argument("floor", nargs="*", help="map_server yamls; default: rooms of our own")
-        parser.add_argument("--policy", default="cost_utility", help="one or several: cost_utility,universal")
-        parser.add_argument("--start", type=float, nargs=2, help="x y [m] that the team begins near; default: drawn")
-        parser.add_argument("--radius", type=float, default=0.35, help="of a robot [m]")
-        parser.add_argument("--range", type=float, default=6.0, help="of its lidar [m]")
-        parser.add_argument("--speed", type=float, default=0.6, help="[m/s]")
-        parser.add_argument("--seconds", type=float, default=1800.0, help="broken off after so many")
-        parser.add_argument("--seed", type=int, default=0, help="of starts and of choices at random")
-        parser.add_argument("--runs", type=int, default=1, help="from so many places, one seed after the other")
-        parser.add_argument("--spare", default="wait", help="robots without a target: wait, or home")
-        parser.add_argument("--together", dest="distinct", action="store_false", help="robots may share a target")
-        parser.add_argument("--compare", action="store_true", help="each run both ways, and a table of the differences")
-        parser.add_argument("--notes", action="store_true", help="print what the planner says")
-        parser.add_argument("--picture", help="file to draw the last run in (.png), with its axes in metres")
-    else:
-        parser.add_argument("--calls", type=int, default=10, help="plans for each planner")
-    given = parser.parse_args(words[1:] if simulates else words)
-    _check(parser, given)
-    given.run = simulate if simulates else measure
-    return given
-
-
-def _check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """End with a sentence for a number that is out of its range, or a picture that cannot be written."""
-    for name in ("metres", "resolution", "radius", "range", "speed", "seconds"):
-        value = getattr(given, name, 1.0)
-        if not 0.0 < value < np.inf:
-            parser.error(f"--{name} {value:g} must be more than 0")
-    for name in ("robots", "runs", "calls"):
-        if getattr(given, name, 1) < 1:
-            parser.error(f"--{name} {getattr(given, name)} must be 1 or more")
-    picture = Path(getattr(given, "picture", None) or "x.png")
+    kind = SimulateSettings if simulates else MeasureSettings
+    add_settings(parser, kind)
+    given = vars(parser.parse_args(words[simulates:]))
+    try:
+        for one in fields(kind):
+            check_value(f"--{one.name}", given[one.name], kinds(kind)[one.name], one.metadata)
+    except ValueError as error:
+        parser.error(str(error))
+    picture = Path(given.get("picture") or "x.png")
     if picture.suffix != ".png" or not picture.parent.is_dir():
-        parser.error(f"--picture {picture} must be a .png file in a folder that is there")
+        parser.error(f"--picture={picture} must be a .png file in a folder that is there")
+    return kind(**given)
+
+
+def add_settings(parser: argparse.ArgumentParser, kind: type) -> None:
+    """An argument for each setting of a dataclass: a list stands by itself, the others are named."""
+    for one in fields(kind):
+        of, default = kinds(kind)[one.name][0], None if one.default is MISSING else one.default
+        told = explain(one.metadata) + (f"; default: {default}" if default else "")
+        if get_origin(of) is list:
+            parser.add_argument(one.name, nargs="*", help=told)
+        elif of is bool:
+            parser.add_argument(f"--{one.name}", action="store_true", help=told)
+        else:
+            reads = {"type": float, "nargs": 2} if get_origin(of) is tuple else {"type": of}
+            parser.add_argument(f"--{one.name}", default=default, help=told, **reads)
 
 
 def main() -> None:
     """Do what the command line says; what cannot be done is one sentence."""
     given = read_words(sys.argv[1:])
     try:
-        given.run(given)
+        simulate(given) if isinstance(given, SimulateSettings) else measure(given)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
 
