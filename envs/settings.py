@@ -8,31 +8,14 @@ import numpy as np
 import torch
 
 from maexp.envs.config import (
+    GROUPS,
     CommConfig,
     EnvSettings,
     FaultsConfig,
-    LookaheadConfig,
     ObservationConfig,
-    OdometryConfig,
     PlannerConfig,
     RadarConfig,
-    RewardConfig,
     RobotConfig,
-    TargetsConfig,
-    check_comm,
-    check_done,
-    check_faults,
-    check_lookahead,
-    check_observation,
-    check_odometry,
-    check_reward,
-    check_strategy,
-    check_targets,
-    complete_planner,
-    complete_radar,
-    complete_robot,
-    one_config,
-    per_robot,
 )
 from maexp.envs.fields import check_settings
 from maexp.envs.map import MapError, PointCloudMap
@@ -65,22 +48,27 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
         )
     scenario, device = find_scenario(maps[0].scenario), _device(settings.device)
     local_steps = int(scenario.local_steps if settings.local_steps is None else settings.local_steps)
-    robots = tuple(complete_robot(r, scenario) for r in per_robot("robot", settings.robot, RobotConfig, num_robots))
-    radars = tuple(complete_radar(r, scenario) for r in per_robot("radar", settings.radar, RadarConfig, num_robots))
+    robots, radars = (
+        tuple(one.completed(scenario) for one in per_robot(name, getattr(settings, name), kind, num_robots))
+        for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
+    )
     macro_steps = settings.macro_steps
     if macro_steps is None:
         team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
         macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario, team, local_steps)
     check_bodies(maps, robots)
-    planner = complete_planner(one_config("planner", settings.planner, PlannerConfig), scenario)
-    observation = one_config("observation", settings.observation, ObservationConfig)
-    check_observation(observation, planner)
-    comm = check_comm(one_config("comm", settings.comm, CommConfig))
-    check_strategy(comm, num_robots, planner)
+    groups = {
+        name: one_config(name, getattr(settings, name), kind).completed(scenario)
+        for name, kind in GROUPS.items()
+        if name not in ("robot", "radar")
+    }
+    comm, faults = groups["comm"], groups["faults"]
+    check_observation(groups["observation"], groups["planner"])
+    check_strategy(comm, num_robots, groups["planner"])
     check_base(maps, comm)
     check_noise(maps, radars)
     check_done(settings.done, comm)
-    faults = check_faults(one_config("faults", settings.faults, FaultsConfig), num_robots)
+    check_failing(faults, num_robots)
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
     return replace(
         settings,
@@ -95,15 +83,8 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
         success_coverage=float(settings.success_coverage),
         robot=robots,
         radar=radars,
-        planner=planner,
-        reward=check_reward(one_config("reward", settings.reward, RewardConfig)),
-        observation=observation,
-        comm=comm,
-        faults=faults,
-        odometry=check_odometry(one_config("odometry", settings.odometry, OdometryConfig)),
         limited=settings.limited or comm.limited or faults.some,
-        targets=check_targets(one_config("targets", settings.targets, TargetsConfig)),
-        lookahead=check_lookahead(one_config("lookahead", settings.lookahead, LookaheadConfig)),
+        **groups,
     )
 
 
@@ -144,6 +125,62 @@ def check_noise(maps: Sequence[PointCloudMap], radars: Sequence[RadarConfig]) ->
                     f"radar.noise={radar.noise:g} m leaves fewer than one return in {1 / LEAST_RETURNS:.0f} on map "
                     f"{m.name}, whose points are {m.resolution:g} m apart: lower it, or use a coarser map"
                 )
+
+
+def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None:
+    """Raise ValueError if targets are shown to a policy that steers."""
+    if config.targets and planner.name == "direct":
+        raise ValueError(
+            f"planner=direct takes controls, observation.targets={config.targets} shows goals: add action=regions"
+        )
+
+
+def check_strategy(config: CommConfig, num_robots: int, planner: PlannerConfig) -> None:
+    """Raise ValueError if the team, its radios or its planner do not go with `comm.strategy`."""
+    name = config.strategy
+    if name == "opportunistic":
+        return
+    if planner.name != "wavefront":
+        raise ValueError(f"comm.strategy={name} sends robots back: planner={planner.name} finds no way, use wavefront")
+    if not config.limited:
+        raise ValueError(f"comm.strategy={name} is for radios that do not reach: add comm=ir2, comm.range or the like")
+    if name in ("relay", "return_to_base") and not config.has_base:
+        raise ValueError(f"comm.strategy={name} needs a base station: add comm.base_station=true")
+    if name == "relay" and num_robots < 2:
+        raise ValueError(f"comm.strategy=relay needs an explorer and a relay: num_robots={num_robots}, give 2 or more")
+
+
+def check_done(done: str, comm: CommConfig) -> None:
+    """Raise ValueError unless whose coverage ends an episode is there."""
+    if done == "base" and not comm.has_base:
+        raise ValueError("done='base' needs a base station: add comm.base_station=true")
+
+
+def check_failing(config: FaultsConfig, num_robots: int) -> None:
+    """Raise ValueError if a robot fails that is not there."""
+    for robot, _ in config.at:
+        if robot >= num_robots:
+            last = num_robots - 1
+            raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")
+
+
+def per_robot(what: str, config, kind: type, count: int) -> list:
+    """One config per robot from a single one or a list of ``count``."""
+    if config is None:
+        return [kind()] * count
+    if isinstance(config, kind):
+        return [config] * count
+    if isinstance(config, Sequence) and len(config) == count and all(isinstance(c, kind) for c in config):
+        return list(config)
+    size = f"a list of {len(config)}" if isinstance(config, Sequence) else repr(config)
+    raise ValueError(f"{what}={size}: give one {kind.__name__} or a list of num_robots={count} of them")
+
+
+def one_config(what: str, config, kind: type):
+    """The config given, or one of defaults."""
+    if config is not None and not isinstance(config, kind):
+        raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
+    return config or kind()
 
 
 def positive_count(name: str, value: int) -> int:

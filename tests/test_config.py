@@ -15,14 +15,7 @@ from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
 from maexp.agents.settings.resolved import planner_config
 from maexp.agents.settings.schema import SCHEMAS, schema
-from maexp.envs.config import (
-    PlannerConfig,
-    RadarConfig,
-    RobotConfig,
-    complete_planner,
-    complete_radar,
-    complete_robot,
-)
+from maexp.envs.config import PlannerConfig, RadarConfig, RobotConfig
 from maexp.envs.scenarios import SCENARIOS
 
 
@@ -71,10 +64,10 @@ def test_a_tuning_holds_the_settings_of_its_row(algorithm):
 def test_the_command_line_takes_what_the_env_takes_by_itself(scenario, planner):
     cfg, row = compose_config("train", [*REGIONS, f"scenario={scenario}", f"planner={planner}"]), SCENARIOS[scenario]
     robot, radar = team_configs(cfg, 1)
-    assert complete_robot(robot, row) == complete_robot(RobotConfig(), row)
-    assert complete_radar(radar, row) == complete_radar(RadarConfig(), row)
-    whole = complete_planner(PlannerConfig(name=planner), row)
-    assert complete_planner(planner_config(cfg, row), row) == whole
+    assert robot.completed(row) == RobotConfig().completed(row)
+    assert radar.completed(row) == RadarConfig().completed(row)
+    whole = PlannerConfig(name=planner).completed(row)
+    assert planner_config(cfg, row).completed(row) == whole
 
 
 def test_every_setting_of_a_file_differs_from_its_default():

@@ -186,7 +186,7 @@ def test_the_table_of_extending_counts_the_files(what, number):
     page = (ROOT / "docs/extending.md").read_text()
     files = re.findall(r"^\+\+\+ b/(\S+)", blocks("docs/extending.md", "diff")[number], re.MULTILINE)
     assert int(re.search(rf"\(#{what}\) \| (\d)", page)[1]) == len(files) == len(set(files))
-    assert what != "a-reward-term" or files == ["envs/config.py", "kernels/reward.py"]
+    assert what != "a-reward-term" or files == ["envs/config/reward.py", "kernels/reward.py"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

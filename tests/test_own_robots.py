@@ -14,7 +14,6 @@ from maexp.agents.build import team_configs
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import describe_radius, resolve
 from maexp.envs import ExplorationEnv, MapError, RadarConfig, RobotConfig
-from maexp.envs.config import complete_robot
 from maexp.envs.render import draw_teams
 from maexp.envs.scenarios import SCENARIOS, default_macro_steps
 from maexp.envs.viewing.quads import make_quads
@@ -70,9 +69,9 @@ def test_a_radius_stands_for_the_sizes_of_the_body():
                           for body in ({"radius": 0.35}, ROUND))  # fmt: skip
     tensors = round_one.simulation.robot_tensors, by_hand.simulation.robot_tensors
     assert all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[1])
-    again = complete_robot(round_one.robot_configs[0], ROW)
+    again = round_one.robot_configs[0].completed(ROW)
     assert again == round_one.robot_configs[0] and again.wheelbase == 0.7
-    assert complete_robot(RobotConfig(radius=0.35, **ROUND), ROW).length == 0.7, "the same said twice"
+    assert RobotConfig(radius=0.35, **ROUND).completed(ROW).length == 0.7, "the same said twice"
 
 
 @pytest.mark.parametrize(("body", "told"), [
@@ -94,15 +93,15 @@ def test_a_radius_in_settings():
     words = ["scenario=maze", "robot.radius=0.35", "robot=differential"]
     cfg = compose_config("train", words)
     robot, _ = team_configs(cfg, 3)
-    assert complete_robot(robot, SCENARIOS["maze"]) == complete_robot(
-        RobotConfig("differential", radius=0.35), SCENARIOS["maze"])  # fmt: skip
+    maze = SCENARIOS["maze"]
+    assert robot.completed(maze) == RobotConfig("differential", radius=0.35).completed(maze)
     shown = resolve(cfg)["robot"]
     assert shown.items() >= (ROUND | {"radius": 0.35, "wheelbase": 0.7, "max_speed": 8.0}).items()
     assert describe_radius(cfg).startswith("robot.radius=0.35: round, 0.7 m across; collides")
     with pytest.raises(ValueError, match=r"robot\.radius=0\.35 makes robot\.width 0\.7 m, and 0\.5 is given"):
         resolve(compose_config("train", [*words, "robot.width=0.5"]))
     mixed = compose_config("train", ["scenario=maze", "robot.team=[{radius: 0.35}, {}]"])
-    small, car = (complete_robot(one, SCENARIOS["maze"]) for one in team_configs(mixed, 2)[0])
+    small, car = (one.completed(SCENARIOS["maze"]) for one in team_configs(mixed, 2)[0])
     assert (small.width, small.collision_threshold) == (0.7, 0.35) and (car.width, car.radius) == (1.0, None)
     assert "radius" not in resolve(mixed)["robot"]["team"][1] and describe_radius(mixed) is None
     own = compose_config("train", ["scenario=pointcloud", "scenario.path=x.yaml", "robot.radius=0.35"])

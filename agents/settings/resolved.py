@@ -20,36 +20,12 @@ from maexp.agents.settings.schema import (
     read_free_groups,
     schema,
 )
-from maexp.envs.config import (
-    BODY,
-    PlannerConfig,
-    RadarConfig,
-    RobotConfig,
-    check_comm,
-    check_faults,
-    check_lookahead,
-    check_odometry,
-    check_reward,
-    check_targets,
-    complete_planner,
-    complete_radar,
-    complete_robot,
-    supplied,
-)
+from maexp.envs.config import BODY, PlannerConfig, RadarConfig, RobotConfig, supplied
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
 
 FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig}
 """Groups with settings that the scenario supplies where they are null."""
-CHECKS = {
-    "reward": check_reward,
-    "observation": lambda config: config,  # with the planner, where the env is made
-    "comm": check_comm,
-    "faults": check_faults,
-    "odometry": check_odometry,
-    "targets": check_targets,
-    "lookahead": check_lookahead,
-}
 PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
 
 
@@ -83,7 +59,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         known = maps is not None or row.build is not None
         if known:
             settings["robot"] |= _resolve_robot(cfg, row)
-            settings["radar"] = asdict(complete_radar(read(RadarConfig, cfg.radar), row))
+            settings["radar"] = asdict(read(RadarConfig, cfg.radar).completed(row))
         settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
         if maps and not settings["scenario"]["macro_steps"]:
             settings["scenario"]["macro_steps"] = default_macro_steps(
@@ -91,7 +67,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
             )
         if known:
             settings["planner"] = _resolve_planner(cfg, row)
-        settings |= {name: asdict(CHECKS[name](one)) for name, one in read_free_groups(cfg).items()}
+        settings |= {name: asdict(one.checked()) for name, one in read_free_groups(cfg).items()}
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -129,9 +105,9 @@ def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
     team = []
     for entry in plain_value(cfg.robot.team) or []:
-        seen = complete_radar(read(RadarConfig, cfg.radar, **entry.get("radar", {})), row)
-        team.append(_without_null(asdict(complete_robot(robot_config(cfg, entry), row))) | {"radar": asdict(seen)})
-    return asdict(complete_robot(robot_config(cfg), row)) | {"team": team or None}
+        seen = read(RadarConfig, cfg.radar, **entry.get("radar", {})).completed(row)
+        team.append(_without_null(asdict(robot_config(cfg, entry).completed(row))) | {"radar": asdict(seen)})
+    return asdict(robot_config(cfg).completed(row)) | {"team": team or None}
 
 
 def robot_config(cfg: CommonSettings, entry: dict[str, Any] | None = None) -> RobotConfig:
@@ -150,7 +126,7 @@ def describe_radius(cfg: DictConfig) -> str | None:
     """A line of what `robot.radius` came to; None where no robot of an env is round."""
     if "scenario" not in cfg or cfg.robot.radius is None:
         return None
-    robot = complete_robot(robot_config(cfg), find_scenario(cfg.scenario.name))
+    robot = robot_config(cfg).completed(find_scenario(cfg.scenario.name))
     told = (
         f"robot.radius={robot.radius:g}: round, {robot.length:g} m across; collides with walls {robot.radius:g} m from "
         "its centre"
@@ -167,7 +143,7 @@ def planner_config(cfg: CommonSettings, row: Scenario) -> PlannerConfig:
 
 
 def _resolve_planner(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
-    return _own_planner(asdict(complete_planner(planner_config(cfg, row), row)))
+    return _own_planner(asdict(planner_config(cfg, row).completed(row)))
 
 
 def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:

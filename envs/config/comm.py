@@ -1,0 +1,80 @@
+"""Communication: who hears whom, and what robots do to tell others what they know."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from maexp.envs.fields import setting, words_of
+
+from .group import Group
+
+SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
+CELLS_OF_RADAR = 80  # that IR2's sensor reaches
+
+
+@dataclass(frozen=True)
+class CommConfig(Group):
+    """Who hears whom (docs/conditions.md).
+
+    Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
+    (`maexp.kernels.radio`). ``strategy`` is what robots do to tell others what they know, whatever their policy
+    (`maexp.envs.strategy`): nothing but to talk when they meet (``opportunistic``), or to report or meet every
+    ``period`` decisions. A base station is a radio with a map of its own.
+    """
+
+    group = "comm"
+
+    range: float = setting(math.inf, "of a radio; inf: everyone hears everyone", unit="m", low=0, infinite=True)
+    line_of_sight: bool = setting(False, "walls between two robots part them")
+    signal: bool = setting(False, "robots hear those whose signal arrives")
+    power: float = setting(-20.0, "that signals are sent with", unit="dBm")
+    threshold: float = setting(-70.0, "that has to arrive, and more, for a link", unit="dBm")
+    cell: float | Literal["auto"] = setting(
+        "auto", "edge of a cell of the signal's model; auto: an 80th of the greatest radar range", unit="m", above=0
+    )
+    noise: float = setting(
+        0.0, "greatest fading of each part of the loss, drawn for every pair and moment", unit="dB", low=0
+    )
+    loss: float = setting(0.0, "probability that two radios miss each other in a step of 0.1 s", low=0, high=1)
+    base_station: bool | tuple[float, float] = setting(
+        False, "true: a radio with a map of its own where robot 0 starts; or a place [x, y]", unit="m"
+    )
+    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = setting(
+        "opportunistic", "what robots do to tell others what they know (docs/conditions.md)"
+    )
+    period: int = setting(8, "decisions between two reports or meetings", low=1)
+
+    @property
+    def limited(self) -> bool:
+        """Whether robots may know different things."""
+        return self.line_of_sight or math.isfinite(self.range) or self.signal or self.loss > 0.0 or self.has_base
+
+    @property
+    def has_base(self) -> bool:
+        """Whether there is a base station."""
+        return self.base_station is not False
+
+    def checked(self) -> "CommConfig":
+        """A signal must be able to arrive; a place becomes a tuple."""
+        super().checked()
+        if self.signal and self.threshold >= self.power - SIGNAL_LOSS:
+            raise ValueError(
+                f"comm.threshold={self.threshold:g} dBm is out of reach: of comm.power={self.power:g} dBm "
+                f"{self.power - SIGNAL_LOSS:g} arrive at best, and nobody would ever hear anybody; lower the "
+                "threshold, or use comm.range=0 if that is meant"
+            )
+        return replace(self, base_station=_check_base(self.base_station))
+
+
+def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:
+    if isinstance(base, bool):
+        return base
+    place = list(base) if isinstance(base, Sequence) and not isinstance(base, str) else []
+    if len(place) != 2 or not all(isinstance(x, int | float) and math.isfinite(x) for x in place):
+        where = "true (where robot 0 starts), false or a place [x, y] in metres"
+        raise ValueError(f"comm.base_station={base!r} must be {where}")
+    return float(place[0]), float(place[1])
+
+
+STRATEGIES = words_of(CommConfig, "strategy")

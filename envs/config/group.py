@@ -1,0 +1,32 @@
+"""What the groups of an env's settings share: they fill in what is None from the scenario, and check themselves."""
+
+from dataclasses import fields, replace
+from typing import ClassVar, Self
+
+from maexp.envs.fields import check_settings
+from maexp.envs.scenarios import Scenario
+
+
+class Group:
+    """Settings that go together, called ``group`` on the command line."""
+
+    group: ClassVar[str]
+
+    def completed(self, scenario: Scenario) -> Self:
+        """With what is None taken from the scenario where that says it, and every value checked.
+
+        Raises:
+            ValueError: a value is out of its range (named).
+        """
+        names = {one.name: one.metadata.get("scenario") for one in fields(self) if getattr(self, one.name) is None}
+        return replace(self, **{one: getattr(scenario, name) for one, name in names.items() if name}).checked()
+
+    def checked(self) -> Self:
+        """Itself, if every value is in its range and the values go together; else ValueError."""
+        check_settings(self, self.group)
+        return self
+
+
+def supplied(kind: type[Group]) -> list[str]:
+    """Settings of a robot, radar or planner whose default is the scenario's value."""
+    return [one.name for one in fields(kind) if one.default is None and one.name != "radius"]

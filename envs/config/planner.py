@@ -1,0 +1,44 @@
+"""Local planners: how robots drive to their goals."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from maexp.envs.fields import setting
+from maexp.envs.scenarios import Scenario
+
+from .group import Group
+
+PLANNERS = {
+    "dwa": "dynamic window: straight to the goal, around what is near (paper)",
+    "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
+    "direct": "none: the policy itself accelerates and steers",
+}
+CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (measured in docs/notes.md)
+
+
+@dataclass(frozen=True)
+class PlannerConfig(Group):
+    """How a robot drives to its goal (docs/planners.md)."""
+
+    group = "planner"
+
+    name: Literal["dwa", "wavefront", "direct"] = setting(
+        "wavefront", "dwa: straight to the goal; wavefront: on a way through the known map; direct: the policy steers"
+    )
+    num_accel: int = setting(3, "DWA's candidates of the acceleration", low=1)
+    num_steering: int | None = setting(
+        None, "DWA's candidates of the steering angle", low=1, scenario="num_steering"
+    )
+    horizon: int = setting(3, "local steps that DWA looks ahead", low=1)
+    clearance_factor: float | None = setting(
+        None, "nearer than so many collision thresholds costs DWA; wavefront's paths keep as clear of walls", above=0
+    )
+    clearance_weight: float = setting(100.0, "how much that costs", above=0)
+    replan_steps: int = setting(5, "local steps between two looks of wavefront for a path", low=1)
+
+    def completed(self, scenario: Scenario) -> "PlannerConfig":
+        """With the scenario's candidates and the planner's clearance."""
+        if self.clearance_factor is not None:
+            return super().completed(scenario)
+        factor = CLEARANCE.get(self.name, scenario.clearance_factor)
+        return replace(self, clearance_factor=factor).completed(scenario)

@@ -1,0 +1,22 @@
+"""How robots share targets out."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from maexp.envs.fields import setting
+
+from .group import Group
+
+
+@dataclass(frozen=True)
+class TargetsConfig(Group):
+    """How robots share targets out, with any policy that chooses among them."""
+
+    group = "targets"
+
+    distinct: bool = setting(
+        True, "robots that hear each other go to different targets; else each goes where it likes best"
+    )
+    spare: Literal["wait", "home"] = setting(
+        "wait", "where robots go for which no target is left: nowhere, or home to where they started"
+    )
