@@ -4,6 +4,9 @@ With every step the error of a robot's estimate grows by a random walk: on a way
 along each axis and `odometry_turn` sqrt(d) in its heading, normally distributed; and what it drives is added up in the
 heading that it believes. Jumps add `odometry_jump` along each axis, `odometry_jump_rate` times a second. All is drawn
 by (seed, env, episode, step, robot).
+
+A robot plans its way by where it believes to be, and drives it by what its radar shows: walls and other robots are as
+far from it as they are, and only the place that it drives to is off by the error.
 """
 
 from typing import TYPE_CHECKING
@@ -14,7 +17,7 @@ from maexp.kernels.dynamics import wrap_angle
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import PI, Maps, Robots
+from maexp.kernels.types import PI, Maps, Robots, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
@@ -115,6 +118,38 @@ def _estimate_poses(
     pose_estimate[e, i] = wp.vec4(at[0] - forward[0], at[1] - forward[1], true[2], theta)
 
 
+@wp.func
+def place_from(true: wp.vec3, believed: wp.vec3, turn: float, place: wp.vec2) -> wp.vec2:
+    """Where a robot drives that wants to get to a place of its map; ``turn``: its heading less what it believes."""
+    c = wp.cos(turn)
+    s = wp.sin(turn)
+    way = place - point_xy(believed)
+    return point_xy(true) + wp.vec2(c * way[0] - s * way[1], s * way[0] + c * way[1])
+
+
+@wp.kernel
+def _take_aim(
+    # State in:
+    active: wp.array(dtype=wp.int32),  # [env]
+    pose: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    pose_estimate: wp.array2d(dtype=wp.vec4),  # [env, robot]
+    center_estimate: wp.array2d(dtype=wp.vec3),  # [env, robot]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    # Scratch out:
+    goal_aim: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    waypoint_aim: wp.array2d(dtype=wp.vec2),  # [env, robot]
+):
+    """Where the goal and the waypoint of robot (e, i) lie as it drives to them."""
+    e, i = wp.tid()
+    if active[e] == 0:
+        return
+    turn = pose[e, i][3] - pose_estimate[e, i][3]
+    goal_aim[e, i] = place_from(center[e, i], center_estimate[e, i], turn, goal[e, i])
+    waypoint_aim[e, i] = place_from(center[e, i], center_estimate[e, i], turn, waypoint[e, i])
+
+
 def drift_odometry(launch: Launch, shard: "Shard") -> None:
     """Let the robots' estimates drift, if they do, by the way that they drive next."""
     if shard.settings.drifts:
@@ -127,3 +162,9 @@ def estimate_poses(launch: Launch, shard: "Shard", running: wp.array, begins: in
     if shard.settings.drifts:
         writes = "odometry_error pose_estimate center_estimate"
         shard.call(launch, _estimate_poses, writes, active=running, begins=begins)
+
+
+def take_aim(launch: Launch, shard: "Shard") -> None:
+    """Where robots drive that are elsewhere than they believe (`Shard.aims`), once their waypoints are set."""
+    if shard.settings.drifts:
+        shard.call(launch, _take_aim, "goal_aim waypoint_aim")

@@ -244,5 +244,5 @@ def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     shard.call(
         launch, _hold_back, "waypoint",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        lead_time=settings.horizon * settings.dt, **shard.believed,
+        lead_time=settings.horizon * settings.dt, **shard.aims,
     )  # fmt: skip

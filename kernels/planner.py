@@ -7,6 +7,7 @@ import warp as wp
 from maexp.kernels.dwa import _plan_dwa
 from maexp.kernels.dynamics import turn_limit
 from maexp.kernels.launches import Launch
+from maexp.kernels.odometry import take_aim
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps, Robots
 
@@ -80,8 +81,12 @@ def plan(launch: Launch, shard: "Shard") -> None:
     if shard.settings.planner == "direct":
         shard.call(launch, _plan_direct, "control")
         return
-    robots = shard.robots if shard.wavefront is None else shard.wavefront.narrowed
+    robots = shard.robots
+    if shard.wavefront is None:
+        take_aim(launch, shard)
+    else:
+        robots = shard.wavefront.narrowed
     shard.call(
         launch, _plan_dwa, "error control nearby mates",
-        robots=robots, known_boundary=shard.known("boundary"), **shard.believed,
+        robots=robots, known_boundary=shard.known("boundary"), waypoint=shard.aims["waypoint"],
     )  # fmt: skip

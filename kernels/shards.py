@@ -70,9 +70,16 @@ class Shard:
 
     @property
     def believed(self) -> dict[str, wp.array]:
-        """Poses and centres as robots believe them to be, for kernels that plan and observe."""
-        names = ("pose", "center")
-        return {name: getattr(self.view, f"{name}_estimate" if self.settings.drifts else name) for name in names}
+        """Poses and centres as robots believe them to be, for kernels that plan ways and observe."""
+        return self._as_drifting("estimate", "pose", "center")
+
+    @property
+    def aims(self) -> dict[str, wp.array]:
+        """Goals and waypoints from where robots are, for kernels that drive by what is there."""
+        return self._as_drifting("aim", "goal", "waypoint")
+
+    def _as_drifting(self, suffix: str, *names: str) -> dict[str, wp.array]:
+        return {name: getattr(self.view, f"{name}_{suffix}" if self.settings.drifts else name) for name in names}
 
     def call(
         self, launch: Launch, kernel: wp.Kernel, writes: str, dim: int | tuple[int, ...] | None = None, **given

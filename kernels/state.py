@@ -185,6 +185,9 @@ SCRATCH = {
     "near_count": Field(wp.int32, "E N", "", "how many those are", "_list_near"),
 
     # Planning.
+    "goal_aim": Field(wp.vec2, "E J", "m", "where the goal lies for a robot that is elsewhere than it believes",
+        "_take_aim"),
+    "waypoint_aim": Field(wp.vec2, "E J", "m", "the same of the waypoint", "_take_aim _hold_back _hold_turns"),
     "nearby": Field(wp.vec2, "E N O", "m", "known boundary points that may be in the way", "_plan_dwa"),
     "mates": Field(wp.int32, "E N S", "", "robots that may be in the way", "_plan_dwa"),
 

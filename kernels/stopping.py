@@ -143,5 +143,5 @@ def hold_turns(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     shard.call(
         launch, _hold_turns, "waypoint clearance",
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        clearance=wavefront.narrowed.clearance, **shard.believed,
+        clearance=wavefront.narrowed.clearance, waypoint=shard.aims["waypoint"],
     )  # fmt: skip

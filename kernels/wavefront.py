@@ -20,6 +20,7 @@ from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
 from maexp.kernels.geodesic import SKIP, DistanceSearch
 from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
+from maexp.kernels.odometry import take_aim
 from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.passable import PassableGrids
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -301,6 +302,7 @@ def pick_waypoints(launch: Launch, shard: "Shard") -> None:
         center = shard.believed["center"]
         own.paths.pick(launch, s.active, s.collided, center, s.goal, shard.robots.radar_range, s.waypoint)
         fit_clearance(launch, shard, own)
+        take_aim(launch, shard)
         hold_back(launch, shard, own)
         hold_turns(launch, shard, own)
 

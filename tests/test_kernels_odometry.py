@@ -114,20 +114,65 @@ def test_goals_are_missed_by_the_error(planner):
     torch.testing.assert_close(td["agents", "observation", "pose"][0, 0, :2], (believed - middle) * 2.0 / side)
 
 
-def test_who_believes_a_wall_elsewhere_runs_into_it():
-    """A robot that knows a wall ahead stops before it, unless it believes to be three metres farther back."""
-    ends = []
-    for off in (0.0, -3.0):
-        env = make(OdometryConfig(jump=1e-9, jump_rate=1e-9), robots=1, envs=1, local_steps=10, macro_steps=40)
+@pytest.mark.parametrize("planner", ["dwa", "wavefront"])
+def test_robots_aim_from_where_they_are(planner):
+    """Goals and waypoints turn and move with the error; waypoints may then be drawn nearer, on the same line."""
+    env = make(SOME, robot=KINDS[0], planner=PlannerConfig(name=planner))
+    s, poses, off = env.simulation.tensors, {}, []
+
+    def compare(env):
+        for e in range(2):
+            for i in range(3):
+                if int(s["local_step"][e]) > 1 and not s["collided"][e, i]:
+                    true, believed = poses[e, i]
+                    goal, waypoint = (
+                        odometry.seen_from(true, believed, s[one][e, i].tolist()) for one in ("goal", "waypoint")
+                    )
+                    assert s["goal_aim"][e, i].tolist() == pytest.approx(goal, abs=5e-3)
+                    aim = s["waypoint_aim"][e, i]
+                    way, full = (one - torch.tensor(true[:2]) for one in (aim, torch.tensor(waypoint)))
+                    share = 1.0 if planner == "dwa" else float(way.norm() / full.norm())
+                    assert share <= 1.001
+                    torch.testing.assert_close(way, share * full, atol=5e-3, rtol=1e-3)
+                    off.append(math.dist(goal, s["goal"][e, i].tolist()))
+                poses[e, i] = [
+                    (*s[f"center{which}"][e, i, :2].tolist(), float(s[f"pose{which}"][e, i, 3]))
+                    for which in ("", "_estimate")
+                ]
+
+    env.set_step_hook(compare)
+    env.reset()
+    drive(env, 6)
+    assert len(off) > 60 and max(off) > 0.5
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_who_believes_a_wall_elsewhere_stops_before_it(kind):
+    """A robot keeps clear of what it sees, though it believes to be three metres farther back."""
+    for planner in ("dwa", "wavefront"):
+        env = make(OdometryConfig(jump=1e-9, jump_rate=1e-9), robots=1, envs=1, local_steps=10, macro_steps=40,
+                   robot=RobotConfig(kind=kind), planner=PlannerConfig(name=planner))  # fmt: skip
         env.set_starts([[14.0, 4.0, 0.0]])
         td, s = env.reset(), env.simulation.tensors
-        s["odometry_error"][0, 0, 0] = off
+        s["odometry_error"][0, 0, 0] = -3.0
         for _ in range(25):
             td["agents", "action", "region"] = torch.tensor([[8 * 3 + 1]])
             td["agents", "action", "offset"] = torch.tensor([[[1.0, 0.0]]])
             td = step_mdp(env.step(td))
-        ends.append(bool(td["info", "collided"][0, 0]))
-    assert ends == [False, True]
+        assert not td["info", "collided"].any() and s["path_length"].min() > 1.0, planner
+
+
+def test_mates_are_where_they_are_seen():
+    """Two robots that believe to pass far from each other stop where they would meet."""
+    env = make(OdometryConfig(jump=1e-9, jump_rate=1e-9), robots=2, envs=1, local_steps=10)
+    env.set_starts([[6.0, 10.0, 0.0], [14.0, 10.0, math.pi]])
+    td, s = env.reset(), env.simulation.tensors
+    s["odometry_error"][0] = torch.tensor([[0.0, 2.9375, 0.0], [0.0, -2.8125, 0.0]])
+    for _ in range(14):
+        td["agents", "action", "region"] = torch.tensor([[8 * 3 + 4, 8 * 1 + 2]])
+        td["agents", "action", "offset"] = torch.zeros(1, 2, 2)
+        td = step_mdp(env.step(td))
+    assert not td["info", "collided"].any() and s["path_length"].min() > 1.0
 
 
 @pytest.mark.parametrize("comm", [CommConfig(), CommConfig(range=6.0, base_station=True, strategy="return_to_base")])

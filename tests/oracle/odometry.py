@@ -39,3 +39,10 @@ class Walker:
         heading += self.error[2]
         at = (x + self.error[0] + offset * math.cos(heading), y + self.error[1] + offset * math.sin(heading))
         return tuple(min(max(one, a), b) for one, a, b in zip(at, low, high, strict=True)), heading
+
+
+def seen_from(true, believed, place) -> tuple[float, float]:
+    """Where a place of the map lies for a robot that drives there by what it sees: poses are x, y, heading."""
+    ahead, bearing = math.dist(place, believed[:2]), math.atan2(place[1] - believed[1], place[0] - believed[0])
+    bearing += true[2] - believed[2]
+    return true[0] + ahead * math.cos(bearing), true[1] + ahead * math.sin(bearing)
