@@ -1,7 +1,7 @@
 """From settings to maps, environments and learners."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
@@ -173,26 +174,62 @@ def choose_starts(cfg: CommonSettings, num_robots: int) -> str | np.ndarray:
 
 
 def other_scenarios(cfg: DictConfig, words: DictConfig) -> list[DictConfig]:
-    """The settings once more for each scenario of `scenario.also`, with what a scenario supplies left to it.
+    """The settings once more for each entry of `scenario.also`, with what a scenario supplies left to it.
 
-    `words` tell what that is: settings that hold no values of a checkpoint.
+    An entry is a scenario's name, or settings of `scenario` with the name among them. `words` tell what a scenario
+    supplies: settings that hold no values of a checkpoint.
 
     Raises:
-        UserError: a name that is unknown or given twice, or a scenario without maps of its own.
+        UserError: an entry that is unknown or given twice, or a scenario without maps of its own and without a path.
     """
-    names = [] if cfg.scenario.also is None else list(cfg.scenario.also)
+    entries = [] if cfg.scenario.also is None else OmegaConf.to_container(cfg.scenario.also)
+    entries = [{"name": one} if isinstance(one, str) else one for one in entries]
+    for one in entries:
+        _check_entry(one)
+    names = [one["name"] if len(one) == 1 else str(one) for one in entries]
     check_distinct("scenario.also", [cfg.scenario.name, *names])
-    return [_with_scenario(cfg, words, name) for name in names]
+    return [_with_scenario(cfg, words, one) for one in entries]
 
 
-def _with_scenario(cfg: DictConfig, words: DictConfig, name: str) -> DictConfig:
-    if name not in SCENARIOS or SCENARIOS[name].build is None:
+def title_scenario(entry: str | Mapping[str, Any]) -> str:
+    """An entry of `scenario.also` in words: `maze`, or `maze local_steps=5`; of files their number."""
+    if isinstance(entry, str):
+        return entry
+    others = {name: value for name, value in entry.items() if name != "name"}
+    if "path" in others:
+        count = len(split_paths(others["path"]))
+        others["path"] = f"{count} file{'s' * (count > 1)}"
+    return " ".join([entry["name"], *(f"{name}={value}" for name, value in others.items())])
+
+
+def _check_entry(entry: Any) -> None:
+    if not isinstance(entry, dict) or not isinstance(entry.get("name"), str):
+        raise UserError(
+            f"scenario.also: {entry} is neither a scenario's name nor settings of one, as "
+            "{name: maze, local_steps: 5}."
+        )
+    name, path = entry["name"], entry.get("path")
+    if name not in SCENARIOS or (SCENARIOS[name].build is None and path is None):
         known = ", ".join(one for one, row in SCENARIOS.items() if row.build is not None)
-        raise UserError(f"scenario.also={name} is no scenario with maps of its own: choose among {known}.")
+        raise UserError(
+            f"scenario.also={name} is no scenario with maps of its own: choose among {known}, or give "
+            "{name: pointcloud, path: FILES}."
+        )
+    settings = [one.name for one in fields(ScenarioSettings) if one.name not in ("also", "importing")]
+    if unknown := [one for one in entry if one not in settings]:
+        raise UserError(f"scenario.also has no setting {unknown[0]}: choose among {', '.join(settings)}.")
+
+
+def _with_scenario(cfg: DictConfig, words: DictConfig, entry: dict[str, Any]) -> DictConfig:
     other = copy.deepcopy(cfg)
-    other.scenario.name = name
     for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED):
         other.scenario[setting] = None
+    for setting, value in entry.items():
+        try:
+            other.scenario[setting] = value
+        except OmegaConfBaseException as error:
+            why = str(error).splitlines()[0]
+            raise UserError(f"scenario.also: {setting}={value} of {entry['name']} cannot be: {why}") from error
     unresolved = OmegaConf.to_container(words, resolve=False)
     for group, setting in (one.split(".") for one in find_followers(words)):
         if group != "scenario":

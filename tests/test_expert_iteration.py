@@ -16,6 +16,7 @@ from maexp.agents.networks.actor import ALIVE, COMM, PREFERENCE, TARGETS, TARGET
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import model_config
 from maexp.agents.training.branching import BranchingActor
+from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint
 from maexp.envs import ExplorationEnv, ObservationConfig
 from maexp.envs.features import FEATURES
 
@@ -153,3 +154,23 @@ def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):
 def test_the_six_stay_six():
     """Those that learn from Collector batches alone: user code loops over them."""
     assert len(ALGORITHMS) == 6 and "expert_iteration" not in ALGORITHMS
+
+
+def test_begins_from_another_run(somewhere, capsys):
+    """With its policy and its decisions, on another scenario; stopped and resumed it is as in one go."""
+    first = run("first", 2, *WORDS)
+    known = find_checkpoint(first)[1]
+    words = (*WORDS, "scenario=indoor_small", f"algorithm.begin_from={first}", "algorithm.final_lr_share=1")
+    whole = run("whole", 2, *words)
+    start = load_checkpoint(whole / "checkpoints" / START)
+    assert all(torch.equal(start["policy"][name], one) for name, one in known["policy"].items())
+    mine, theirs = start["updater"]["memory"], known["updater"]["memory"]
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[n]["features"], theirs[n]["features"]) for n in theirs)
+    assert find_checkpoint(whole)[1]["updater"]["memory"]["2"]["mask"].shape[0] > len(theirs["2"]["mask"])
+    assert_same_runs(whole, resume(run("parts", 1, *words), 2))
+    other = run("other", 1, "action=targets", "algorithm=mappo")
+    for place, sentence in (("nowhere", "nowhere does not exist"), (other, "was not trained by expert iteration")):
+        capsys.readouterr()
+        assert main(["train", *TINY, *WORDS, f"algorithm.begin_from={place}", "hydra.run.dir=bad"]) == 2
+        assert sentence in capsys.readouterr().err

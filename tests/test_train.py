@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 import torch
 
+from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
 from maexp.agents.commands.train import draw_rollout
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog, read_metrics
+from maexp.envs import make_map
 
 pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands
 
@@ -227,10 +229,34 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
     for word, told in (
         ("scenario.also=[nowhere]", "scenario.also=nowhere is no scenario"),
         ("scenario.also=[maze_small]", "names maze_small twice"),
+        ("scenario.also=[{local_steps:5}]", "neither a scenario's name nor settings of one"),
+        ("scenario.also=[{name:maze_small,steps:5}]", "scenario.also has no setting steps: choose among"),
+        ("scenario.also=[{name:maze_small,local_steps:few}]", "local_steps=few of maze_small cannot be"),
+        ("scenario.also=[{name:maze_small,local_steps:0}]", "local_steps=0"),
+        ("scenario.also=[pointcloud]", "or give {name: pointcloud, path: FILES}"),
+        ("scenario.also=[{name:pointcloud,path:nowhere.yaml}]", "nowhere.yaml"),
     ):
         capsys.readouterr()
         assert main(["train", "scenario=maze_small", word, "hydra.run.dir=bad"]) == 2
         assert told in capsys.readouterr().err
+
+
+def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
+    """The same places with shorter decisions, beside a map of the user's."""
+    make_map("maze_small", 3).save(tmp_path / "mine.npz")
+    cfg = compose_config("train", [
+        "scenario=maze_small", "num_robots=2", "action=targets",
+        f"scenario.also=[{{name:maze_small,local_steps:5,maps:[1]}},{{name:pointcloud,path:{tmp_path}/mine.npz}}]",
+    ])  # fmt: skip
+    short, mine = other_scenarios(cfg, cfg)
+    env = make_env(short, load_maps(short.scenario).train, 2, 1)
+    assert (env.local_steps, env.macro_steps) == (5, 15)
+    assert [one.name for one in env.maps] == ["maze_small_1"]
+    assert [one.name for one in load_maps(mine.scenario).train] == ["maze_small_3"]
+    assert cfg.scenario.local_steps is None or cfg.scenario.local_steps == 20
+    assert [title_scenario(one) for one in cfg.scenario.also] == [
+        "maze_small local_steps=5 maps=[1]", "pointcloud path=1 file"
+    ]  # fmt: skip
 
 
 def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
@@ -354,6 +380,7 @@ import sys, torch
 torch.set_num_threads(1)
 from maexp.agents.commands import train
 train.draw_rollout = train.draw_curves = lambda *args: None
+from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -109,8 +109,12 @@ class ExpertUpdater(Updater):
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)
+        self.load_memory(state["memory"])
+
+    def load_memory(self, memory: dict[str, dict[str, Tensor]]) -> None:
+        """Learn from these decisions, as `state_dict` tells them."""
         device = self.policy_params[0].device
-        self.memory = {int(n): TensorDict(one, len(one["mask"])).to(device) for n, one in state["memory"].items()}
+        self.memory = {int(n): TensorDict(one, len(one["mask"])).to(device) for n, one in memory.items()}
 
 
 def tried_others(part: TensorDict) -> Tensor:

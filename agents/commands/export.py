@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.build import load_maps, make_env
+from maexp.agents.build import load_maps, make_env, title_scenario
 from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import check_writable, remove_if_empty
 from maexp.agents.errors import UserError, blame_input
@@ -60,7 +60,7 @@ def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
 def describe_training(cfg: ExportSettings, saved: dict) -> dict[str, Any]:
     """How the policy of a checkpoint was trained."""
     return {
-        "scenarios": [cfg.scenario.name, *(cfg.scenario.also or [])],
+        "scenarios": [cfg.scenario.name, *map(title_scenario, cfg.scenario.also or [])],
         "num_robots": team_sizes(cfg.num_robots),
         "algorithm": cfg.algorithm.name,
         "seed": cfg.seed,

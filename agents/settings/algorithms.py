@@ -122,6 +122,9 @@ class ExpertSettings(Settings):
     epochs: int = setting(2, "how often a branched decision is learned from, on average", low=1)
     memory: int = setting(20_000, "decisions kept to learn from, of every team size", low=1)
     weight_decay: float = setting(0.1, "of the weights, as in AdamW", low=0)
+    begin_from: str | None = setting(
+        None, "run of expert iteration whose policy and branched decisions this one begins with, on whatever scenarios"
+    )
 
     unused: ClassVar[tuple[str, ...]] = (
         "gamma", "lmbda", "finite_horizon", "critic_lr", "entropy_coeff", "critic_coeff", "value_norm",

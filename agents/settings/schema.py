@@ -149,7 +149,11 @@ def import_settings(**references: str) -> Any:
 class ScenarioSettings(optional_settings(Scenario)):
     """Where the team explores, and what robot, radar and planner take from there. Null: what the map says."""
 
-    also: Any = setting(None, "further scenarios to train on, as [maze,outdoor], each with its own robots and episode")
+    also: Any = setting(
+        None,
+        "further scenarios to train on, each with its own robots and episode, as [maze,outdoor], or with settings of "
+        "their own: [{name:maze,local_steps:5},{name:pointcloud,path:hall.yaml}]",
+    )
     path: str | None = setting(None, "the map of scenario=pointcloud, or several: a.yaml,b.pcd")
     maps: Any = setting(None, "indices trained on; default: what held_out and validation leave of the table's count")
     validation: Any = setting(

@@ -40,6 +40,7 @@ from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.schema import TrainSettings
 from maexp.agents.training.checkpoint import (
     check_action,
+    find_checkpoint,
     random_state,
     save_checkpoint,
     seed_everything,
@@ -129,6 +130,8 @@ class TrainingRun:
             run = cls(cfg, folder, overrides, suite, learner, experience)
             if saved is not None:
                 run.restore(saved)
+            elif cfg.algorithm.get("begin_from"):
+                run.begin_from(cfg.algorithm.begin_from)
         return run
 
     @cached_property
@@ -213,6 +216,16 @@ class TrainingRun:
         self.average, self.seconds = saved["average"], saved["seconds"]
         self.restore_validation(saved)
         set_random_state(saved["random"])
+
+    def begin_from(self, place: str) -> None:
+        """Start with the policy and the branched decisions of another run; its optimizer and clock stay behind."""
+        _, saved = find_checkpoint(place)
+        if "memory" not in saved["updater"]:
+            raise UserError(f"algorithm.begin_from={place} was not trained by expert iteration: it holds no branches.")
+        check_action(saved, self.cfg)
+        load_matching(self.learner.policy, saved["policy"])
+        self.learner.updater.load_memory(saved["updater"]["memory"])
+        self.experience.update_policy_weights_()
 
     def restore_validation(self, saved: dict) -> None:
         """Go on with what the planners of `saved` did, where they would do the same."""
