@@ -81,7 +81,8 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
     learner = make_learner(cfg, env)
-    assert {"name": "expert_iteration"} | asdict(learner.updater.settings) == shown["algorithm"]
+    mine = {name: value for name, value in asdict(learner.updater.settings).items() if value is not None}
+    assert {"name": "expert_iteration"} | mine == shown["algorithm"]
 
 
 def test_a_map_of_ones_own_tells_its_scenario_and_the_length_of_an_episode(tmp_path):
