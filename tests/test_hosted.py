@@ -19,9 +19,9 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies import POLICIES, hosted, wire
 from maexp.agents.policies.foreign import TeamSight, as_policy
-from maexp.agents.policies.hosted import HostedPolicy, greet
+from maexp.agents.policies.hosted import HostedPolicy, greet, guest_of
 from maexp.agents.policies.load import load_policy_folder
-from maexp.agents.policies.process import Guest, Lost, ask_all, command_of
+from maexp.agents.policies.process import Lost, Process, ask_all, command_of
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime.agent import TeamAgent
 from maexp.agents.suites.players import Player
@@ -43,7 +43,7 @@ def beside_the_hostile_ones(monkeypatch):
 def play_hosted(word: str, limit: float = 20.0, patience: float = 20.0):
     """An episode of four teams: last info, reasons, which teams meet a fault, decisions and their processor time."""
     env = make_env(ENVS, macro_steps=STEPS)
-    with HostedPolicy(env, command_of(word), word, limit, patience) as policy:
+    with HostedPolicy(env, guest_of(word), word, limit, patience) as policy:
         taken = []
 
         def watched(state):
@@ -112,7 +112,7 @@ def test_a_policy_that_speaks_unasked_is_lost():
 
 def test_the_next_episode_has_a_new_process():
     env = make_env(1, macro_steps=3)
-    with HostedPolicy(env, command_of("hostile:Exits"), "exits", 20.0, 20.0) as policy:
+    with HostedPolicy(env, guest_of("hostile:Exits"), "exits", 20.0, 20.0) as policy:
         ends = []
         for number in range(6):
             play(policy, env, torch.tensor([number]))
@@ -137,7 +137,7 @@ def test_what_does_not_start_is_told_before_anything_is_played(word, told, monke
 
 
 def test_an_echo_is_no_policy():
-    assert greet(["cat"], "cat")
+    assert greet(guest_of("exec:cat"), "cat")
     _, reasons, _, _ = play_hosted("exec:cat")
     assert set(reasons) == {"it answered 'reset' where 'ready' was asked for"}
 
@@ -164,7 +164,7 @@ def test_a_process_chooses_as_its_class_does_inside(monkeypatch):
 
     envs = [make_env(3, macro_steps=8) for _ in range(2)]
     inside = as_policy(envs[0], Nearest)
-    with HostedPolicy(envs[1], command_of("nearest:Nearest"), "nearest", 20.0, 20.0) as outside:
+    with HostedPolicy(envs[1], guest_of("nearest:Nearest"), "nearest", 20.0, 20.0) as outside:
         states = [env.reset() for env in envs]
         for _ in range(8):
             states = [policy(state) for policy, state in zip((inside, outside), states, strict=True)]
@@ -203,7 +203,7 @@ def test_our_planners_through_a_process_take_the_targets_that_they_take_inside(p
     apart, sent = 0.0, note_goals(monkeypatch)
     env = make_env(1, maps=[make_map("maze_small", 1)])
     inside, sight, state = POLICIES[policy](env), TeamSight(env), env.reset()
-    guest = Guest(command_of(f"process:{policy}"))
+    guest = Process(command_of(f"process:{policy}"))
     try:
         ask_all([(guest, {"type": "hello", "version": 1})], 60.0, 60.0)
         for _ in range(5):
@@ -224,7 +224,7 @@ def test_a_trained_policy_through_a_process_takes_the_targets_that_it_takes_insi
     shown, apart, sent = ObservationConfig(pictures=False, targets=24), [], note_goals(monkeypatch)
     env = make_env(1, observation=shown)
     inside, sight, state = load_policy_folder("universal", env), TeamSight(env), env.reset()
-    guest = Guest(command_of("process:universal"))
+    guest = Process(command_of("process:universal"))
     try:
         ask_all([(guest, {"type": "hello", "version": 1})], 60.0, 60.0)
         for step in range(6):
@@ -252,7 +252,7 @@ def test_the_example_in_another_language_chooses_as_its_twin_in_python(tmp_path)
         pytest.skip("nlohmann/json IS ABSENT: the example in C++ is not compiled")
     assert done.returncode == 0, done.stderr
     env = make_env(2, macro_steps=4)
-    with HostedPolicy(env, command_of(f"exec:{tmp_path / 'nearest'}"), "nearest", 60.0, 60.0) as policy:
+    with HostedPolicy(env, guest_of(f"exec:{tmp_path / 'nearest'}"), "nearest", 60.0, 60.0) as policy:
         state = env.reset()
         for _ in range(4):
             state = policy(state)
@@ -338,7 +338,7 @@ def test_the_processor_time_is_that_of_the_process():
         "    while time.process_time() - begin < m['spin']: pass\n"
         "    time.sleep(m['sleep']); wire.write(sys.stdout.buffer, {'type': 'ready'})\n"
     )
-    guest = Guest([sys.executable, "-c", program])
+    guest = Process([sys.executable, "-c", program])
     try:
         ask_all([(guest, {"type": "x", "spin": 0.0, "sleep": 0.0})], 60.0, 60.0)
         ask_all([(guest, {"type": "x", "spin": 0.3, "sleep": 0.6})], 60.0, 60.0)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.
 
-KEPT = ("place", "policy", "seed", "num_envs", "decision_limit")
+KEPT = ("place", "policy", "name", "seed", "num_envs", "decision_limit")
 """Settings of a run that `resume` keeps."""
 DIFFERENT, STOPPED = 1, 130
 
@@ -104,10 +103,10 @@ def _run(cfg: SuiteSettings, where: Path) -> int:
     suite = load_suite(cfg.place)
     suite.check()
     limit = suite.decision_limit if cfg.decision_limit is None else cfg.decision_limit
-    player = Player(cfg.policy, limit, cfg.patience)
+    player = Player(cfg.policy, limit, cfg.patience, cfg.name)
     settings = {name: cfg[name] for name in KEPT} | {"decision_limit": limit}
     if player.hosted and not cfg.resume:
-        settings["num_envs"] = min(cfg.num_envs, cfg.workers or os.cpu_count() or 1)
+        settings["num_envs"] = min(cfg.num_envs, cfg.workers or player.most_teams)
     return play(suite, player, where, settings, cfg.device, "suite run")
 
 

@@ -1,7 +1,10 @@
-"""Foreign policies in processes of their own, one a team: what one does costs it its episode, and nobody else's."""
+"""Foreign policies in processes of their own or elsewhere, one a team: what one does costs it its episode, and nobody
+else's."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,23 +13,35 @@ from tensordict import TensorDictBase
 
 from maexp.agents.errors import UserError
 from maexp.agents.policies import wire
+from maexp.agents.policies.connection import SOCKET, Connection, address_of
 from maexp.agents.policies.foreign import TeamSight, read_goals
-from maexp.agents.policies.process import Guest, Lost, ask_all
+from maexp.agents.policies.process import Guest, Lost, Process, ask_all, command_of
 from maexp.envs import ExplorationEnv
 
 START = 120.0  # seconds that a process may take to say hello: some import a lot
 
 
-class HostedPolicy:
-    """A foreign policy for all teams of an env, each in a process of its own.
+def guest_of(word: str) -> Callable[[], Guest]:
+    """What makes a guest for one team: of `socket:HOST:PORT` a connection, of any other word a process.
 
-    Beside the action it writes ``lost``, bool [E, 1]: teams whose process has failed in this episode, and
-    ``decision_seconds``, float64 [E, 1]: processor time of the decision [s]. A team that is lost stays where it is;
-    its next episode has a new process.
+    Raises:
+        ValueError: there is no address or no command in it.
+    """
+    if word.startswith(SOCKET):
+        return partial(Connection, *address_of(word))
+    return partial(Process, command_of(word))
+
+
+class HostedPolicy:
+    """A foreign policy for all teams of an env, each with a guest of its own.
+
+    Beside the action it writes ``lost``, bool [E, 1]: teams whose guest has failed in this episode, and
+    ``decision_seconds``, float64 [E, 1]: what the decision took (`Guest.seconds`) [s]. A team that is lost stays where
+    it is; its next episode has a new guest.
 
     Args:
         env: with a planner that drives to goals.
-        command: program and arguments.
+        make_guest: called for each team (`guest_of`).
         name: of the policy, for messages.
         limit: processor time of a decision [s].
         patience: how long an answer may take otherwise [s].
@@ -35,10 +50,10 @@ class HostedPolicy:
         reasons: why each team is lost, "" for those that are not.
     """
 
-    def __init__(self, env: ExplorationEnv, command: list[str], name: str, limit: float, patience: float):
+    def __init__(self, env: ExplorationEnv, make_guest: Callable[[], Guest], name: str, limit: float, patience: float):
         if env.planner_config.name == "direct":
             raise UserError(f"planner=direct takes controls, and {name} picks goals: use planner=dwa or wavefront.")
-        self.env, self.command, self.name = env, command, name
+        self.env, self.make_guest, self.name = env, make_guest, name
         self.limit, self.patience = limit, patience
         self.sight, self.guests = TeamSight(env), [None] * env.num_envs
         self.reasons = [""] * env.num_envs
@@ -50,7 +65,7 @@ class HostedPolicy:
         self.close()
 
     def close(self) -> None:
-        """End all processes."""
+        """Have done with all guests."""
         for team, guest in enumerate(self.guests):
             if guest is not None:
                 guest.kill()
@@ -84,7 +99,7 @@ class HostedPolicy:
     def _start(self, teams: list[int]) -> None:
         for team in teams:
             try:
-                self.guests[team] = Guest(self.command)
+                self.guests[team] = self.make_guest()
             except Lost as lost:
                 self._lose(team, str(lost))
         hello = {"type": "hello", "version": wire.VERSION}
@@ -117,14 +132,14 @@ class HostedPolicy:
         self.guests[team] = None
 
 
-def greet(command: list[str], name: str) -> bool:
+def greet(make_guest: Callable[[], Guest], name: str) -> bool:
     """Start a policy once, before anything is played; whether it is a foreign one.
 
     Raises:
         UserError: it does not start, or does not say hello.
     """
     try:
-        guest = Guest(command)
+        guest = make_guest()
     except Lost as lost:
         raise UserError(f"policy={name}: {lost}.") from lost
     try:

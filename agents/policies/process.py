@@ -1,7 +1,7 @@
 """A policy in a process of its own, as a run sees it: asked, waited for, ended. Nothing that it does ends the run.
 
 It is no sandbox: the policy can read and write what its user can. Whoever runs code that he does not trust gives it a
-container of its own.
+container of its own, and calls it there (`maexp.agents.policies.connection`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
+from typing import Any, BinaryIO
 
 from maexp.agents.policies import wire
 
@@ -43,13 +43,108 @@ class Lost(Exception):
 
 
 class Guest:
-    """A process that plays one team.
+    """A policy that plays one team, beyond two files that do not block: one takes questions, one gives answers.
+
+    Attributes:
+        seconds: what the answer that came last took [s]: processor time where that is known, else the time waited.
+        spoken: what it says besides, to be read for its last words; None: nothing.
+    """
+
+    spoken: BinaryIO | None = None
+
+    def __init__(self, asked: BinaryIO, answers: BinaryIO):
+        self.asked, self.answers = asked, answers
+        self.inbox, self.outbox, self.seconds = bytearray(), memoryview(b""), 0.0
+        for file in self.files:
+            os.set_blocking(file.fileno(), False)
+
+    @property
+    def files(self) -> list[BinaryIO]:
+        """All that are open between us."""
+        return [one for one in (self.asked, self.answers, self.spoken) if one is not None]
+
+    def begin(self, message: dict[str, Any]) -> None:
+        """Put a question."""
+        self.receive_part()
+        if self.inbox:
+            raise Lost("it spoke without being asked")
+        self.outbox = memoryview(wire.pack(message))
+        self.since, self.clock = time.monotonic(), self.spent_seconds()
+
+    def spent_seconds(self) -> float:
+        """What its clock shows [s]."""
+        return time.monotonic()
+
+    def send(self) -> None:
+        """As much of the question as fits."""
+        try:
+            self.outbox = self.outbox[os.write(self.asked.fileno(), self.outbox[:CHUNK]) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            raise Lost(self.last_words()) from None
+
+    def receive_part(self) -> None:
+        """What it has said since."""
+        try:
+            part = os.read(self.answers.fileno(), CHUNK)
+        except BlockingIOError:
+            return
+        except OSError:
+            part = b""
+        if not part:
+            raise Lost(self.last_words())
+        self.inbox += part
+
+    def receive(self) -> dict[str, Any] | None:
+        """The answer, once it is there as a whole."""
+        self.receive_part()
+        if len(self.inbox) < wire.HEAD.size:
+            return None
+        (length,) = wire.HEAD.unpack_from(self.inbox)
+        if length > wire.MOST_ANSWER:
+            raise Lost(f"it answered garbage (a message of {length:,} bytes)")
+        if len(self.inbox) < wire.HEAD.size + length:
+            return None
+        body, self.inbox = bytes(self.inbox[wire.HEAD.size :][:length]), self.inbox[wire.HEAD.size + length :]
+        self.seconds = max(self.spent_seconds() - self.clock, 0.0)
+        try:
+            message = wire.unpack(body)
+        except ValueError as error:
+            raise Lost(f"it answered garbage (a message that {error})") from error
+        if message["type"] == "error":
+            raise Lost(f"it gave up: {' '.join(str(message.get('message')).split())[:300]}")
+        return message
+
+    def listen(self) -> bool:
+        """Keep the end of what it says besides; whether there can be more."""
+        return False
+
+    def check_clocks(self, limit: float, patience: float) -> None:
+        """Raise Lost where it has thought for longer than `limit` [s], or owed an answer for `patience` [s]."""
+        if time.monotonic() - self.since > patience:
+            raise Lost(f"it gave no answer in {patience:g} s")
+        if self.spent_seconds() - self.clock > limit:
+            raise Lost(f"it thought for more than {limit:g} s")
+
+    def last_words(self) -> str:
+        """Why there will be no more answers."""
+        return "it closed the connection"
+
+    def kill(self) -> None:
+        """Have done with it."""
+        for file in self.files:
+            file.close()
+
+
+class Process(Guest):
+    """One in a process of this machine, which ends with it.
 
     Args:
         command: program and arguments.
 
-    Attributes:
-        seconds: processor time of the answer that came last [s]; where a system does not tell it, the time waited.
+    Raises:
+        Lost: it does not start.
     """
 
     def __init__(self, command: list[str]):
@@ -60,20 +155,11 @@ class Guest:
             )  # fmt: skip
         except (OSError, ValueError) as error:
             raise Lost(f"{command[0]} cannot be started ({getattr(error, 'strerror', None) or error})") from error
-        self.inbox, self.said, self.seconds, self.spent = bytearray(), bytearray(), 0.0, 0.0
-        self.outbox = memoryview(b"")
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            os.set_blocking(pipe.fileno(), False)
+        self.spoken, self.said, self.spent = self.process.stderr, bytearray(), 0.0
+        super().__init__(self.process.stdin, self.process.stdout)
 
-    def begin(self, message: dict[str, Any]) -> None:
-        """Put a question."""
-        if self.inbox:
-            raise Lost("it spoke without being asked")
-        self.outbox = memoryview(wire.pack(message))
-        self.asked, self.clock = time.monotonic(), self.processor_seconds()
-
-    def processor_seconds(self) -> float:
-        """Of the process and its threads so far [s]; where a system does not tell, a clock's time."""
+    def spent_seconds(self) -> float:
+        """Processor time of the process and its threads so far; where a system does not tell, a clock's time."""
         try:
             self.spent = time.clock_gettime((~self.process.pid << 3) | 2)  # Linux: the clock of another process
         except (OSError, AttributeError):
@@ -81,56 +167,14 @@ class Guest:
                 self.spent = time.monotonic()
         return self.spent
 
-    def send(self) -> None:
-        """As much of the question as fits."""
-        try:
-            self.outbox = self.outbox[os.write(self.process.stdin.fileno(), self.outbox[:CHUNK]) :]
-        except BlockingIOError:
-            pass
-        except OSError:
-            raise Lost(self.last_words()) from None
-
-    def receive(self) -> dict[str, Any] | None:
-        """The answer, once it is there as a whole."""
-        try:
-            part = os.read(self.process.stdout.fileno(), CHUNK)
-        except BlockingIOError:
-            return None
-        if not part:
-            raise Lost(self.last_words())
-        self.inbox += part
-        if len(self.inbox) < wire.HEAD.size:
-            return None
-        (length,) = wire.HEAD.unpack_from(self.inbox)
-        if length > wire.MOST_ANSWER:
-            raise Lost(f"it answered garbage (a message of {length:,} bytes)")
-        if len(self.inbox) < wire.HEAD.size + length:
-            return None
-        body, self.inbox = bytes(self.inbox[wire.HEAD.size :][:length]), self.inbox[wire.HEAD.size + length :]
-        self.seconds = max(self.processor_seconds() - self.clock, 0.0)
-        try:
-            message = wire.unpack(body)
-        except ValueError as error:
-            raise Lost(f"it answered garbage (a message that {error})") from error
-        if message["type"] == "error":
-            raise Lost(f"it gave up: {' '.join(str(message.get('message')).split())[:300]}")
-        return message
-
     def listen(self) -> bool:
         """Keep the end of what it says on its standard error; whether there can be more."""
         try:
-            part = os.read(self.process.stderr.fileno(), CHUNK)
+            part = os.read(self.spoken.fileno(), CHUNK)
         except BlockingIOError:
             return True
         self.said = (self.said + part)[-TAIL:]
         return bool(part)
-
-    def check_clocks(self, limit: float, patience: float) -> None:
-        """Raise Lost where it has thought for longer than `limit` [s], or owed an answer for `patience` [s]."""
-        if self.processor_seconds() - self.clock > limit:
-            raise Lost(f"it thought for more than {limit:g} s")
-        if time.monotonic() - self.asked > patience:
-            raise Lost(f"it gave no answer in {patience:g} s")
 
     def last_words(self) -> str:
         """How a process that has closed its pipes ended, and the last line that it said."""
@@ -144,23 +188,27 @@ class Guest:
         return f"{how}{f', saying {lines[-1][:200]!r}' if lines else ''}"
 
     def kill(self) -> None:
-        """End the process, and those that it started and did not hide."""
-        try:
-            os.killpg(self.process.pid, signal.SIGKILL)
-        except (ProcessLookupError, PermissionError):
-            pass
-        self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            pipe.close()
+        """End it, too."""
+        end(self.process)
+        super().kill()
+
+
+def end(process: subprocess.Popen) -> None:
+    """End a process that leads a session, and those that it started and did not hide."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (ProcessLookupError, PermissionError):
+        pass
+    process.wait()
 
 
 def ask_all(
     questions: list[tuple[Guest, dict[str, Any]]], limit: float, patience: float
 ) -> list[dict[str, Any] | Lost]:
-    """Ask several processes at once; the answer of each, or why there is none.
+    """Ask several at once; the answer of each, or why there is none.
 
     Args:
-        limit: processor time of an answer [s].
+        limit: processor time of an answer, where that is known [s].
         patience: how long an answer may take otherwise [s].
     """
     answers: list[Any] = [None] * len(questions)
@@ -168,10 +216,9 @@ def ask_all(
 
         def settle(k: int, answer: Any) -> None:
             answers[k] = answer
-            process = questions[k][0].process
-            for pipe in (process.stdin, process.stdout, process.stderr):
-                if pipe.fileno() in selector.get_map():
-                    selector.unregister(pipe)
+            for file in questions[k][0].files:
+                if file.fileno() in selector.get_map():
+                    selector.unregister(file)
 
         for k, (guest, message) in enumerate(questions):
             try:
@@ -179,9 +226,10 @@ def ask_all(
             except Lost as lost:
                 answers[k] = lost
                 continue
-            selector.register(guest.process.stdin, selectors.EVENT_WRITE, (k, "send"))
-            selector.register(guest.process.stdout, selectors.EVENT_READ, (k, "receive"))
-            selector.register(guest.process.stderr, selectors.EVENT_READ, (k, "listen"))
+            selector.register(guest.asked, selectors.EVENT_WRITE, (k, "send"))
+            selector.register(guest.answers, selectors.EVENT_READ, (k, "receive"))
+            if guest.spoken is not None:
+                selector.register(guest.spoken, selectors.EVENT_READ, (k, "listen"))
         while any(one is None for one in answers):
             events = selector.select(POLL)
             for key, _ in events:
@@ -196,7 +244,7 @@ def ask_all(
 
 
 def _serve(selector, key, guest: Guest, answers: list, settle) -> None:
-    """One pipe that is ready."""
+    """One file that is ready."""
     k, what = key.data
     if answers[k] is not None:
         return

@@ -6,10 +6,11 @@ from contextlib import AbstractContextManager, nullcontext
 
 from maexp.agents.errors import UserError
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.hosted import HostedPolicy, greet
+from maexp.agents.policies.connection import SOCKET
+from maexp.agents.policies.hosted import HostedPolicy, greet, guest_of
 from maexp.agents.policies.load import is_exported
 from maexp.agents.policies.names import plug_ins
-from maexp.agents.policies.process import APART, EXEC, command_of
+from maexp.agents.policies.process import APART, EXEC, Guest, command_of
 from maexp.agents.training.named import Player as Named
 from maexp.agents.training.named import find_player
 from maexp.agents.training.named import short_name as name_of
@@ -20,41 +21,48 @@ class Player:
     """A policy by the word that names it.
 
     Args:
-        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks `maexp.agents.policies.wire`; or
-            `process:NAME`, one of ours as if it were a stranger's. A class with `act` always plays in processes.
-        limit: processor time that a decision may take a policy in processes of its own [s].
+        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks `maexp.agents.policies.wire`;
+            `socket:HOST:PORT`, where one listens; or `process:NAME`, one of ours as if it were a stranger's. A class
+            with `act` always plays in processes.
+        limit: processor time that a decision may take a policy in processes of its own, or time elsewhere [s].
         patience: how long an answer of such a one may take otherwise [s].
+        name: what tables call it; None: by its word.
 
     Raises:
         UserError: there is none of that name, it is damaged, does not start, or gives controls.
     """
 
-    def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0):
+    def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0, name: str | None = None):
         self.word, self.limit, self.patience = word, limit, patience
-        self.command = self._find_command()
-        self.name = short_name(word)
+        self.make_guest = self._find_guest()
+        self.name = name or short_name(word)
         self.found: Named | None = None if self.hosted else find_player(word, name=self.name)
         if self.found is not None and self.found.direct:
             raise UserError(f"policy={word} gives controls (planner=direct), and the robots of a suite drive to goals.")
 
-    def _find_command(self) -> list[str] | None:
-        """Of a policy in processes of its own; None: it plays in this one."""
-        if not self.word.startswith((EXEC, APART)) and not is_own(self.word):
+    def _find_guest(self) -> Callable[[], Guest] | None:
+        """What plays a team in a process of its own or elsewhere; None: it plays in this one."""
+        if not self.word.startswith((EXEC, APART, SOCKET)) and not is_own(self.word):
             return None
         try:
-            command = command_of(self.word)
+            make_guest = guest_of(self.word)
         except ValueError as error:
-            raise UserError(f"policy={self.word} cannot be started: {error}.") from error
-        if greet(command, self.word):
-            return command
+            raise UserError(f"policy={self.word} cannot be played: {error}.") from error
+        if greet(make_guest, self.word):
+            return make_guest
         if self.word.startswith(APART):
             raise UserError(f"policy={self.word} is no class with act(observation): see docs/arena.md.")
         return None
 
     @property
     def hosted(self) -> bool:
-        """Whether each team has a process of its own."""
-        return self.command is not None
+        """Whether each team has a process or connection of its own."""
+        return self.make_guest is not None
+
+    @property
+    def most_teams(self) -> int:
+        """How many a hosted one plays at once unless told: who listens at a socket may serve one after another."""
+        return 1 if self.word.startswith(SOCKET) else os.cpu_count() or 1
 
     def observation(self) -> ObservationConfig:
         """What its env shows."""
@@ -64,9 +72,9 @@ class Player:
         return ObservationConfig(map=found.map or "seen", pictures=found.pictures, targets=found.targets or 0)
 
     def open(self, env: ExplorationEnv) -> AbstractContextManager[Callable]:
-        """The policy for an env; at the end of the context its processes end."""
+        """The policy for an env; at the end of the context it has done with its guests."""
         if self.found is None:
-            return HostedPolicy(env, self.command, self.name, self.limit, self.patience)
+            return HostedPolicy(env, self.make_guest, self.name, self.limit, self.patience)
         return nullcontext(self.found.make(env))
 
 

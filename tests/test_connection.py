@@ -1,0 +1,204 @@
+"""Policies elsewhere: who listens at a socket chooses as inside; what it does wrong costs it its episode."""
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mazes import OFFSET, REGION, make_env
+from test_hosted import ENVS, EXAMPLES, STEPS, alive, play_hosted
+
+from maexp.agents.errors import UserError
+from maexp.agents.evaluation.evaluate import play
+from maexp.agents.policies import hosted, wire
+from maexp.agents.policies.connection import address_of
+from maexp.agents.policies.foreign import as_policy
+from maexp.agents.policies.hosted import HostedPolicy, guest_of
+from maexp.agents.policies.process import command_of
+from maexp.agents.suites.players import Player
+
+pytestmark = pytest.mark.slow  # processes
+
+TESTS = Path(__file__).resolve().parent
+SERVE = "import sys; from maexp.agents.policies.connection import serve; serve('127.0.0.1', 0, sys.argv[1:])"
+
+
+@contextmanager
+def listening(word: str, folder: Path = TESTS):
+    """A machine elsewhere that plays `word`; gives socket:HOST:PORT and its process."""
+    command = [sys.executable, "-c", SERVE, *command_of(word)]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder, text=True)
+    try:
+        yield f"socket:127.0.0.1:{server.stdout.readline().split()[-1]}", server
+    finally:
+        server.send_signal(signal.SIGINT)
+        server.wait()
+        server.stdout.close()
+
+
+@contextmanager
+def answering(reply):
+    """Somebody who takes one connection after another and does `reply` with each."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def take():
+            while True:
+                try:
+                    link, _ = server.accept()
+                except OSError:
+                    return
+                with link:
+                    try:
+                        reply(link)
+                    except OSError:
+                        pass
+
+        threading.Thread(target=take, daemon=True).start()
+        yield f"socket:127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(socket.SHUT_RDWR)
+
+
+def stays(link: socket.socket) -> None:
+    """A whole policy of another language, as it were."""
+    stream = link.makefile("rwb")
+    while (message := wire.read(stream)) is not None:
+        kind = {"hello": "hello", "reset": "ready", "act": "goals"}[message["type"]]
+        wire.write(stream, {"type": kind, "version": 1, "goals": np.full((3, 2), np.nan)})
+
+
+def test_it_chooses_as_its_class_does_inside(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from nearest import Nearest
+
+    envs = [make_env(3, macro_steps=6) for _ in range(2)]
+    inside = as_policy(envs[0], Nearest)
+    with (
+        listening("nearest:Nearest", EXAMPLES) as (word, _),
+        HostedPolicy(envs[1], guest_of(word), word, 60.0, 60.0) as outside,
+    ):
+        states = [env.reset() for env in envs]
+        for _ in range(6):
+            states = [policy(state) for policy, state in zip((inside, outside), states, strict=True)]
+            assert all(torch.equal(states[0][name], states[1][name]) for name in (REGION, OFFSET))
+            assert not states[1]["lost"].any()
+            assert (states[1]["decision_seconds"][:, 0].numpy() > 0)[outside.sight.active].all()
+            states = [env.step(state)["next"] for env, state in zip(envs, states, strict=True)]
+    assert float(states[0]["info", "coverage"].mean()) > 0.4
+
+
+@pytest.mark.parametrize(("kind", "reason"), {
+    "Raises": "it gave up: KeyError in hostile.py, line", "Exits": "it closed the connection",
+    "Dies": "it closed the connection", "Sleeps": "it gave no answer in 3 s", "Spins": "it gave no answer in 3 s",
+    "WrongShape": "it returned numbers of shape [4, 2]: goals must be numbers [3, 2]",
+    "Infinite": "it returned a goal that is infinite", "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
+    "Noise": "it answered garbage (a message that is no", "Deaf": "it gave no answer in 3 s",
+    "BadReset": "it gave up: RuntimeError in hostile.py, line",
+}.items())  # fmt: skip
+def test_a_fault_costs_its_episode_and_nothing_else(kind, reason):
+    with listening(f"hostile:{kind}") as (word, _):
+        final, reasons, bad, _ = play_hosted(word, 60.0, 3.0 if "no answer" in reason else 60.0)
+    assert 0 < sum(bad) < ENVS and [bool(one) for one in reasons] == bad
+    assert all(one.startswith(reason) for one in reasons if one), reasons
+    steps = [20 * ((kind != "BadReset") if one else STEPS) for one in bad]
+    assert final["local_steps"][:, 0].tolist() == steps
+
+
+def test_an_answer_too_many_is_no_answer_to_the_next_question():
+    with listening("hostile:Twice") as (word, _):
+        _, reasons, bad, _ = play_hosted(word)
+    assert [bool(one) for one in reasons] == bad and {one for one in reasons if one} == {"it spoke without being asked"}
+
+
+def test_who_is_gone_loses_its_episodes_and_the_run_goes_on():
+    env = make_env(1, macro_steps=3)
+    with listening("hostile:Stays") as (word, server):
+        with HostedPolicy(env, guest_of(word), word, 60.0, 60.0) as policy:
+            play(policy, env, torch.tensor([0]))
+            assert policy.reasons == [""]
+            server.send_signal(signal.SIGINT)
+            server.wait()
+            for told in ("it closed the connection", *2 * ["nobody can be reached at 127.0.0.1, port"]):
+                final = play(policy, env, torch.tensor([1]))
+                assert policy.reasons[0].startswith(told) and "\n" not in policy.reasons[0]
+                assert int(final["local_steps"]) == 0
+
+
+def test_what_plays_elsewhere_ends_with_its_connection(tmp_path):
+    """A planner that thinks for ever is not left to burn a processor."""
+    script = tmp_path / "spin"
+    script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/number\nwhile :; do :; done\n")
+    script.chmod(0o755)
+    with listening(f"exec:{script}") as (word, _):
+        guest = guest_of(word)()
+        wait_for(lambda: (tmp_path / "number").exists() and (tmp_path / "number").read_text().strip())
+        number = int((tmp_path / "number").read_text())
+        assert alive(number)
+        guest.kill()
+        wait_for(lambda: not alive(number))
+
+
+def wait_for(what, seconds: float = 20.0) -> None:
+    """Until it is so."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_listener_that_takes_one_after_another_is_enough():
+    with answering(stays) as word:
+        player = Player(word)
+        assert player.hosted and player.most_teams == 1 and player.name == word
+        env = make_env(1, macro_steps=2)
+        with player.open(env) as policy:
+            for number in range(3):
+                assert int(play(policy, env, torch.tensor([number]))["local_steps"]) == 40
+                assert policy.reasons == [""]
+
+
+def silent(link):
+    link.recv(2**20)
+    threading.Event().wait(5.0)
+
+
+@pytest.mark.parametrize(("reply", "told"), [
+    (silent, "it gave no answer in 1 s"), (lambda link: None, "it closed the connection"),
+    (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "it answered garbage"),
+    (lambda link: link.sendall(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
+    (lambda link: link.sendall(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
+])  # fmt: skip
+def test_who_is_no_policy_is_told_before_anything_is_played(reply, told, monkeypatch):
+    monkeypatch.setattr(hosted, "START", 1.0 if reply is silent else 30.0)
+    with answering(reply) as word, pytest.raises(UserError, match=told) as error:
+        Player(word)
+    assert str(error.value).startswith(f"policy={word}") and "\n" not in str(error.value)
+
+
+def test_nobody_there_is_told_before_anything_is_played():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(UserError, match=f"nobody can be reached at 127.0.0.1, port {port} .*refused"):
+        Player(f"socket:127.0.0.1:{port}")
+    with pytest.raises(UserError, match="nobody can be reached at no.such.host.invalid, port 5000"):
+        Player("socket:no.such.host.invalid:5000")
+
+
+@pytest.mark.parametrize(
+    "word", ["socket:", "socket:5000", "socket:a:", "socket:a:0", "socket:a:65536", "socket:a:x", "socket:a:²"]
+)
+def test_what_is_no_address_is_told(word):
+    with pytest.raises(UserError, match="is no HOST:PORT, as localhost:5000") as error:
+        Player(word)
+    assert str(error.value).startswith(f"policy={word} ")
+
+
+def test_addresses():
+    assert address_of("socket:localhost:5000") == ("localhost", 5000)
+    assert address_of("[::1]:80") == ("::1", 80)
