@@ -170,7 +170,7 @@ def silent(link):
 
 @pytest.mark.parametrize(("reply", "told"), [
     (silent, "it gave no answer in 1 s"), (lambda link: None, "it closed the connection"),
-    (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "it answered garbage"),
+    (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "garbage|unasked|without being asked"),
     (lambda link: link.sendall(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
     (lambda link: link.sendall(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
 ])  # fmt: skip

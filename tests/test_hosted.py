@@ -125,7 +125,7 @@ def test_the_next_episode_has_a_new_process():
 @pytest.mark.parametrize(("word", "told"), [
     ("hostile:Nobody", "AttributeError"), ("nowhere:Nobody", "ModuleNotFoundError"), ("exec:true", "it ended"),
     ("exec:/no/such/program", "cannot be started"), ("exec:", "names no command"), ("exec:'a", "No closing quotation"),
-    ("exec:yes", "garbage"), ("exec:sleep 1000", "it gave no answer in 2 s"),
+    ("exec:yes", "garbage|spoke without being asked"), ("exec:sleep 1000", "it gave no answer in 2 s"),
     ("process:hostile:factory", "is no class with act"),
     ("process:nobody", "policy=nobody is unknown"), ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
 ])  # fmt: skip

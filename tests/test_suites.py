@@ -267,6 +267,7 @@ def test_an_edited_run_is_not_believed_and_what_differs_is_named(copy, small, ki
 def test_a_stopped_run_goes_on_to_the_same_results(small, played, tmp_path, monkeypatch, capsys):
     where = tmp_path / "run"
     words = ["suite", "run", str(small), "policy=nearest_frontier", "num_envs=3", f"hydra.run.dir={where}"]
+    words += ["name=our nearest mark 2"]
     play, batches = SuiteRun._play_part, []
 
     def stop_in_the_second_part(self, name):
@@ -285,8 +286,9 @@ def test_a_stopped_run_goes_on_to_the_same_results(small, played, tmp_path, monk
     assert main(["suite", "run", f"resume={where}"]) == 0
     assert (where / "actions" / "indoor_small-0000.npz").stat().st_mtime_ns == kept
     one, other = (json.loads((place / "results.json").read_text()) for place in (played, where))
-    for name in ("suite", "policy", "score", "parts", "reference", "episodes", "maps", "profile"):
+    for name in ("suite", "score", "parts", "reference", "episodes", "maps", "profile"):
         assert one[name] == other[name], name
+    assert (one["policy"], other["policy"]) == ("nearest_frontier", "our nearest mark 2")
     assert verify(where, str(small))["verified"] and not batches
 
 
