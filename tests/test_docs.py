@@ -1,4 +1,4 @@
-"""What the documentation shows works: its Python blocks run, its diffs apply, its links lead somewhere."""
+"""What the documentation shows works: its Python blocks run, its patches apply, its links lead somewhere."""
 
 import re
 import runpy
@@ -24,6 +24,8 @@ from maexp.kernels.state import STATE
 from maexp.kernels.types import PICTURE_CHANNELS
 
 ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "docs" / "examples"
+PATCHES = sorted((EXAMPLES / "patches").glob("*.diff"))
 PAGES = sorted((ROOT / "docs").rglob("*.md")) + [ROOT / "README.md"]
 SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
 """The README shows sizes that people use; here they would take too long."""
@@ -31,9 +33,9 @@ PLANNERS = get_args(PlannerConfig.__dataclass_fields__["name"].type)
 SHIPPED = {
     "reward terms": (len(REWARD_TERMS), 5), "parameters of robots": (len(fields(RobotConfig)), 10),
     "kinds of robots": (len(ROBOT_KINDS), 3), "planners": (len(PLANNERS), 3), "features": (len(FEATURES), 32),
-    "channels": (PICTURE_CHANNELS, 4), "arrays of the state": (len(STATE), 37),
+    "channels": (PICTURE_CHANNELS, 4), "arrays of the state": (len(STATE), 49),
 }  # fmt: skip
-"""What docs/extending.md adds to: how many there are, and how many it is written for."""
+"""What the patches add to: how many there are, and how many they are written for."""
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -105,13 +107,13 @@ def test_episode_files_and_recorders(tmp_path, monkeypatch):
 
 def test_the_planner_of_the_arena_is_the_example_and_short():
     (code,) = blocks("docs/arena.md", "python")
-    assert code == (ROOT / "docs" / "examples" / "policies" / "nearest.py").read_text()
+    assert code == (EXAMPLES / "policies" / "nearest.py").read_text()
     assert len([line for line in code.splitlines() if line.strip()]) <= 30
 
 
 def test_the_greedy_planner_weighs_distance_and_length_and_gives_up():
     """A hall of 20 x 9 m whose walls have a gap of 1 m near the robot, on the left, and one of 5 m on the right."""
-    example = runpy.run_path(str(ROOT / "docs" / "examples" / "policies" / "greedy.py"))
+    example = runpy.run_path(str(EXAMPLES / "policies" / "greedy.py"))
     grid = np.full((1, 11, 22), 100, np.int8)
     grid[0, 1:-1, 1:-1] = 0
     grid[0, 5, 0] = grid[0, 3:8, -1] = -1
@@ -166,25 +168,29 @@ def test_every_block_of_extending_is_tested():
     assert len(blocks("docs/extending.md", "python")) == 4
 
 
-@pytest.mark.skipif(shutil.which("git") is None, reason="git is absent: diffs are not checked")
-@pytest.mark.parametrize("number", range(7))
-def test_diffs_apply(number):
-    """To the tree as it ships. Where something was added, lines beside it have moved: that is no fault of the page."""
-    patches = blocks("docs/extending.md", "diff")
-    assert len(patches) == 7
-    done = subprocess.run(
-        ["git", "apply", "--check", "-"], input=patches[number], text=True, capture_output=True, cwd=ROOT
-    )
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is absent: patches are not checked")
+@pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.stem)
+def test_patches_apply(patch):
+    """To the tree as it ships. Where something was added, lines beside it have moved: that is no fault of the patch."""
+    done = subprocess.run(["git", "apply", "--check", patch], text=True, capture_output=True, cwd=ROOT)
     own = [f"{count - shipped} {what}" for what, (count, shipped) in SHIPPED.items() if count > shipped]
     if done.returncode and own:
-        pytest.skip(f"DIFF {number} OF docs/extending.md IS FOR THE TREE AS IT SHIPS; here are more: {', '.join(own)}")
-    assert done.returncode == 0, f"write this diff of docs/extending.md anew:\n{done.stderr}"
+        pytest.skip(f"{patch.name} IS FOR THE TREE AS IT SHIPS; here are more: {', '.join(own)}")
+    assert done.returncode == 0, f"write {patch.relative_to(ROOT)} anew:\n{done.stderr}"
 
 
-@pytest.mark.parametrize(("what", "number"), [("a-parameter-of-robots", 0), ("a-reward-term", 6)])
-def test_the_table_of_extending_counts_the_files(what, number):
+def test_extending_shows_every_patch():
+    shown = re.findall(r"\{literalinclude\} examples/patches/(.*)", (ROOT / "docs/extending.md").read_text())
+    assert sorted(shown) == [patch.name for patch in PATCHES] and len(shown) == 7
+
+
+COUNTED = [("a-parameter-of-robots", "robot_parameter"), ("a-reward-term", "reward_term")]
+
+
+@pytest.mark.parametrize(("what", "patch"), COUNTED)
+def test_the_table_of_extending_counts_the_files(what, patch):
     page = (ROOT / "docs/extending.md").read_text()
-    files = re.findall(r"^\+\+\+ b/(\S+)", blocks("docs/extending.md", "diff")[number], re.MULTILINE)
+    files = re.findall(r"^\+\+\+ b/(\S+)", (EXAMPLES / "patches" / f"{patch}.diff").read_text(), re.MULTILINE)
     assert int(re.search(rf"\(#{what}\) \| (\d)", page)[1]) == len(files) == len(set(files))
     assert what != "a-reward-term" or files == ["envs/config/reward.py", "kernels/reward.py"]
 
