@@ -18,6 +18,7 @@ from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
+from maexp.agents.settings.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings, read_free_groups
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import (
@@ -27,15 +28,8 @@ from maexp.agents.settings.resolved import (
     planner_config,
     robot_config,
 )
-from maexp.agents.settings.schema import (
-    SUPPLIED,
-    CommonSettings,
-    LearnerSettings,
-    ScenarioSettings,
-    TrainSettings,
-    read,
-    read_free_groups,
-)
+from maexp.agents.settings.storable import read
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import (
     ExplorationEnv,
     PointCloudMap,

@@ -11,7 +11,7 @@ from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import POLICIES, find_override, find_sweeps
 from maexp.agents.settings.resolved import resolve, without_hydra
-from maexp.agents.settings.schema import NAMES
+from maexp.agents.settings.verbs.evaluate import NAMES
 from maexp.envs.scenarios import SCENARIOS
 
 RUNS = ("resume", "checkpoint", "place")

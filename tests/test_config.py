@@ -14,7 +14,8 @@ from maexp.agents.settings.compose import compose_config, group_choices, groups
 from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
 from maexp.agents.settings.resolved import planner_config
-from maexp.agents.settings.schema import SCHEMAS, schema
+from maexp.agents.settings.schema import schema
+from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import PlannerConfig, RadarConfig, RobotConfig
 from maexp.envs.scenarios import SCENARIOS
 

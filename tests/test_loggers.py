@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from maexp.agents.evaluation.results import COLUMNS
-from maexp.agents.settings.schema import LoggerSettings
+from maexp.agents.settings.groups import LoggerSettings
 from maexp.agents.training.logs import MetricsLog, log_results
 
 

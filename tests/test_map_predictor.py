@@ -26,8 +26,8 @@ from maexp.agents.networks.map_predictor import (
     predictor_names,
     sample_worlds,
 )
+from maexp.agents.settings.groups import ScenarioSettings
 from maexp.agents.settings.indices import map_indices
-from maexp.agents.settings.schema import ScenarioSettings
 from maexp.agents.training import beliefs, map_predictor, predictor_score
 from maexp.agents.training.beliefs import NEVER, BeliefConfig, Episode
 from maexp.agents.training.map_predictor import PredictorConfig

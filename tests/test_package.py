@@ -48,7 +48,7 @@ def test_rooms_of_agents_import_only_those_before_them():
     agents = ROOT / "agents"
     assert set(order) == {path.parent.name for path in agents.glob("*/*.py")}
     for place, room in enumerate(order):
-        text = "".join(path.read_text() for path in (agents / room).glob("*.py"))
+        text = "".join(path.read_text() for path in (agents / room).rglob("*.py"))
         used = set(re.findall(r"from maexp\.agents\.(\w+)[. ]", text)) & set(order)
         assert used <= set(order[: place + 1]), room
 

@@ -9,7 +9,8 @@ import pytest
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
 from maexp.agents.settings.model import SIZES, ModelConfig
-from maexp.agents.settings.schema import SCHEMAS, schema
+from maexp.agents.settings.schema import schema
+from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import (
     CommConfig,
     LookaheadConfig,

@@ -32,7 +32,7 @@ from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import PLAYED
-from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
+from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.training.named import Player, suit_observation
 from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config

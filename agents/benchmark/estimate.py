@@ -13,7 +13,7 @@ from maexp.agents.benchmark.plan import Cell, as_list, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner, set_steps
 from maexp.agents.errors import blame_input
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.settings.schema import BenchmarkSettings
+from maexp.agents.settings.verbs import BenchmarkSettings
 from maexp.envs.scenarios import find_scenario
 
 FRAMES = 48  # macro steps of teams in a measured batch, at least, where a batch of the training has as many

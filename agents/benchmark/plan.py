@@ -17,7 +17,7 @@ from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
-from maexp.agents.settings.schema import BenchmarkSettings, TrainSettings
+from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.training.named import Player, check_planner, find_player, name_players
 from maexp.agents.words import as_list, check_names
 from maexp.envs.scenarios import cut_last_fifth, find_scenario, split

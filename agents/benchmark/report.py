@@ -21,7 +21,7 @@ from maexp.agents.evaluation.comparison import find_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, join, pool
 from maexp.agents.files import short, write_json, write_text
 from maexp.agents.policies.classical import CLASSICAL
-from maexp.agents.settings.schema import BenchmarkSettings
+from maexp.agents.settings.verbs import BenchmarkSettings
 from maexp.agents.versions import PACKAGES, find_commit
 
 Samples = dict[str, dict[str, np.ndarray]]  # policy -> scenario -> a number for each episode

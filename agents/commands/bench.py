@@ -9,7 +9,7 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.overrides import find_override, move_sweeps
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import BenchSettings
+from maexp.agents.settings.verbs import BenchSettings
 
 ONE_VALUE = ("task", "seconds", "baseline", "largest", "device", "hydra")
 

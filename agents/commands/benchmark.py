@@ -30,7 +30,7 @@ from maexp.agents.settings.checks import check_counts, check_steps
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import BenchmarkSettings
+from maexp.agents.settings.verbs import BenchmarkSettings
 from maexp.agents.training.train import stop_on_signals, write_config
 
 NOTE = "What is absent here each cell has from its scenario and its algorithm: see cells/*/*/*/config.yaml."

@@ -35,7 +35,7 @@ from maexp.agents.settings.checks import check_counts, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
+from maexp.agents.settings.verbs import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
 from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
 from maexp.agents.training.named import Player, check_planner, find_players, suit_observation
 from maexp.agents.training.train import write_config

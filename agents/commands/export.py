@@ -14,7 +14,7 @@ from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import ExportSettings
+from maexp.agents.settings.verbs import ExportSettings
 from maexp.agents.training.checkpoint import find_checkpoint
 
 

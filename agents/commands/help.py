@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 def verb_help(name: str, verb: "Verb") -> str:
     """The help of a verb: its settings and choices with what is taken without a word; the choices are the files of
     `conf/` with the comment on their first line."""
-    from maexp.agents.settings.schema import describe, schema
+    from maexp.agents.settings.schema import schema
+    from maexp.agents.settings.storable import describe
 
     kind, defaults = schema(name), compose_config(name, [], whole=False)
     lines = [f"maexp {name}: {verb.summary}", ""]

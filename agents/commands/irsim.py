@@ -11,7 +11,8 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import IrsimSettings, read
+from maexp.agents.settings.storable import read
+from maexp.agents.settings.verbs import IrsimSettings
 from maexp.agents.training.named import find_player
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.film import write_gif

@@ -8,7 +8,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.progress import Progress
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import LeaderboardSettings
+from maexp.agents.settings.verbs import LeaderboardSettings
 
 # What needs torch is imported where it is used.
 

@@ -13,7 +13,8 @@ from maexp.agents.files import command, write_text
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import MapsSettings, read
+from maexp.agents.settings.storable import read
+from maexp.agents.settings.verbs import MapsSettings
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.importing import ImportOptions, ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.importing.bags import is_bag

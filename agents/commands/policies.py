@@ -7,7 +7,7 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.folder import CARD, read_contract
 from maexp.agents.runtime.shipped import SHIPPED, find_policy, shipped_names
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import PoliciesSettings
+from maexp.agents.settings.verbs import PoliciesSettings
 
 
 def prepare(overrides: list[str]) -> Recipe:

@@ -11,7 +11,7 @@ from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.driver import DriverSettings, TeamDriver, read_settings
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import Ros2Settings
+from maexp.agents.settings.verbs import Ros2Settings
 from maexp.agents.suites.suite import load_suite, suite_names
 from maexp.agents.words import as_list
 

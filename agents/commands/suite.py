@@ -15,7 +15,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import SuiteSettings
+from maexp.agents.settings.verbs import SuiteSettings
 from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.

@@ -23,7 +23,8 @@ from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.compose import compose_config, compose_recipe, explain
 from maexp.agents.settings.overrides import find_override, find_sweeps, quote, set_names, without
 from maexp.agents.settings.resolved import without_hydra
-from maexp.agents.settings.schema import TrainSettings, register_schema
+from maexp.agents.settings.schema import register_schema
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import list_checkpoints
 
 SWEEP, FORMAT = "sweep.json", "maexp-sweep-1"

@@ -19,7 +19,7 @@ from maexp.agents.locking import lock
 from maexp.agents.settings.checks import check_counts, check_seed, team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import TrainSettings
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger, log_results

@@ -16,7 +16,8 @@ from maexp.agents.files import command, short
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
-from maexp.agents.settings.schema import ViewSettings, read
+from maexp.agents.settings.storable import read
+from maexp.agents.settings.verbs import ViewSettings
 from maexp.agents.training.checkpoint import find_checkpoint, is_run
 from maexp.agents.training.named import check_planner, find_player, suit_observation
 from maexp.envs import PointCloudMap, import_map, make_map

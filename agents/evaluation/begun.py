@@ -9,7 +9,7 @@ from maexp.agents.files import short, write_text
 from maexp.agents.settings.overrides import from_root, set_names
 from maexp.agents.settings.resolved import flatten, plain
 from maexp.agents.settings.runs import Recipe
-from maexp.agents.settings.schema import EvaluateSettings
+from maexp.agents.settings.verbs import EvaluateSettings
 
 ASKED, FORMAT = "evaluation.json", "maexp-evaluation-1"
 PATHS = ("checkpoint", "baseline")

@@ -12,7 +12,7 @@ from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.settings.schema import EpisodeSettings
+from maexp.agents.settings.verbs import EpisodeSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
 

@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from maexp.agents.errors import UserError
-from maexp.agents.settings.schema import EvaluateSettings
+from maexp.agents.settings.verbs import EvaluateSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.film import write_gif, write_mp4
 from maexp.envs.render import add_headline, draw_frame, draw_grid, watch_episode

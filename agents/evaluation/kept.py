@@ -14,9 +14,9 @@ import torch
 
 from maexp.agents.checksums import checksums
 from maexp.agents.files import write_file
+from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import PLAYED
-from maexp.agents.settings.schema import CommonSettings
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
 from maexp.envs.map import MapError, read_npz

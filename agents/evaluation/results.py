@@ -14,7 +14,7 @@ from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.evidence import brackets, describe_evidence
 from maexp.agents.evaluation.headroom import headroom_shares
 from maexp.agents.files import write_json
-from maexp.agents.settings.schema import EpisodeSettings
+from maexp.agents.settings.verbs import EpisodeSettings
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.metrics import in_reach
 

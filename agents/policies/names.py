@@ -7,7 +7,7 @@ from importlib import metadata
 from maexp.agents.errors import UserError
 from maexp.agents.policies.guest import GROUP
 from maexp.agents.runtime.shipped import CONTRACT, advise, shipped_names
-from maexp.agents.settings.schema import NAMES
+from maexp.agents.settings.verbs.evaluate import NAMES
 
 
 def plug_ins() -> dict[str, metadata.EntryPoint]:

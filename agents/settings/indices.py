@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_counts
-from maexp.agents.settings.schema import ScenarioSettings
+from maexp.agents.settings.groups import ScenarioSettings
 from maexp.envs.scenarios import cut_last_fifth, split
 
 

@@ -9,23 +9,15 @@ from omegaconf import DictConfig, OmegaConf
 from maexp.agents.settings.algorithms import Settings, find_tunings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
+from maexp.agents.settings.groups import CommonSettings, LearnerSettings, ScenarioSettings, read_free_groups
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.schema import (
-    CommonSettings,
-    LearnerSettings,
-    ScenarioSettings,
-    helps,
-    read,
-    read_free_groups,
-    schema,
-)
-from maexp.envs.config import BODY, PlannerConfig, RadarConfig, RobotConfig, supplied
+from maexp.agents.settings.schema import schema
+from maexp.agents.settings.storable import helps, read
+from maexp.envs.config import BODY, GROUPS, PlannerConfig, RadarConfig, RobotConfig, supplied
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
 
-FOLLOWERS = {"robot": RobotConfig, "radar": RadarConfig, "planner": PlannerConfig}
-"""Groups with settings that the scenario supplies where they are null."""
 PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
 
 
@@ -165,7 +157,7 @@ def model_settings(cfg: LearnerSettings) -> ModelConfig:
 def find_followers(cfg: DictConfig) -> list[str]:
     """Names of the settings that follow the scenario, as radar.range: null, or a reference to what it says."""
     names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
-    for group, kind in FOLLOWERS.items():
+    for group, kind in GROUPS.items():
         names += [f"{group}.{name}" for name in supplied(kind)]
     found = [name for name in names if _follows(cfg, *name.split("."))]
     return found + ["robot.team"] * bool(cfg.robot.team)

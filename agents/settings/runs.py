@@ -5,7 +5,7 @@
 - Values that the scenario had supplied follow a new scenario; those that the run's own words had set stay.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,23 @@ from maexp.agents.errors import UserError
 from maexp.agents.settings.overrides import find_override, set_names, without
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.settings.schema import schema
+from maexp.envs.config import BODY
+from maexp.envs.config import GROUPS as ENV_GROUPS
 
-GROUPS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
-    "lookahead", "algorithm", "model",
-)  # fmt: skip
-PLAYED = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
-    "lookahead", "num_envs", "num_robots", "seed", "num_threads",
-)  # fmt: skip
+ENV = ("scenario", *ENV_GROUPS)
+GROUPS = (*ENV, "algorithm", "model")
+PLAYED = (*ENV, "num_envs", "num_robots", "seed", "num_threads")
 """Settings that matter to who only plays."""
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
-CALLED = {"radar.range": "radar_range", "robot.length": "body_length", "robot.width": "body_width"}
-"""What the scenario calls them, where that is another name."""
-BODY = ("robot.length", "robot.width", "robot.radius")
-ROUND = ("robot.length", "robot.width", "robot.collision_threshold")  # follow a radius
+SOURCES = {
+    f"{group}.{one.name}": f"scenario.{source}"
+    for group, kind in ENV_GROUPS.items()
+    for one in fields(kind)
+    if (source := one.metadata.get("scenario"))
+}
+"""The settings of the scenario whose values others take; that of another name is called the same."""
+WHEELBASE = ("robot.length", "robot.width", "robot.radius", "robot.team")  # what it follows
+ROUND = tuple(f"robot.{name}" for name in BODY)  # follow a radius
 HELD_OUT = ("scenario.held_out", "scenario.held_out_count")  # one of the two
 
 
@@ -100,9 +102,9 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers
-    gone = [one for one in followers if f"scenario.{CALLED.get(one, one.partition('.')[2])}" in names]
+    gone = [one for one in followers if SOURCES.get(one, f"scenario.{one.partition('.')[2]}") in names]
     gone += [one for one in ROUND if one in followers and "robot.radius" in names]
-    gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*BODY, "robot.team"} & {*names}))
+    gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*WHEELBASE} & {*names}))
     if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode
         gone += ["scenario.macro_steps"] * ("scenario.macro_steps" in followers)
     return gone

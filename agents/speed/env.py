@@ -9,7 +9,7 @@ import torch
 
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.progress import Progress
-from maexp.agents.settings.schema import BenchSettings
+from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.speed.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
 from maexp.envs import ExplorationEnv
 from maexp.envs.simulation import bytes_per_env

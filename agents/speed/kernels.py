@@ -19,7 +19,7 @@ import warp as wp
 from maexp.agents.build import load_maps, make_env, pick_device
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
-from maexp.agents.settings.schema import BenchSettings
+from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.speed.env import advance
 from maexp.agents.speed.shared import (
     LEAST_LAPS,

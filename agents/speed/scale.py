@@ -21,7 +21,7 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts, check_distinct
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
-from maexp.agents.settings.schema import BenchSettings
+from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.speed.env import Batch
 from maexp.agents.speed.shared import LEAST_LAPS, print_table, write_report
 from maexp.envs import PointCloudMap

@@ -20,8 +20,9 @@ from rich.table import Table
 from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.overrides import split_sweeps, without
-from maexp.agents.settings.schema import BenchSettings, CommonSettings
+from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs import ExplorationEnv
 

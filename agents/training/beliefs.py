@@ -23,7 +23,7 @@ from torchrl.envs.utils import step_mdp
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_utility
-from maexp.agents.settings.schema import storable
+from maexp.agents.settings.storable import storable
 from maexp.envs import ExplorationEnv, MapError, ObservationConfig, PlannerConfig, PointCloudMap, make_map
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.importing.finish import crop_grid, finish_map

@@ -17,9 +17,9 @@ from maexp.agents.errors import UserError, advise_on_disk
 from maexp.agents.files import command, short, write_file
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.networks.weights import load_matching
+from maexp.agents.settings.groups import LearnerSettings
 from maexp.agents.settings.model import SIZES, ModelConfig
 from maexp.agents.settings.resolved import flatten
-from maexp.agents.settings.schema import LearnerSettings
 from maexp.envs import ExplorationEnv
 
 NAME = re.compile(r"iteration_(\d+)\.pt")

@@ -23,7 +23,7 @@ from maexp.agents.networks.distributions import ACTION
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.resolved import model_settings
-from maexp.agents.settings.schema import TrainSettings
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collect import batch_statistics, divide_teams
 from maexp.agents.training.named import Player, check_planner, find_player, suit_observation
 from maexp.agents.training.train import TrainingRun

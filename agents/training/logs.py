@@ -14,7 +14,7 @@ from typing import Any
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.results import COLUMNS
 from maexp.agents.files import write_text
-from maexp.agents.settings.schema import LoggerSettings
+from maexp.agents.settings.groups import LoggerSettings
 
 MODES = ("online", "offline")
 RESULTS = "summary.json"

@@ -22,8 +22,8 @@ from maexp.agents.policies.load import is_exported, load_policy_folder, open_pol
 from maexp.agents.policies.names import describe_unknown, plug_ins
 from maexp.agents.policies.own import find_own, is_foreign, is_reference, make_own, source_of
 from maexp.agents.settings.checks import check_distinct
+from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.resolved import flatten
-from maexp.agents.settings.schema import CommonSettings
 from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, model_of, restore_policy
 from maexp.envs import ExplorationEnv, PointCloudMap
 

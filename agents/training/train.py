@@ -37,7 +37,7 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
 from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
-from maexp.agents.settings.schema import TrainSettings
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import (
     check_action,
     find_checkpoint,

@@ -17,7 +17,7 @@ from maexp.agents.evaluation.comparison import DECIDES, play_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, join
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.settings.checks import team_sizes, words_of
-from maexp.agents.settings.schema import TrainSettings
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
 

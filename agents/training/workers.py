@@ -24,7 +24,8 @@ from torchrl.collectors import BaseCollector, MultiSyncCollector
 from maexp.agents.build import choose_device, choose_starts, make_env
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
-from maexp.agents.settings.schema import CollectorSettings, TrainSettings
+from maexp.agents.settings.groups import CollectorSettings
+from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collect import Experience, TeamCollector, Teams, WorkerLost
 from maexp.envs import PointCloudMap
 

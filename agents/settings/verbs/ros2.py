@@ -1,0 +1,33 @@
+"""Settings of `maexp ros2`."""
+
+from dataclasses import dataclass, fields, make_dataclass
+from typing import Any
+
+from omegaconf import MISSING
+
+from maexp.agents.runtime.driver import DriverSettings
+from maexp.envs.fields import setting
+
+DriveSettings = make_dataclass(
+    "DriveSettings",
+    [(one.name, Any, setting(None if one.default == () else one.default, f"team: {one.metadata['help']}"))
+     for one in fields(DriverSettings)],
+)  # fmt: skip
+
+
+@dataclass
+class Ros2Settings(DriveSettings):
+    """`maexp ros2`."""
+
+    task: str = MISSING
+    place: str | None = setting(None, "serve: the suite, or the .yaml file of one")
+    domain: int | None = setting(None, "number of DDS's domain; default: ROS_DOMAIN_ID, or 0")
+    answer: float = setting(60.0, "how long the other side may be silent before this ends [s]")
+    robots: Any = setting(None, "namespaces, a,b,c; serve: default robot1,robot2,...")
+    name: str = setting("ros2", "serve: what results call those who play")
+    seed: int | None = setting(None, "serve: plays other maps and starts than the frozen ones, those of this seed")
+    resume: str | None = setting(None, "serve: folder of a run to go on with")
+    tf: str = setting("shared", "serve: /tf with frames NAME/base_link; own: /NAME/tf with base_link")
+    wait_for: str = setting("all", "serve: the clock waits until all robots have a new goal; idle: those without one")
+    stands: float = setting(5.0, "serve: how long the clock stands still for goals [s]")
+    limit: float = setting(10.0, "serve: how long it runs on then, before robots without a goal stay [s]")
