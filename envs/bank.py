@@ -26,7 +26,8 @@ class MapBank:
     ``arrays`` holds every field of `kernels.types.Maps`; ``order[m]`` the permutation from the sorted
     free (``order_boundary``: boundary) points back to the map's own order; the counts bound how many
     points can ever be in range of a robot, so that buffers of that size cannot overflow. ``grids`` are the navigation
-    grids of maps that have theirs from elsewhere, as `nav_grid.bank_nav_grids` gives them.
+    grids of maps that have theirs from elsewhere, as `nav_grid.bank_nav_grids` gives them, and ``block_sides`` what
+    `nav_grid.bank_block_sides` gives for them.
     """
 
     maps: list[PointCloudMap]
@@ -39,6 +40,7 @@ class MapBank:
     boundary_in_range: int
     occluders_in_range: int
     grids: tuple[NavGrids, int] | None = None
+    block_sides: np.ndarray | None = None
 
     def tensors(self, device: torch.device) -> dict[str, torch.Tensor]:
         """The arrays as tensors on ``device``."""

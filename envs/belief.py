@@ -23,7 +23,7 @@ from maexp.envs.nav_grid import bank_nav_grids
 from maexp.envs.navigation import Navigation
 from maexp.envs.targets import TargetTracker
 from maexp.kernels.belief import NOBODY, recall, write_worlds
-from maexp.kernels.blocks import block_sides
+from maexp.kernels.block_size import block_sides
 from maexp.kernels.constants import FREE, MARGIN_CELLS, OBSTACLE, UNKNOWN
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, record, replay
@@ -53,7 +53,7 @@ class WorldSizes:
     def around(cls, grids: NavGrids, most: float, least: float) -> WorldSizes:
         """Grids around the true ones, for radars that reach `most` and at least `least` metres."""
         edge, width, height = (getattr(grids, name).numpy() for name in ("cell", "width", "height"))
-        block = block_sides(edge, least)
+        block = block_sides(edge, least, width, height)  # as in the true grids
         margin = (np.ceil((np.ceil(most / edge) + 1) / block) * block).astype(np.int32)
         return cls(
             edge=edge,
@@ -147,7 +147,7 @@ def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> Imagin
         maps=[ImaginedMap(f"imagined_{k}", finest, side) for k in range(worlds)],
         arrays=arrays | scalars, order_free=[], order_boundary=[], max_free=points, max_boundary=points,
         free_in_range=in_range, boundary_in_range=in_range, occluders_in_range=in_range,
-        grids=(grids, width * height),
+        grids=(grids, width * height), block_sides=np.full(worlds, sizes.block.min()),
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from maexp.envs.bank import MapBank
 from maexp.envs.map import BOUNDARY_REACH, PointCloudMap
+from maexp.kernels.block_size import block_sides
 from maexp.kernels.known_grid import NavGrids
 
 
@@ -123,6 +124,14 @@ def list_voids(stand_in: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     voids = np.flatnonzero((stand_in >= 0) & (stand_in != np.arange(len(stand_in))))
     voids = voids[np.argsort(stand_in[voids], kind="stable")]
     return np.bincount(stand_in[voids], minlength=len(stand_in)), voids.astype(np.int32)
+
+
+def bank_block_sides(bank: MapBank, reach: float) -> np.ndarray:
+    """Edges of the blocks of frontier cells on each map of a bank, int32 [M], in cells, for a radar's reach [m]."""
+    if bank.block_sides is not None:
+        return bank.block_sides
+    width, height = np.array([grid_shape(one) for one in bank.maps]).T
+    return block_sides(np.array([one.resolution for one in bank.maps]), reach, width, height)
 
 
 def bank_nav_grids(bank: MapBank, device: str = "cpu") -> tuple[NavGrids, int]:

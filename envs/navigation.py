@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from maexp.envs.nav_grid import bank_nav_grids
+from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids
 from maexp.envs.simulation import navigation_bytes, refuse_too_many
 from maexp.kernels import goals, outlook, targets
 from maexp.kernels.blocks import FrontierBlocks
@@ -91,7 +91,7 @@ class Navigation:
         room = np.ascontiguousarray((comfort * (OPEN_GROUND / COMFORT))[:, mask_of_robot])
         self.room = wp.array(room, dtype=wp.float32, device=str(env.device))
         least = min(r.range for r in env.radar_configs)
-        self.blocks = FrontierBlocks(self.paths, least, float(threshold.max()))
+        self.blocks = FrontierBlocks(self.paths, bank_block_sides(env.bank, least), float(threshold.max()))
         self.num_blocks = self.blocks.num_blocks
         self._make_views(cells)
         self._all = self._listed = torch.arange(self.num_envs, dtype=torch.int32, device=env.device)

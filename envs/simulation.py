@@ -10,8 +10,8 @@ import warp as wp
 
 from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
-from maexp.envs.nav_grid import bank_nav_grids, build_nav_grid, grid_shape, open_cells
-from maexp.kernels.blocks import block_memory_per_env, block_sides
+from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
+from maexp.kernels.blocks import block_memory_per_env
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
@@ -222,10 +222,8 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
 def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
     """What a `Navigation` and the targets that it finds keep of one env."""
     grids, reach = grid_sizes(settings, bank), min(one.range for one in settings.radar)
-    blocks = 0
-    for one in bank.maps:
-        side = int(block_sides(np.float32(one.resolution), reach))
-        blocks = max(blocks, math.prod(-(-cells // side) for cells in grid_shape(one)))
+    sides = zip(bank.maps, bank_block_sides(bank, reach).tolist(), strict=True)
+    blocks = max(math.prod(-(-cells // side) for cells in grid_shape(one)) for one, side in sides)
     kept = block_memory_per_env(grids["cells"], grids["known_rows"], grids["wall_words"], blocks)
     in_vain = 4 * grids["robots"] * blocks  # decisions in vain of every robot (`TargetTracker`)
     return grid_memory_per_env(**grids, shared=settings.device.type == "cpu") + kept + in_vain

@@ -7,7 +7,7 @@ numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the e
 import numpy as np
 import warp as wp
 
-from maexp.kernels.constants import BLOCKS_PER_RANGE, MARGIN_CELLS, UNREACHED
+from maexp.kernels.constants import MARGIN_CELLS, UNREACHED
 from maexp.kernels.frontier import is_frontier
 from maexp.kernels.known_grid import NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
@@ -293,17 +293,12 @@ def _list_blocks(
     count[e] = found
 
 
-def block_sides(cell: np.ndarray, reach: float) -> np.ndarray:
-    """Edges of blocks, in cells, on grids with cells of these sizes [m], for a radar that reaches so far [m]."""
-    return np.maximum(2, np.round(reach / cell / BLOCKS_PER_RANGE)).astype(np.int32)
-
-
 class FrontierBlocks:
     """The blocks of a run of envs, brought up to date after every search of `paths` from all robots.
 
     Args:
         paths: known grids, masks and distances.
-        radar_range: of the robot that sees least far [m].
+        side: int32 [grid], edges of blocks in cells (`block_size.block_sides`).
         threshold: the largest collision threshold [m]: so far outside its block, and a little more, may a target lie.
 
     Attributes:
@@ -317,12 +312,11 @@ class FrontierBlocks:
         looked_at: int32 [E * R, K, 2], lower and upper corner of what was looked at from there.
     """
 
-    def __init__(self, paths: PathSearch, radar_range: float, threshold: float):
+    def __init__(self, paths: PathSearch, side: np.ndarray, threshold: float):
         known = paths.passable.known
         rows, cells = known.known.shape
         device, envs = known.known.device, rows // known.rows_per_env
         cell, width, height = (getattr(known.grids, name).numpy() for name in ("cell", "width", "height"))
-        side = block_sides(cell, radar_range)
         search = np.ceil(threshold / cell + MARGIN_CELLS).astype(np.int32) + 1
         self.paths, self.tallest = paths, int(height.max())
         self.num_blocks = int((-(-width // side) * -(-height // side)).max())

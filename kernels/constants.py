@@ -17,5 +17,4 @@ COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: 
 SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells along x and y
 
 # Targets.
-BLOCKS_PER_RANGE = 4.0  # blocks of frontier cells along the radar's range
 RAYS = 48  # rays that look around from a target

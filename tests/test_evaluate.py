@@ -253,6 +253,16 @@ def test_what_figures_rest_on_is_said_where_it_is_little(rows, wanted):
     assert describe_evidence([Evidence(f"p{k}", *row) for k, row in enumerate(rows)]) == wanted
 
 
+def test_a_team_that_sees_the_map_from_the_start_is_told(capsys):
+    env = ExplorationEnv(make_map("maze_small", 0), num_envs=2, num_robots=50, macro_steps=2)
+    result = evaluate_recorded(POLICIES["random"](env), env, 2)
+    print_results([result], "maze")
+    told = "In 2 of 2 episodes 50 robots saw 95 % of the map from the start"
+    assert told in capsys.readouterr().out
+    print_results([replace(result, coverage=0.9 * result.coverage)], "maze")
+    assert "from the start" not in capsys.readouterr().out
+
+
 def test_eight_copies_are_not_ahead(tmp_path, monkeypatch, capsys):
     """All episodes from one start: policies that draw nothing play one and the same eight times."""
     monkeypatch.chdir(tmp_path)

@@ -20,10 +20,12 @@ from maexp.envs import (
     ObservationConfig,
     PlannerConfig,
     PointCloudMap,
+    RadarConfig,
     RobotConfig,
     TargetsConfig,
     make_map,
 )
+from maexp.envs.nav_grid import bank_block_sides
 
 
 def actions(env, config: LookaheadConfig, steps: int, true_world: bool = False) -> list[torch.Tensor]:
@@ -211,3 +213,11 @@ def test_it_competes_with_the_classical_planners(tmp_path):
     found = json.loads((tmp_path / "run" / "results.json").read_text())
     assert "coverage_auc" in found["difference"]["lookahead"]["cost_utility"]
     assert set(found["difference"]) == {"lookahead"} and set(found.get("headroom_share", {})) <= {"lookahead"}
+
+
+def test_imagined_worlds_hold_the_blocks_of_a_radar_that_reaches_beyond_the_map():
+    env = ExplorationEnv([room(29, 22), room(21, 31)], num_envs=2, radar=RadarConfig(range=40.0))
+    branches = LookaheadPlanner(env, LookaheadConfig(horizon=2)).rollouts.branches
+    sizes, blocks = branches.sizes, branches.tracker.nav.blocks
+    assert sizes.block.tolist() == bank_block_sides(env.bank, 40.0).tolist()
+    assert blocks.num_blocks >= (-(-sizes.width // sizes.block) * -(-sizes.height // sizes.block)).max()

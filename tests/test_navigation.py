@@ -1,5 +1,7 @@
 """What a planner knows of its env: the team's grid, targets and ways to them, places as actions, open ground."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -8,9 +10,10 @@ from oracle.grid import frontier_cells, geodesic_distance
 from oracle.pace import look_around
 from worlds import room, ways_to_blocks
 
-from maexp.envs import RobotConfig, make_map
+from maexp.envs import RadarConfig, RobotConfig, make_map
 from maexp.envs.navigation import Navigation
 from maexp.envs.targets import keyed_uniform
+from maexp.kernels.block_size import block_sides
 from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN, UNREACHED
 
 
@@ -37,6 +40,16 @@ def test_navigation_shows_what_the_team_knows():
         for cell in nav.target[e, 0][nav.target[e, 0] >= 0].tolist():
             assert known.flat[cell] == FREE
     assert (known == UNKNOWN).any()
+
+
+@pytest.mark.parametrize("reach", [500.0, 60.0])
+def test_a_radar_that_reaches_beyond_the_map_leaves_more_than_one_target(reach):
+    """A quarter of the map's longer side is the most that a block measures; robots agree where they know the map."""
+    env = make_env(2, radar=RadarConfig(range=reach))
+    side = 9  # of 37 cells
+    assert Navigation(env).blocks.block.numpy().tolist() == [side, side] and Navigation(env).num_blocks == 25
+    assert block_sides(1.0, reach, 37, 37) == side and block_sides(1.0, reach, math.inf, math.inf) == reach / 4
+    assert block_sides(1.0, 10.0, 37, 37) == 2, "what lies within the map counts as before"
 
 
 def test_travel_and_points_of_targets():

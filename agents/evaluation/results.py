@@ -92,8 +92,24 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
     print_table(title, rows, results[0].success_coverage)
     whole = [one for one in results if not one.place]
     named = zip(result_names(whole), whole, strict=True)
-    for sentence in describe_evidence([one.evidence._replace(policy=name) for name, one in named]):
+    evidence = [one.evidence._replace(policy=name) for name, one in named]
+    for sentence in [*describe_evidence(evidence), *describe_starts(whole)]:
         print(sentence)
+
+
+def describe_starts(results: list[EvaluationResult]) -> list[str]:
+    """A sentence for each team size of which some see enough of the map where they start: nothing was left to do."""
+    sentences = []
+    for one in {one.num_robots: one for one in results if one.coverage is not None}.values():
+        over = int((one.coverage[:, 0] >= one.success_coverage).sum())
+        if over:
+            team = f"{one.num_robots} robots" if one.num_robots > 1 else "the robot"
+            episodes, goal = len(one.coverage), f"{100 * one.success_coverage:g} %"
+            sentences.append(
+                f"In {over} of {episodes} episodes {team} saw {goal} of the map from the start: they say nothing of a "
+                "policy. Take a larger map, fewer robots or a smaller radar.range."
+            )
+    return sentences
 
 
 def print_table(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from maexp.kernels.constants import BLOCKS_PER_RANGE, FREE, OBSTACLE, RAYS, UNKNOWN
+from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN
 
 from .grid import KnownGrid
 
@@ -61,11 +61,6 @@ def mark_frontier(known: np.ndarray, bounded: bool) -> np.ndarray:
     unknown = np.pad(known == UNKNOWN, 1, constant_values=not bounded)
     beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
     return (known == FREE) & beside
-
-
-def block_side(radar_range: float, cell: float) -> int:
-    """Side of a block in cells."""
-    return max(2, round(radar_range / cell / BLOCKS_PER_RANGE))
 
 
 def list_targets(frontier: np.ndarray, reached: np.ndarray, side: int, search: int, shift: tuple[int, int]) -> Targets:

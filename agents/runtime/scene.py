@@ -10,9 +10,10 @@ import numpy as np
 from scipy.ndimage import label
 from scipy.optimize import linear_sum_assignment
 
+from maexp.kernels.block_size import block_sides
 from maexp.kernels.constants import MARGIN_CELLS, OBSTACLE, SNAP_CELLS, STRAIGHT, UNREACHED
 
-from .frontiers import Targets, block_side, list_targets, look_around, mark_frontier
+from .frontiers import Targets, list_targets, look_around, mark_frontier
 from .grid import KnownGrid
 from .in_turn import plan_in_turn
 from .team import Team
@@ -131,10 +132,9 @@ def look_at(
     robots, passable, distance = find_ways(grid, team, clearance_factor, notes)
     radius = team.radius[robots]
     search = math.ceil(np.float32(radius.max(initial=0.0)) / np.float32(grid.cell) + np.float32(MARGIN_CELLS)) + 1
-    targets = list_targets(
-        mark_frontier(grid.known, bounded), (distance < UNREACHED).any(0), block_side(radar_range, grid.cell), search,
-        shift,
-    )  # fmt: skip
+    extent = (grid.width, grid.height) if bounded else (math.inf, math.inf)
+    side = int(block_sides(grid.cell, radar_range, *extent))
+    targets = list_targets(mark_frontier(grid.known, bounded), (distance < UNREACHED).any(0), side, search, shift)
     area, middle = look_around(grid, targets.cell, radar_range, bounded)
     least = math.pi * radius.min(initial=math.inf) ** 2 if least_area is None else least_area
     kept = area * grid.cell**2 >= least
