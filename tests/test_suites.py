@@ -237,6 +237,19 @@ EDITS = {
     ),
     "another seed": (edit_json(lambda one: one["suite"].update(seed=5)), "results.json", "suite.seed"),
     "a score": (edit_json(lambda one: one["score"].update(mean=0.99)), "results.json", "score.mean"),
+    "an interval": (edit_json(lambda one: one["score"]["ci95"].reverse()), "results.json", "score.ci95[0]"),
+    "a mean of a part": (
+        edit_json(lambda one: one["parts"]["maze_small"]["path_length"].update(mean=1.0)), "results.json",
+        "parts.maze_small.path_length.mean",
+    ),
+    "a difference": (
+        edit_json(lambda one: one["reference"]["difference"]["coverage_auc"].update(mean=0.1)), "results.json",
+        "reference.difference.coverage_auc.mean",
+    ),
+    "a profile": (
+        edit_json(lambda one: one["profile"]["policy"].__setitem__(3, 0.5)), "results.json", "profile.policy[3]",
+    ),
+    "a time": (edit_json(lambda one: one["decisions"].update(mean_seconds=1e-9)), "results.json", "decisions.mean_sec"),
     "a reference": (edit_json(lambda one: one["reference"].update(score=0.1)), "results.json", "reference.score"),
     "a part left out": (edit_json(lambda one: one["parts"].pop("maze_small")), "results.json", "parts.maze_small"),
     "a damaged file": (cut_off, "actions/indoor_small-0000.npz", "is damaged or holds something else"),

@@ -120,6 +120,21 @@ def describe_episodes(suite: Suite, batches: dict[str, list[Batch]]) -> dict[str
     return found
 
 
+def describe_decisions(batches: dict[str, list[Batch]]) -> dict[str, Any]:
+    """Processor time that the decisions of a team took the policy [s]; no part of any score."""
+    several = [batch for one in batches.values() for batch in one]
+    spent = [batch.seconds[k, :count] for batch in several for k, count in enumerate(batch.decisions)]
+    seconds = np.concatenate(spent).astype(np.float64) if spent else np.zeros(0)
+    if not len(seconds):
+        return {"count": 0}
+    return {
+        "count": len(seconds),
+        "mean_seconds": float(seconds.mean()),
+        "median_seconds": float(np.median(seconds)),
+        "largest_seconds": float(seconds.max()),
+    }
+
+
 def write_results(where: Path, content: dict[str, Any]) -> None:
     """`results.json`, lists on one line each."""
     write_text(where / RESULTS, dump(content) + "\n")

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.suites import folder
 from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
@@ -52,7 +50,7 @@ class SuiteRun:
             "suite": folder.describe_suite(self.suite, self.seed),
             "policy": self.player.name,
             **summary,
-            "decisions": describe_decisions(batches),
+            "decisions": folder.describe_decisions(batches),
             "episodes": folder.describe_episodes(self.suite, batches),
             "maps": points,
             "files": folder.list_files(self.where),
@@ -94,18 +92,3 @@ class SuiteRun:
             return folder.read_batch(self.where, self.suite, name, first)
         except UserError as error:
             raise UserError(f"{str(error).rstrip('.')}: remove it, and it is played again.") from error
-
-
-def describe_decisions(batches: dict[str, list[Batch]]) -> dict[str, Any]:
-    """Processor time that the decisions of a team took the policy [s]; no part of any score."""
-    several = [batch for one in batches.values() for batch in one]
-    spent = [batch.seconds[k, :count] for batch in several for k, count in enumerate(batch.decisions)]
-    seconds = np.concatenate(spent).astype(np.float64) if spent else np.zeros(0)
-    if not len(seconds):
-        return {"count": 0}
-    return {
-        "count": len(seconds),
-        "mean_seconds": float(seconds.mean()),
-        "median_seconds": float(np.median(seconds)),
-        "largest_seconds": float(seconds.max()),
-    }

@@ -93,6 +93,7 @@ def _check_numbers(where: Path, suite: Suite, stated: dict, found: Findings, adv
     compare(found, folder.RESULTS, "episodes", stated["episodes"], folder.describe_episodes(suite, batches), 0.0)
     rivals = read_frozen(suite) if seed is None else play_rivals(suite, seed)["results"]
     summary = summarise_suite(suite, folder.to_results(stated["policy"], suite, batches), rivals)
+    summary["decisions"] = folder.describe_decisions(batches)
     for key, value in summary.items():
         compare(found, folder.RESULTS, key, stated[key], value, CLOSE)
 
@@ -116,7 +117,7 @@ def _replay_part(
         if env is None or env.num_envs < count:
             env = build_env(part, maps, count, suite.key(seed), ObservationConfig(pictures=False), device="cpu")
         again = replay_batch(suite, env, noted)
-        again.reasons = noted.reasons
+        again.reasons, again.seconds = noted.reasons, noted.seconds
         _compare_batches(where, noted, again, name, found)
         played.append(again)
         first += count
