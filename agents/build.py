@@ -28,6 +28,7 @@ from maexp.agents.settings.resolved import (
     planner_config,
     robot_config,
 )
+from maexp.agents.settings.schema import RULES
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import (
@@ -97,7 +98,8 @@ def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
         return MapSuite(maps, maps, False, lambda: maps)
     if scenario.path is not None:
         raise UserError(
-            f"scenario.path={scenario.path} needs scenario=pointcloud; scenario={scenario.name} builds its own maps."
+            f"scenario.path={scenario.path} needs scenario=pointcloud or scenario=ir2; scenario={scenario.name} builds "
+            "its own maps."
         )
     indices, validation, held_out = map_indices(scenario)
 
@@ -109,16 +111,21 @@ def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
 
 
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
-    """The maps of scenario=pointcloud: `scenario.path` names a file, or several with commas between them."""
+    """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
     from maexp.envs.importing import ImportOptions, import_map
 
     if not scenario.path:
-        raise UserError("scenario=pointcloud needs a map: add scenario.path=FILE.")
+        raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
     maps = [import_map(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
     names = [one.name for one in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
     kinds = sorted({one.scenario for one in maps})
+    if scenario.name in RULES and (other := next((one for one in maps if one.scenario != scenario.name), None)):
+        raise UserError(
+            f"scenario={scenario.name} counts in the pixels of a picture, and {other.name} is a saved map of "
+            f"scenario={other.scenario}: give its picture, or use scenario=pointcloud."
+        )
     if len(kinds) > 1:
         raise UserError(
             f"scenario.path={scenario.path} names maps of the scenarios {' and '.join(kinds)}, which have robots of "

@@ -1,12 +1,14 @@
 """`python -m maexp.agents.conditions out=FOLDER`: what radios and failures cost, as one table (docs/conditions.md).
 
 Every condition is an evaluation of its own (`maexp evaluate`) below `out`, of the same episodes. A command that was
-stopped goes on where it was when it is given again; more conditions, scenarios, teams or policies may join.
+stopped goes on where it was when it is given again; more conditions, scenarios, teams or policies may join. Maps of
+one's own are played as a scenario with a name: `own.floors=a.yaml,b.yaml`.
 """
 
 import json
+import math
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -20,8 +22,9 @@ from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import write_json, write_text
 from maexp.agents.locking import lock
-from maexp.agents.settings.overrides import quote
+from maexp.agents.settings.overrides import quote, split_paths
 from maexp.envs.fields import check_settings, setting
+from maexp.envs.scenarios import SCENARIOS
 
 IR2 = ("comm=ir2",)
 BASE = (*IR2, "comm.base_station=true")
@@ -66,13 +69,19 @@ class ConditionsConfig:
     out: str = setting("conditions", "folder for the evaluations and the table")
     conditions: list[str] = setting(list(CONDITIONS), "some of `CONDITIONS`; the first of these joins them by itself")
     scenarios: list[str] = setting(["indoor_medium", "indoor_large", "maze"], "whose held-out maps are played")
+    own: dict[str, str] = field(default_factory=dict)  # name -> files of a scenario of one's own, with commas between
     teams: list[int] = setting([3, 5], "sizes")
     policies: list[str] = setting(
         ["cost_utility", "hungarian", "universal"], "each as `maexp evaluate policy=` takes it"
     )
-    episodes: int = setting(64, "of each condition, scenario, size and policy", low=1)
+    episodes: int = setting(64, "of each condition, scenario, size and policy; of own maps shared out", low=1)
     num_envs: int = setting(32, "teams at once", low=1)
     seed: int = setting(0, "of maps, starts and everything else", low=0)
+
+    @property
+    def places(self) -> list[str]:
+        """Names of all scenarios, those of one's own last."""
+        return [*self.scenarios, *self.own]
 
 
 KEPT = ("episodes", "num_envs", "seed")  # of a folder: the rest may grow
@@ -90,14 +99,23 @@ def play(config: ConditionsConfig, scenario: str, team: int, condition: str, pol
     words = [f"resume={quote(str(where))}"]
     if not is_begun(where):
         words = [
-            f"policy={policy}", f"scenario={scenario}", f"num_robots={team}",
-            f"episodes={config.episodes}", f"num_envs={config.num_envs}", f"seed={config.seed}", "num_threads=1",
+            f"policy={policy}", *scenario_words(config, scenario), f"num_robots={team}",
+            f"num_envs={config.num_envs}", f"seed={config.seed}", "num_threads=1",
             f"hydra.run.dir={quote(str(where))}", *CONDITIONS[condition],
         ]  # fmt: skip
     print(f"{scenario}, {team} robots: {condition}, {policy}", flush=True)
     if cli.main(["evaluate", *words]):
         where = f"{scenario} with {team} robots stopped at {condition}, {policy}"
         raise UserError(f"{where}. The same command goes on there.")
+
+
+def scenario_words(config: ConditionsConfig, scenario: str) -> list[str]:
+    """Where an evaluation plays, and how many episodes: on maps of one's own as many on each."""
+    if scenario not in config.own:
+        return [f"scenario={scenario}", f"episodes={config.episodes}"]
+    files = config.own[scenario]
+    each = math.ceil(config.episodes / len(split_paths(files)))
+    return ["scenario=pointcloud", f"scenario.path={files}", f"episodes={each}"]
 
 
 def place(config: ConditionsConfig, scenario: str, team: int, condition: str, policy: str) -> Path:
@@ -108,7 +126,7 @@ def place(config: ConditionsConfig, scenario: str, team: int, condition: str, po
 def write_table(config: ConditionsConfig) -> None:
     """`TABLE`: means of every condition and policy, and how far coverage over time is from that of the first."""
     parts = []
-    for scenario in config.scenarios:
+    for scenario in config.places:
         for team in config.teams:
             found = {name: read(config, scenario, team, name) for name in config.conditions}
             parts.append(table(f"{scenario}, {team} robots", {name: one for name, one in found.items() if one}))
@@ -161,8 +179,9 @@ def read_config(words: list[str]) -> ConditionsConfig:
         if wrong := [name for name in values["conditions"] if name not in CONDITIONS]:
             raise ValueError(f"conditions={wrong[0]} is unknown: choose among {', '.join(CONDITIONS)}.")
         for name in ("scenarios", "teams", "policies"):
-            if not values[name]:
+            if not values[name] and not (name == "scenarios" and values["own"]):
                 raise ValueError(f"{name}=[] is empty: name at least one.")
+        check_own(values["own"], values["scenarios"])
         chosen = {next(iter(CONDITIONS)), *values["conditions"]}
         values["conditions"] = [name for name in CONDITIONS if name in chosen]
         config = ConditionsConfig(**values)
@@ -170,6 +189,16 @@ def read_config(words: list[str]) -> ConditionsConfig:
     except (OmegaConfBaseException, ValueError) as error:
         raise UserError(" ".join(str(error).split())) from error
     return config
+
+
+def check_own(own: dict[str, str], scenarios: list[str]) -> None:
+    """Raise ValueError for maps of one's own that are not there, or whose name is no folder's or a scenario's."""
+    for name, files in own.items():
+        if not name.isidentifier() or name in SCENARIOS or name in scenarios:
+            raise ValueError(f"own.{name} cannot be a scenario's name: choose another, as own.floors=a.yaml,b.yaml.")
+        for file in split_paths(files):
+            if not Path(file).expanduser().is_file():
+                raise ValueError(f"own.{name} names {file}, and there is no such file.")
 
 
 def keep_plan(config: ConditionsConfig) -> None:
@@ -200,7 +229,7 @@ def main(words: list[str]) -> int:
         Path(config.out).mkdir(parents=True, exist_ok=True)
         with lock(Path(config.out), "conditions"):
             keep_plan(config)
-            for scenario in config.scenarios:
+            for scenario in config.places:
                 for team in config.teams:
                     for condition in config.conditions:
                         for policy in config.policies:

@@ -5,8 +5,10 @@ import shutil
 import pytest
 
 from maexp.agents import cli, conditions
+from maexp.agents.evaluation.baseline import load_baseline
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import resolve
+from maexp.envs import make_map
 
 WORDS = ["scenarios=[maze_small]", "teams=[2]", "policies=[cost_utility]", "episodes=2", "num_envs=2",
          "conditions=[base_return]"]  # fmt: skip
@@ -45,9 +47,22 @@ def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):
         ("conditions=[fog]", "conditions=fog is unknown: choose among perfect, range"),
         ("episodes=0", "conditions.episodes=0 must be a whole number"),
         ("policies=[]", "policies=[] is empty"),
+        ("own.maze=x.yaml", "own.maze cannot be a scenario's name"),
+        ("own.floors=gone.yaml", "own.floors names gone.yaml, and there is no such file"),
         ("weather=fog", "weather"),
     ],
 )
 def test_bad_words_are_named(word, told, tmp_path, capsys):
     assert conditions.main([f"out={tmp_path}/it", word]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_maps_of_ones_own_share_the_episodes(tmp_path):
+    for index in (0, 1):
+        make_map("maze_small", index).save(tmp_path / f"m{index}.npz")
+    own = f"own.mine={tmp_path}/m0.npz,{tmp_path}/m1.npz"
+    words = [f"out={tmp_path}/it", "scenarios=[]", own, "teams=[2]", "policies=[random]", "conditions=[perfect]"]
+    assert conditions.main([*words, "episodes=3", "num_envs=2"]) == 0
+    found = load_baseline(str(tmp_path / "it" / "mine" / "robots_2" / "perfect" / "random")).results["random", 2]
+    assert sorted(found.maps) == ["maze_small_0"] * 2 + ["maze_small_1"] * 2, "half of three, rounded up"
+    assert "**mine, 2 robots**" in (tmp_path / "it" / "conditions.md").read_text()

@@ -13,6 +13,7 @@ from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.collect import make_collector
 from maexp.envs import SCENARIOS
+from maexp.envs.importing.export import export_ros_map
 
 TEAM = {"random_obstacles": 1, "maze": 2, "maze_small": 4}  # robots; three elsewhere
 
@@ -32,9 +33,9 @@ def experience(scenario: str, path: str | None):
 
 @pytest.fixture(scope="module")
 def own_map(tmp_path_factory) -> str:
-    """A file for scenario=pointcloud."""
-    path = tmp_path_factory.mktemp("map") / "room.npz"
-    room(24, 17, spacing=0.5).save(path)
+    """A file for scenario=pointcloud and scenario=ir2."""
+    path = tmp_path_factory.mktemp("map") / "room.yaml"
+    export_ros_map(room(60, 42, spacing=0.2), path)
     return str(path)
 
 

@@ -195,6 +195,7 @@ def test_counts_are_those_of_the_paper():
         "indoor_large": 22,
         "outdoor": 32,
         "pointcloud": None,
+        "ir2": None,
     }
     assert {name: SCENARIOS[name].count for name in counts} == counts
 

@@ -41,7 +41,7 @@ class ScenarioSettings(optional_settings(Scenario)):
         "further scenarios to train on, each with its own robots and episode, as [maze,outdoor], or with settings of "
         "their own: [{name:maze,local_steps:5},{name:pointcloud,path:hall.yaml}]",
     )
-    path: str | None = setting(None, "the map of scenario=pointcloud, or several: a.yaml,b.pcd")
+    path: str | None = setting(None, "the map of scenario=pointcloud or ir2, or several: a.yaml,b.pcd")
     maps: Any = setting(None, "indices trained on; default: what held_out and validation leave of the table's count")
     validation: Any = setting(
         None, "indices that choose between checkpoints and planners; default: the last fifth of the rest"

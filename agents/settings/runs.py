@@ -12,7 +12,7 @@ from typing import Any
 from maexp.agents.errors import UserError
 from maexp.agents.settings.overrides import find_override, set_names, without
 from maexp.agents.settings.resolved import flatten
-from maexp.agents.settings.schema import schema
+from maexp.agents.settings.schema import groups_of_rules, schema
 from maexp.envs.config import BODY
 from maexp.envs.config import GROUPS as ENV_GROUPS
 
@@ -91,9 +91,11 @@ def _is_set(name: str, words: list[str]) -> bool:
 
 
 def _chosen_anew(values: dict[str, Any], new: list[str]) -> list[str]:
-    """The groups that the new words choose; a scenario or planner that the run had already is no new choice."""
+    """The groups that the new words choose, and what the protocol of a new scenario sets; a scenario or planner that
+    the run had already is no new choice."""
     had = {name: values.get(f"{name}.name") for name in ("scenario", "planner")}
-    return [one for one in set_names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
+    chosen = [one for one in set_names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
+    return chosen + groups_of_rules(find_override(new, "scenario") if "scenario" in chosen else None)
 
 
 def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str], verb: str) -> list[str]:

@@ -13,6 +13,21 @@ from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import CLEARANCE, PLANNERS
 from maexp.envs.scenarios import SCENARIOS, Scenario
 
+RULES: dict[str, dict[str, Any]] = {
+    "ir2": {
+        "defaults": [{"override /comm": "ir2"}, "_self_"],
+        "num_robots": 4,
+        "scenario": {
+            "starts": "together",
+            "done": "everyone",
+            "success_coverage": 0.99,
+            "importing": {"scenario": "ir2", "pixel_size": 0.2, "free_threshold": 0.41, "occupied_threshold": 0.41},
+        },
+    }
+}
+"""Scenarios that stand for a published protocol: what they set besides their rows. A pixel of IR2's plans is free if it
+is brighter than 150 of 255."""
+
 
 def schema(verb: str) -> type:
     """The dataclass of a verb's settings."""
@@ -25,7 +40,9 @@ def register_schema(verb: str) -> None:
     store(name=f"{verb}_schema", node=schema(verb))
     for group, choices in stored_choices().items():
         for name, (_, values) in choices.items():
-            store(group=group, name=name, node=values)
+            rules = RULES.get(name, {}) if group == "scenario" else {}
+            node = {**rules, "scenario": values | rules["scenario"]} if rules else values
+            store(group=group, name=name, node=node, package="_global_" if rules else None)
     for name, row in TUNINGS.items():
         if row.reference != row.default:
             store(group="_tuning", name=f"reference_{name}", node=asdict(row.reference))
@@ -39,6 +56,14 @@ def stored_choices() -> dict[str, dict[str, tuple[str, dict[str, Any]]]]:
         "planner": {name: (summary, _planner(name)) for name, summary in PLANNERS.items()},
         "model": {name: (SUMMARIES[name], asdict(sizes)) for name, sizes in SIZES.items()},
     }
+
+
+def groups_of_rules(name: str | None) -> list[str]:
+    """Groups and settings outside `scenario` that choosing a scenario sets: those of its protocol."""
+    rules = RULES.get(name, {})
+    chosen = [key for one in rules.get("defaults", ()) if isinstance(one, dict) for key in one]
+    others = [one for one in rules if one not in ("defaults", "scenario")]
+    return [one.removeprefix("override /") for one in chosen] + others
 
 
 def _planner(name: str) -> dict[str, Any]:

@@ -92,6 +92,11 @@ _ROWS = [
              count=None, resolution=0.25, size=None, radar_range=5.0, max_speed=2.0,
              max_accel=1.0, body_length=0.6, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
              local_steps=20, macro_steps=None),
+    Scenario("ir2",
+             summary="IR2's protocol (arXiv 2409.04730) on plans of your own: set scenario.path=PLAN.png or several",
+             count=None, resolution=0.3, size=None, radar_range=16.0, max_speed=2.0,
+             max_accel=1.0, body_length=0.4, body_width=0.4, collision_threshold=0.3, clearance_factor=3.0,
+             local_steps=40, macro_steps=196),
 ]  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {row.name: row for row in _ROWS}
