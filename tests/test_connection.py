@@ -202,3 +202,17 @@ def test_what_is_no_address_is_told(word):
 def test_addresses():
     assert address_of("socket:localhost:5000") == ("localhost", 5000)
     assert address_of("[::1]:80") == ("::1", 80)
+
+
+def test_the_table_of_decision_times(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(EXAMPLES.parent)
+    import decision_times
+
+    monkeypatch.setattr(decision_times, "PART", "maze_small")
+    monkeypatch.setattr(decision_times, "EPISODES", 2)
+    decision_times.main("cost_utility", "inside", "process", "socket")
+    rows = [line.split("|") for line in capsys.readouterr().out.splitlines()[-3:]]
+    inside, process, there = ([one.strip() for one in row[1:-1]] for row in rows)
+    assert inside[2] == there[2] == "-" and float(process[2]) > 0
+    for row in (process, there):
+        assert row[-1].startswith("yes, to") and float(row[3]) > 0
