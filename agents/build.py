@@ -18,28 +18,20 @@ from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
-from maexp.agents.settings.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings, read_free_groups
+from maexp.agents.settings.env import env_settings, find_followers
+from maexp.agents.settings.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.overrides import split_paths
 from maexp.agents.settings.resolved import (
     algorithm_settings,
-    find_followers,
     model_settings,
-    planner_config,
-    robot_config,
 )
 from maexp.agents.settings.schema import RULES
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.envs import (
-    ExplorationEnv,
-    PointCloudMap,
-    RadarConfig,
-    RobotConfig,
-    make_map,
-)
-from maexp.envs.config import STARTS, EnvSettings
-from maexp.envs.scenarios import SCENARIOS, Scenario, find_scenario
+from maexp.envs import ExplorationEnv, PointCloudMap, make_map
+from maexp.envs.config import STARTS
+from maexp.envs.scenarios import SCENARIOS, find_scenario
 from maexp.envs.starts import read_starts
 
 
@@ -142,26 +134,10 @@ def make_env(
     Raises:
         ValueError: a setting out of range; MapError: no room for the team.
     """
-    settings = env_settings(cfg, find_scenario(maps[0].scenario), num_robots, num_envs or cfg.num_envs)
-    return ExplorationEnv(maps, **(vars(settings) | {"starts": choose_starts(cfg, num_robots)} | others))
-
-
-def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int, num_envs: int) -> EnvSettings:
-    """The settings of an env on maps of a scenario."""
-    robot, radar = team_configs(cfg, num_robots)
-    same = ("local_steps", "macro_steps", "collision", "success_coverage", "done")
-    return EnvSettings(
-        num_envs=num_envs,
-        num_robots=num_robots,
-        device=pick_device(cfg.device),
-        seed=cfg.seed,
-        num_threads=cfg.num_threads,
-        robot=robot,
-        radar=radar,
-        planner=planner_config(cfg, row),
-        **{name: cfg.scenario[name] for name in same},
-        **read_free_groups(cfg),
-    )
+    settings = env_settings(cfg, find_scenario(maps[0].scenario), num_robots)
+    here = {"num_envs": num_envs or cfg.num_envs, "device": pick_device(cfg.device)}
+    others = {"starts": choose_starts(cfg, num_robots)} | others
+    return ExplorationEnv(maps, **(vars(settings) | here | others))
 
 
 def choose_starts(cfg: CommonSettings, num_robots: int) -> str | np.ndarray:
@@ -245,32 +221,6 @@ def set_steps(cfg: TrainSettings, env: ExplorationEnv) -> int:
     """
     cfg.collector.steps = cfg.collector.steps or env.macro_steps
     return cfg.collector.steps
-
-
-def team_configs(
-    cfg: CommonSettings, num_robots: int
-) -> tuple[RobotConfig | list[RobotConfig], RadarConfig | list[RadarConfig]]:
-    """Robot and radar of a team: one of each for all robots, or lists where `robot.team` tells robots apart.
-
-    An entry of `robot.team` holds settings of a robot, and under `radar` those of its radar. A team larger than
-    the list repeats it.
-    """
-    if not cfg.robot.team:
-        return robot_config(cfg), read(RadarConfig, cfg.radar)
-    entries = OmegaConf.to_container(cfg.robot.team)
-    _check_team(entries)
-    entries = [entries[i % len(entries)] for i in range(num_robots)]
-    robots = [robot_config(cfg, one) for one in entries]
-    return robots, [read(RadarConfig, cfg.radar, **one.get("radar", {})) for one in entries]
-
-
-def _check_team(entries: object) -> None:
-    allowed = [one.name for one in fields(RobotConfig)] + ["radar"]
-    if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
-        raise UserError("robot.team must be a list of settings, as [{kind: ackermann}, {kind: differential}].")
-    for name in (name for one in entries for name in one):
-        if name not in allowed:
-            raise UserError(f"robot.team has no setting {name}: choose one of {', '.join(allowed)}.")
 
 
 @dataclass

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from maexp.envs.config import (
-    GROUPS,
     CommConfig,
     EnvSettings,
     FaultsConfig,
@@ -20,7 +19,7 @@ from maexp.envs.config import (
 from maexp.envs.fields import check_settings
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
-from maexp.envs.scenarios import default_macro_steps, find_scenario
+from maexp.envs.scenarios import find_scenario
 from maexp.kernels.sensing import return_chance
 
 LEAST_RETURNS = 0.01  # share of the returns in view that has to count
@@ -46,27 +45,14 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
             f"map {fewest.name} has {len(fewest.free)} free points and no room for num_robots={num_robots}: "
             "use fewer robots or a larger map"
         )
-    scenario, device = find_scenario(maps[0].scenario), _device(settings.device)
-    local_steps = int(scenario.local_steps if settings.local_steps is None else settings.local_steps)
-    robots, radars = (
-        tuple(one.completed(scenario) for one in per_robot(name, getattr(settings, name), kind, num_robots))
-        for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
-    )
-    macro_steps = settings.macro_steps
-    if macro_steps is None:
-        team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
-        macro_steps = scenario.macro_steps or default_macro_steps(maps, scenario, team, local_steps)
-    check_bodies(maps, robots)
-    groups = {
-        name: one_config(name, getattr(settings, name), kind).completed(scenario)
-        for name, kind in GROUPS.items()
-        if name not in ("robot", "radar")
-    }
-    comm, faults = groups["comm"], groups["faults"]
-    check_observation(groups["observation"], groups["planner"])
-    check_strategy(comm, num_robots, groups["planner"])
+    device = _device(settings.device)
+    settings = settings.completed(find_scenario(maps[0].scenario), maps)
+    check_bodies(maps, settings.robot)
+    comm, faults = settings.comm, settings.faults
+    check_observation(settings.observation, settings.planner)
+    check_strategy(comm, num_robots, settings.planner)
     check_base(maps, comm)
-    check_noise(maps, radars)
+    check_noise(maps, settings.radar)
     check_done(settings.done, comm)
     check_failing(faults, num_robots)
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
@@ -78,13 +64,10 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
         seed=int(settings.seed),
         first_env=int(settings.first_env),
         num_threads=threads if device.type == "cpu" else 1,
-        local_steps=local_steps,
-        macro_steps=int(macro_steps),
+        local_steps=int(settings.local_steps),
+        macro_steps=int(settings.macro_steps),
         success_coverage=float(settings.success_coverage),
-        robot=robots,
-        radar=radars,
         limited=settings.limited or comm.limited or faults.some,
-        **groups,
     )
 
 
@@ -162,25 +145,6 @@ def check_failing(config: FaultsConfig, num_robots: int) -> None:
         if robot >= num_robots:
             last = num_robots - 1
             raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")
-
-
-def per_robot(what: str, config, kind: type, count: int) -> list:
-    """One config per robot from a single one or a list of ``count``."""
-    if config is None:
-        return [kind()] * count
-    if isinstance(config, kind):
-        return [config] * count
-    if isinstance(config, Sequence) and len(config) == count and all(isinstance(c, kind) for c in config):
-        return list(config)
-    size = f"a list of {len(config)}" if isinstance(config, Sequence) else repr(config)
-    raise ValueError(f"{what}={size}: give one {kind.__name__} or a list of num_robots={count} of them")
-
-
-def one_config(what: str, config, kind: type):
-    """The config given, or one of defaults."""
-    if config is not None and not isinstance(config, kind):
-        raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
-    return config or kind()
 
 
 def positive_count(name: str, value: int) -> int:

@@ -8,12 +8,12 @@ import yaml
 from omegaconf import OmegaConf
 
 from maexp.agents.algorithms.table import ALGORITHMS, TRAININGS
-from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings, team_configs
+from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups
+from maexp.agents.settings.env import planner_config, team_configs
 from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.overrides import find_override, make_overrides, quote, without
-from maexp.agents.settings.resolved import planner_config
 from maexp.agents.settings.schema import schema
 from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import PlannerConfig, RadarConfig, RobotConfig

@@ -10,8 +10,8 @@ import pytest
 import torch
 from worlds import room
 
-from maexp.agents.build import team_configs
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.env import team_configs
 from maexp.agents.settings.resolved import describe_radius, resolve
 from maexp.envs import ExplorationEnv, MapError, RadarConfig, RobotConfig
 from maexp.envs.render import draw_teams

@@ -15,7 +15,8 @@ from maexp.agents.checksums import checksums, warn_of_changed_maps
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, compose_recipe
-from maexp.agents.settings.resolved import algorithm_settings, find_followers, flatten, resolve, to_yaml
+from maexp.agents.settings.env import find_followers
+from maexp.agents.settings.resolved import algorithm_settings, flatten, resolve, to_yaml
 from maexp.agents.settings.runs import continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.envs import make_map

@@ -1,6 +1,6 @@
 """The values that settings come to: what is null in the composed settings is filled in from where it comes."""
 
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import Any
 
 import yaml
@@ -9,14 +9,15 @@ from omegaconf import DictConfig, OmegaConf
 from maexp.agents.settings.algorithms import Settings, find_tunings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
+from maexp.agents.settings.env import env_settings, robot_config
 from maexp.agents.settings.groups import CommonSettings, LearnerSettings, ScenarioSettings, read_free_groups
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import schema
 from maexp.agents.settings.storable import helps, read
-from maexp.envs.config import BODY, GROUPS, PlannerConfig, RadarConfig, RobotConfig, supplied
+from maexp.envs.config import GROUPS, PlannerConfig, RadarConfig
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.scenarios import Scenario, default_macro_steps, find_scenario
+from maexp.envs.scenarios import Scenario, find_scenario
 
 PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
 
@@ -48,18 +49,17 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
         del settings["scenario"]["name"], settings["scenario"]["importing"], settings["algorithm"]["name"]
     elif "scenario" in settings:
         row = find_scenario(maps[0].scenario if maps else cfg.scenario.name)
-        known = maps is not None or row.build is not None
-        if known:
+        settings["scenario"] |= _resolve_scenario(cfg.scenario, row)
+        if maps is not None or row.build is not None:
+            count = min(team_sizes(settings.get("num_robots") or 3))
+            played = env_settings(cfg, row, count).completed(row, maps or ())
+            settings |= {name: asdict(getattr(played, name)) for name in GROUPS if name not in ("robot", "radar")}
+            settings["planner"] = _own_planner(settings["planner"])
             settings["robot"] |= _resolve_robot(cfg, row)
             settings["radar"] = asdict(read(RadarConfig, cfg.radar).completed(row))
-        settings["scenario"] |= _resolve_scenario(cfg.scenario, row, maps)
-        if maps and not settings["scenario"]["macro_steps"]:
-            settings["scenario"]["macro_steps"] = default_macro_steps(
-                maps, row, _paces(settings), settings["scenario"]["local_steps"]
-            )
-        if known:
-            settings["planner"] = _resolve_planner(cfg, row)
-        settings |= {name: asdict(one.checked()) for name, one in read_free_groups(cfg).items()}
+            settings["scenario"] |= {"local_steps": played.local_steps, "macro_steps": played.macro_steps}
+        else:
+            settings |= {name: asdict(one.checked()) for name, one in read_free_groups(cfg).items()}
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -70,7 +70,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
     return _without_null(settings)
 
 
-def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | None) -> dict[str, Any]:
+def _resolve_scenario(scenario: ScenarioSettings, row: Scenario) -> dict[str, Any]:
     settings = {"local_steps": scenario.local_steps or row.local_steps}
     settings["macro_steps"] = scenario.macro_steps or row.macro_steps
     if find_scenario(scenario.name).build is None:
@@ -80,38 +80,13 @@ def _resolve_scenario(scenario: ScenarioSettings, row: Scenario, maps: list | No
     return settings | {"importing": None}
 
 
-def _paces(settings: dict[str, Any]) -> list[tuple[float, float]]:
-    """Speed [m/s] and radar range [m] of every robot of the smallest team."""
-    robot, radar = settings["robot"], settings["radar"]
-    team = robot["team"] or [robot | {"radar": radar}]
-    count = min(team_sizes(plain_value(settings.get("num_robots", 3))))
-    return [(one["max_speed"], one["radar"]["range"]) for one in (team[i % len(team)] for i in range(count))]
-
-
-def plain_value(value: Any) -> Any:
-    """A list of OmegaConf as a list."""
-    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-
-
 def _resolve_robot(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
     """The robot, and each entry of `robot.team` with all its values."""
     team = []
-    for entry in plain_value(cfg.robot.team) or []:
+    for entry in OmegaConf.to_container(cfg.robot.team) if cfg.robot.team else []:
         seen = read(RadarConfig, cfg.radar, **entry.get("radar", {})).completed(row)
         team.append(_without_null(asdict(robot_config(cfg, entry).completed(row))) | {"radar": asdict(seen)})
     return asdict(robot_config(cfg).completed(row)) | {"team": team or None}
-
-
-def robot_config(cfg: CommonSettings, entry: dict[str, Any] | None = None) -> RobotConfig:
-    """The robot's settings, with those of an entry of `robot.team`; what a scenario says of bodies yields to a radius.
-
-    Args:
-        entry: may hold the radar's settings, too, which are left out.
-    """
-    own = {name: value for name, value in (entry or {}).items() if name != "radar"}
-    if own.get("radius", cfg.robot.radius) is not None:
-        own = {name: None for name in BODY if _follows(cfg, "robot", name)} | own
-    return read(RobotConfig, cfg.robot, **own)
 
 
 def describe_radius(cfg: DictConfig) -> str | None:
@@ -124,18 +99,6 @@ def describe_radius(cfg: DictConfig) -> str | None:
         "its centre"
     )
     return told + f"; maps are imported without gaps narrower than {robot.length:g} m"
-
-
-def planner_config(cfg: CommonSettings, row: Scenario) -> PlannerConfig:
-    """The planner's settings; without a clearance DWA takes that of the map's scenario (`planner=paper`)."""
-    planner = read(PlannerConfig, cfg.planner)
-    if planner.name == "dwa" and planner.clearance_factor is None:
-        return replace(planner, clearance_factor=row.clearance_factor)
-    return planner
-
-
-def _resolve_planner(cfg: CommonSettings, row: Scenario) -> dict[str, Any]:
-    return _own_planner(asdict(planner_config(cfg, row).completed(row)))
 
 
 def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:
@@ -152,19 +115,6 @@ def algorithm_settings(cfg: LearnerSettings) -> Settings:
 def model_settings(cfg: LearnerSettings) -> ModelConfig:
     """The sizes of the networks."""
     return read(ModelConfig, cfg.model)
-
-
-def find_followers(cfg: DictConfig) -> list[str]:
-    """Names of the settings that follow the scenario, as radar.range: null, or a reference to what it says."""
-    names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
-    for group, kind in GROUPS.items():
-        names += [f"{group}.{name}" for name in supplied(kind)]
-    found = [name for name in names if _follows(cfg, *name.split("."))]
-    return found + ["robot.team"] * bool(cfg.robot.team)
-
-
-def _follows(cfg: DictConfig, group: str, name: str) -> bool:
-    return OmegaConf.is_interpolation(cfg[group], name) or cfg[group][name] is None
 
 
 def _without_null(node: dict) -> dict:

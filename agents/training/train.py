@@ -34,8 +34,9 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.env import find_followers
 from maexp.agents.settings.overrides import without
-from maexp.agents.settings.resolved import algorithm_settings, find_followers, model_settings, resolve, to_yaml
+from maexp.agents.settings.resolved import algorithm_settings, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import (

@@ -1,10 +1,11 @@
 """All settings of an env."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from maexp.envs.fields import setting, words_of
+from maexp.envs.scenarios import Scenario, default_macro_steps
 
 from .comm import CommConfig
 from .faults import FaultsConfig
@@ -17,6 +18,9 @@ from .radar import RadarConfig
 from .reward import RewardConfig
 from .robot import RobotConfig
 from .targets import TargetsConfig
+
+if TYPE_CHECKING:
+    from maexp.envs.map import PointCloudMap
 
 STARTS = ("drawn", "together", "fixed")
 """Where robots start, besides poses that are given: drawn at every reset, each by itself or all beside each other, or
@@ -63,6 +67,29 @@ class EnvSettings:
     )
     limited: bool = setting(False, "robots may know different things; true where comm or faults make it so")
 
+    def completed(self, scenario: Scenario, maps: "Sequence[PointCloudMap]" = ()) -> Self:
+        """With what is None taken from the scenario, each group checked, and a robot and a radar for each robot.
+
+        ``macro_steps`` stays None where the maps tell and none are given.
+
+        Raises:
+            ValueError: a value of a group is out of its range (named).
+        """
+        robots, radars = (
+            tuple(one.completed(scenario) for one in per_robot(name, getattr(self, name), kind, self.num_robots))
+            for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
+        )
+        others = {name: kind for name, kind in GROUPS.items() if name not in ("robot", "radar")}
+        groups = {name: one_config(name, getattr(self, name), kind) for name, kind in others.items()}
+        local_steps = scenario.local_steps if self.local_steps is None else self.local_steps
+        macro_steps = scenario.macro_steps if self.macro_steps is None else self.macro_steps
+        if not macro_steps and maps:
+            team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
+            macro_steps = default_macro_steps(maps, scenario, team, local_steps)
+        groups = {name: one.completed(scenario) for name, one in groups.items()}
+        steps = {"local_steps": local_steps, "macro_steps": macro_steps}
+        return replace(self, robot=robots, radar=radars, **steps, **groups)
+
     @property
     def episode_steps(self) -> int:
         """Local steps of a whole episode."""
@@ -76,3 +103,22 @@ GROUPS: dict[str, type[Group]] = {
 DONE = words_of(EnvSettings, "done")
 """Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
 station knows, or what every robot knows that has neither collided nor failed."""
+
+
+def per_robot(what: str, config, kind: type, count: int) -> list:
+    """One config per robot from a single one or a list of ``count``."""
+    if config is None:
+        return [kind()] * count
+    if isinstance(config, kind):
+        return [config] * count
+    if isinstance(config, Sequence) and len(config) == count and all(isinstance(c, kind) for c in config):
+        return list(config)
+    size = f"a list of {len(config)}" if isinstance(config, Sequence) else repr(config)
+    raise ValueError(f"{what}={size}: give one {kind.__name__} or a list of num_robots={count} of them")
+
+
+def one_config(what: str, config, kind: type):
+    """The config given, or one of defaults."""
+    if config is not None and not isinstance(config, kind):
+        raise ValueError(f"{what}={config!r}: give a {kind.__name__}, as {what}={kind.__name__}(...)")
+    return config or kind()
