@@ -12,29 +12,16 @@ from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
 from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
 from maexp.kernels.blocks import block_memory_per_env
+from maexp.kernels.dynamics import KINDS, Robots
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.sensing import Sensing, return_chance
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
-from maexp.kernels.types import (
-    ACKERMANN,
-    DIFFERENTIAL,
-    DT,
-    OMNIDIRECTIONAL,
-    PICTURE_CHANNELS,
-    PIXELS,
-    TEAM_CHANNELS,
-    Robots,
-)
+from maexp.kernels.types import DT, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
 from maexp.kernels.wavefront import grid_memory_per_env
 
-KINDS = {
-    "ackermann": ACKERMANN,
-    "differential": DIFFERENTIAL,
-    "omnidirectional": OMNIDIRECTIONAL,
-}
 TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""
 
@@ -63,7 +50,7 @@ def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = Fals
 
 
 def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
-    """Parameters of every robot, [E, N] each (fields of `kernels.types.Robots`)."""
+    """Parameters of every robot, [E, N] each (fields of `kernels.dynamics.Robots`)."""
     robots, radars = settings.robot, settings.radar
     factor = settings.planner.clearance_factor
     same = [one.name for one in fields(RobotConfig) if one.name in Robots.vars]

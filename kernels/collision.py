@@ -4,10 +4,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import Maps, Robots, point_xy, row_range, row_span
+from maexp.kernels.types import Maps, point_xy, row_range, row_span
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

@@ -6,7 +6,7 @@ Every pair of an acceleration and a turn is rolled out for a few local steps and
 import torch
 import warp as wp
 
-from maexp.kernels.dynamics import curvature, heading_change, turn_limit
+from maexp.kernels.dynamics import OMNIDIRECTIONAL, Robots, curvature, heading_change, turn_limit
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
 from maexp.kernels.launches import launch_on
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -15,11 +15,9 @@ from maexp.kernels.types import (
     ERROR_CAPACITY,
     HALF,
     LANES,
-    OMNIDIRECTIONAL,
     ROBOTS_PER_WORD,
     Lanes,
     Maps,
-    Robots,
     point_xy,
     row_range,
     row_span,

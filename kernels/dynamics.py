@@ -1,4 +1,4 @@
-"""Motion of the robots.
+"""Motion of the robots, and the parameters that every kernel reads of them.
 
 A pose is ``(x, y, v, theta)`` of the reference point [m, m, m/s, rad]: the rear axle of an Ackermann
 car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirectional robot [m/s].
@@ -10,12 +10,38 @@ import warp as wp
 
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, OMNIDIRECTIONAL, PI, Robots
+from maexp.kernels.types import PI
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
+
+ACKERMANN = 0
+DIFFERENTIAL = 1
+OMNIDIRECTIONAL = 2
+KINDS = {"ackermann": ACKERMANN, "differential": DIFFERENTIAL, "omnidirectional": OMNIDIRECTIONAL}
+
+
+@wp.struct
+class Robots:
+    """Parameters of every robot, arrays [env, robot]."""
+
+    kind: wp.array2d(dtype=wp.int32)
+    length: wp.array2d(dtype=wp.float32)  # [m]
+    width: wp.array2d(dtype=wp.float32)  # [m]
+    wheelbase: wp.array2d(dtype=wp.float32)  # [m]
+    center_offset: wp.array2d(dtype=wp.float32)  # reference point to body centre [m]
+    max_speed: wp.array2d(dtype=wp.float32)  # [m/s]
+    max_accel: wp.array2d(dtype=wp.float32)  # [m/s^2]
+    max_turn: wp.array2d(dtype=wp.float32)  # steering angle [rad] or yaw rate [rad/s]
+    curvature: wp.array3d(dtype=wp.float32)  # [env, robot, turn] `curvature` of the turns that DWA tries [rad/m]
+    collision_threshold: wp.array2d(dtype=wp.float32)  # [m]
+    clearance: wp.array2d(dtype=wp.float32)  # clearance_factor * collision_threshold [m]
+    radar_range: wp.array2d(dtype=wp.float32)  # [m]
+    radar_cos_fov: wp.array2d(dtype=wp.float32)  # cosine of half the field of view; -2 sees all round
+    radar_cos_beam: wp.array2d(dtype=wp.float32)  # 1 - alpha1
+    radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
 
 
 @wp.func

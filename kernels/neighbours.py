@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.dynamics import curvature, heading_change
+from maexp.kernels.dynamics import Robots, curvature, heading_change
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import HALF, Robots, point_xy, within
+from maexp.kernels.types import HALF, point_xy, within
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.geometry import rectangle_distance
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -27,7 +28,6 @@ from maexp.kernels.types import (
     ROBOTS_PER_WORD,
     TEAM_CHANNELS,
     Maps,
-    Robots,
     point_xy,
 )
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.dynamics import wrap_angle
+from maexp.kernels.dynamics import Robots, wrap_angle
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import PI, Maps, Robots, point_xy
+from maexp.kernels.types import PI, Maps, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

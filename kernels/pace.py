@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.launches import Launch
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import Robots, point_xy
+from maexp.kernels.types import point_xy
 from maexp.kernels.ways import PATH_CELLS, path_slot
 
 if TYPE_CHECKING:

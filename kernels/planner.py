@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from maexp.kernels.dwa import _plan_dwa
-from maexp.kernels.dynamics import turn_limit
+from maexp.kernels.dynamics import Robots, turn_limit
 from maexp.kernels.launches import Launch
 from maexp.kernels.odometry import take_aim
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps, Robots
+from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.sensing import forget_returns
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, Robots, point_xy
+from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

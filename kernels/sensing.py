@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, Robots
+from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

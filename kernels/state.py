@@ -11,9 +11,10 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.shadows import BINS
-from maexp.kernels.types import ROBOTS_PER_WORD, Robots
+from maexp.kernels.types import ROBOTS_PER_WORD
 
 AXES = {
     "E": ("env", "teams of the batch"),

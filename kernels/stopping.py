@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from maexp.kernels.dynamics import wrap_angle
+from maexp.kernels.dynamics import DIFFERENTIAL, Robots, wrap_angle
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
 from maexp.kernels.pace import clear_ahead, nearest_obstacle
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.types import DIFFERENTIAL, PI, Robots, point_xy
+from maexp.kernels.types import PI, point_xy
 
 if TYPE_CHECKING:
     from maexp.kernels.shards import Shard

@@ -1,6 +1,7 @@
-"""Static data that every kernel reads: maps and robots, as structs of Warp arrays.
+"""Static data that every kernel reads: maps, as a struct of Warp arrays.
 
-Three kinds of arrays are kept apart: static (here), state (`kernels.state`) and scratch (ibid.).
+Three kinds of arrays are kept apart: static (here, and `kernels.dynamics.Robots`), state (`kernels.state`) and scratch
+(ibid.).
 
 Maps of a batch differ in size. Their points are concatenated; ``x_begin[m]`` is the first point of
 map ``m``. Within a map the points are sorted by cell of a regular grid (row-major, x fastest), so
@@ -15,10 +16,6 @@ ROBOTS_PER_WORD = 32
 
 VIEWER_NOW = 1 << 16
 """What a robot that sees a point now adds to its viewers during a scan; one that has ever seen it adds 1."""
-
-ACKERMANN = 0
-DIFFERENTIAL = 1
-OMNIDIRECTIONAL = 2
 
 REGIONS = 8
 """Regions along one side of the map's extent (L in the paper)."""
@@ -113,27 +110,6 @@ class Maps:
     point_pixel: wp.array(dtype=wp.int32)
     pixel_point_begin: wp.array(dtype=wp.int32)  # [M * 125 * 125 + 1]
     pixel_point: wp.array(dtype=wp.int32)
-
-
-@wp.struct
-class Robots:
-    """Parameters of every robot, arrays [env, robot]."""
-
-    kind: wp.array2d(dtype=wp.int32)
-    length: wp.array2d(dtype=wp.float32)  # [m]
-    width: wp.array2d(dtype=wp.float32)  # [m]
-    wheelbase: wp.array2d(dtype=wp.float32)  # [m]
-    center_offset: wp.array2d(dtype=wp.float32)  # reference point to body centre [m]
-    max_speed: wp.array2d(dtype=wp.float32)  # [m/s]
-    max_accel: wp.array2d(dtype=wp.float32)  # [m/s^2]
-    max_turn: wp.array2d(dtype=wp.float32)  # steering angle [rad] or yaw rate [rad/s]
-    curvature: wp.array3d(dtype=wp.float32)  # [env, robot, turn] `curvature` of the turns that DWA tries [rad/m]
-    collision_threshold: wp.array2d(dtype=wp.float32)  # [m]
-    clearance: wp.array2d(dtype=wp.float32)  # clearance_factor * collision_threshold [m]
-    radar_range: wp.array2d(dtype=wp.float32)  # [m]
-    radar_cos_fov: wp.array2d(dtype=wp.float32)  # cosine of half the field of view; -2 sees all round
-    radar_cos_beam: wp.array2d(dtype=wp.float32)  # 1 - alpha1
-    radar_alpha2: wp.array2d(dtype=wp.float32)  # [m]
 
 
 HALF = 0.501

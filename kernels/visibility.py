@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch
 from maexp.kernels.sensing import sense
 from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
@@ -27,7 +28,6 @@ from maexp.kernels.types import (
     ROBOTS_PER_WORD,
     VIEWER_NOW,
     Maps,
-    Robots,
     cell_center,
     floor_within,
     point_xy,

@@ -9,8 +9,8 @@ from oracle import pace as oracle
 
 from maexp.kernels import outlook, pace, stopping
 from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN
+from maexp.kernels.dynamics import ACKERMANN, DIFFERENTIAL, Robots
 from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.types import ACKERMANN, DIFFERENTIAL, Robots
 from maexp.kernels.ways import PATH_CELLS
 
 pytestmark = pytest.mark.kernels
