@@ -45,12 +45,12 @@ def setting(
     return field(default=default, metadata=metadata)
 
 
-def same(cls: type, name: str) -> Any:
+def same(cls: type[Any], name: str) -> Any:
     """The setting of another dataclass."""
     return replaced(cls, name, cls.__dataclass_fields__[name].default)
 
 
-def replaced(cls: type, name: str, default: Any) -> Any:
+def replaced(cls: type[Any], name: str, default: Any) -> Any:
     """The setting of another dataclass, with another default."""
     return field(default=default, metadata=cls.__dataclass_fields__[name].metadata)
 
@@ -89,7 +89,7 @@ def check_settings(settings: Any, group: str = "", error: type[ValueError] = Val
 
     Values of several numbers (a type that is neither a number, a bool nor a word) are left to whoever reads them.
     """
-    allowed = kinds(type(settings))
+    allowed = kinds(settings.__class__)
     for one in fields(settings):
         if "limits" in one.metadata:
             name = f"{group}.{one.name}" if group else one.name
@@ -114,7 +114,7 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return str in allowed or value in words
     if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
-    if float not in allowed and low is not None and value > WHOLE_LIMIT:
+    if float not in allowed and low is not None and float(value) > WHOLE_LIMIT:
         return False
     inside = (low is None or value >= low) and (high is None or value <= high)
     inside = inside and (above is None or value > above) and (below is None or value < below)

@@ -100,8 +100,11 @@ class PointCloudMap:
             "free_spacing": free_spacing,
             "obstacle_spacing": obstacle_spacing,
             "boundary_spacing": boundary_spacing,
-            "free_height": _check_per_point("free_height", free_height, free_kept),
-            "obstacle_height": _check_per_point("obstacle_height", obstacle_height, obstacles_kept),
+            "free_height": None if free_height is None else _check_per_point("free_height", free_height, free_kept),
+            "obstacle_height": (
+                None if obstacle_height is None
+                else _check_per_point("obstacle_height", obstacle_height, obstacles_kept)
+            ),
         }
         for field, value in values.items():
             object.__setattr__(self, field, value)
@@ -273,7 +276,7 @@ def _check_resolution(resolution) -> float:
     return value
 
 
-def _check_cloud(name: str, points, resolution: float) -> tuple[np.ndarray, np.ndarray]:
+def _check_cloud(name: str, points, resolution: float) -> tuple[np.ndarray, _Kept]:
     """Float32 [kept, 3] without exact duplicates, and which of the given points were kept."""
     try:
         points = np.asarray(points)
@@ -320,9 +323,7 @@ def _first_occurrences(cloud: np.ndarray) -> np.ndarray | None:
     return None if len(first) == len(cloud) else np.sort(first)
 
 
-def _check_per_point(name: str, values, kept: _Kept) -> np.ndarray | None:
-    if values is None:
-        return None
+def _check_per_point(name: str, values, kept: _Kept) -> np.ndarray:
     values = np.asarray(values)
     if values.dtype.kind not in "fiu" or values.shape != (kept.given,):
         raise MapError(f"{name} has shape {values.shape}; give one number per point, shape ({kept.given},)")

@@ -123,13 +123,12 @@ def resample_weights(*factors: np.ndarray, copies: np.ndarray | None = None, see
 @lru_cache(maxsize=32)
 def _resample_weights(seed: int, *codes: tuple[int, ...]) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    *factors, copies = codes
-    codes, copies = np.array(factors), np.array(copies)
-    counts = [max(one) + 1 for one in factors]
+    labels, copies = np.array(codes[:-1]), np.array(codes[-1])
+    counts = [max(one) + 1 for one in codes[:-1]]
     often = [rng.multinomial(count, np.full(count, 1 / count), size=GROUPED_RESAMPLES) for count in counts]
-    weights = np.zeros((GROUPED_RESAMPLES, codes.shape[1]), dtype=np.float32)
-    for combination in np.unique(codes, axis=1).T:
-        episodes = np.flatnonzero((codes == combination[:, None]).all(0))
+    weights = np.zeros((GROUPED_RESAMPLES, labels.shape[1]), dtype=np.float32)
+    for combination in np.unique(labels, axis=1).T:
+        episodes = np.flatnonzero((labels == combination[:, None]).all(0))
         count = np.prod([one[:, code] for one, code in zip(often, combination, strict=True)], axis=0)
         distinct, group = np.unique(copies[episodes], return_inverse=True)
         drawn = rng.multinomial(count * len(distinct), np.full(len(distinct), 1 / len(distinct)))

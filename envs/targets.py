@@ -4,7 +4,7 @@ from, which targets are given up, and how a chosen one is approached."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 import warp as wp
@@ -52,7 +52,7 @@ class Scene:
     alive: torch.Tensor
     nav: Navigation
     block: torch.Tensor | None = None
-    xp: ClassVar = torch
+    xp: ClassVar[Any] = torch
 
     @property
     def radar_range(self) -> float:

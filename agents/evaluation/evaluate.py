@@ -99,8 +99,9 @@ def join(parts: list[EvaluationResult]) -> EvaluationResult:
 
 def pool(parts: list[EvaluationResult]) -> EvaluationResult:
     """The episodes of several recorded results of one policy as one result."""
-    times = np.unique(np.concatenate([one.times for one in parts]))
-    lines = [np.interp(times, one.times, line) for one in parts for line in one.coverage]
+    recorded = [(one.times, one.coverage) for one in parts if one.times is not None and one.coverage is not None]
+    times = np.unique(np.concatenate([its for its, _ in recorded]))
+    lines = [np.interp(times, its, line) for its, coverage in recorded for line in coverage]
     shares = None if parts[0].shares is None else np.concatenate([one.shares for one in parts])
     return replace(join(parts), times=times, coverage=np.stack(lines), shares=shares)
 

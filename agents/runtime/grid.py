@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
@@ -40,12 +41,12 @@ class KnownGrid:
         """Cells along x."""
         return self.known.shape[1]
 
-    def from_map(self, points: np.ndarray) -> np.ndarray:
+    def from_map(self, points: ArrayLike) -> np.ndarray:
         """Points of the map's frame on the grid, [..., 2] [m]."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return (np.asarray(points, np.float64) - self.corner) @ np.array([[c, -s], [s, c]])
 
-    def to_map(self, points: np.ndarray) -> np.ndarray:
+    def to_map(self, points: ArrayLike) -> np.ndarray:
         """Points on the grid in the map's frame, [..., 2] [m]."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return np.asarray(points, np.float64) @ np.array([[c, s], [-s, c]]) + self.corner
@@ -58,7 +59,7 @@ class KnownGrid:
     def cells(self, points: np.ndarray) -> np.ndarray:
         """Cells of points on the grid, int64 [...]; -1 outside of it and for NaN."""
         index = np.floor(np.asarray(points) / self.cell)
-        inside = ((index >= 0) & (index < (self.width, self.height))).all(-1)
+        inside = np.all((index >= 0) & (index < (self.width, self.height)), axis=-1)
         index = np.where(inside[..., None], index, 0).astype(np.int64)
         return np.where(inside, index[..., 1] * self.width + index[..., 0], -1)
 
@@ -109,9 +110,10 @@ def _check_values(grid) -> np.ndarray:
 
 def _check_origin(origin) -> tuple[float, float, float]:
     numbers = [_number(one) for one in _listed(origin)]
-    if len(numbers) not in (2, 3) or None in numbers or max(map(abs, numbers)) > 1e8:
+    known = [one for one in numbers if one is not None]
+    if len(known) != len(numbers) or len(known) not in (2, 3) or max(map(abs, known)) > 1e8:
         raise ValueError(f"origin={origin!r} must be x, y [m] and at most a yaw [rad] of the lower left corner")
-    x, y, yaw = [*numbers, 0.0][:3]
+    x, y, yaw = [*known, 0.0][:3]
     return x, y, yaw
 
 

@@ -21,7 +21,7 @@ def plan_in_turn(gain: np.ndarray, value: np.ndarray, point: np.ndarray) -> tupl
     some = value > -np.inf
     rest = np.where(some, value, 0.0) - gain
     score, claimed, left = np.zeros_like(gain), np.zeros_like(gain), np.ones_like(gain)
-    taken, waiting = np.zeros(len(gain), np.int64), some.any(-1)
+    taken, waiting = np.zeros(len(gain), np.int64), np.any(some, axis=-1)
     while waiting.any():
         now = np.where(some & waiting[:, None], gain * left + rest, -np.inf)
         robot, k = np.unravel_index(now.argmax(), now.shape)

@@ -107,8 +107,8 @@ class TeamPlanner:
         defaults = DEFAULTS if self.learned is None else self.learned.contract
         self.radar_range = _positive("radar_range", defaults.radar_range if radar_range is None else radar_range)
         self.robot_radius = defaults.robot_radius if robot_radius is None else robot_radius
-        given = {"max_speed": max_speed, "max_accel": max_accel, "seconds": seconds}
-        given = {name: _positive(name, value) for name, value in given.items() if value is not None}
+        limits = {"max_speed": max_speed, "max_accel": max_accel, "seconds": seconds}
+        given = {name: _positive(name, value) for name, value in limits.items() if value is not None}
         self.motion = replace(defaults.motion, **given)
         self.clearance_factor = _positive("clearance_factor", clearance_factor)
         self.occupied = _positive("occupied", occupied)
@@ -212,7 +212,7 @@ class TeamPlanner:
         shares = Shares(preference, travel, scene.points, team.radius[scene.robots], self.distinct)
         some = shares.reached.any(-1)
         shares.settle_for(np.flatnonzero(some & ~parked))
-        for row in np.flatnonzero(some & parked):  # who stands still takes nothing away from the others
+        for row in np.flatnonzero(some & parked).tolist():  # who stands still takes nothing away from the others
             if (free := shares.free(row)).any():
                 shares.taken[row] = np.where(free, travel[row], np.inf).argmin()
         notes += self.watch.settle(team, scene.robots, scene.targets, travel, shares, scene.radar_range)
@@ -221,19 +221,19 @@ class TeamPlanner:
     def _ask(self, team: Team, scene: Scene, time_left: float) -> np.ndarray:
         """What the policy thinks of each target for each robot of the scene, float [n, K]."""
         if self.learned is None:
-            return CHOICES[self.policy](scene)
+            return CHOICES[str(self.policy)](scene)
         robots = scene.robots
         last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
         heading = team.yaw[robots] - scene.grid.yaw
-        last = scene.grid.from_map(last)
-        return self.learned.rank(scene, heading, team.speed[robots], last, time_left, self.motion)
+        before = scene.grid.from_map(np.array(last))
+        return self.learned.rank(scene, heading, team.speed[robots], before, time_left, self.motion)
 
     def _send_away(self, plan: Plan, team: Team, scene: Scene, shares: Shares) -> Plan:
         """The plan with what robots do for which no target is left."""
         for robot in np.flatnonzero(np.isfinite(team.at).all(-1)):
             self.home.setdefault(team.names[robot], team.at[robot].copy())
         notes = []
-        for row in np.flatnonzero(shares.reached.any(-1) & (shares.taken < 0)):
+        for row in np.flatnonzero(shares.reached.any(-1) & (shares.taken < 0)).tolist():
             robot = scene.robots[row]
             way = self._way_home(team, scene, row) if self.spare == "home" else None
             plan.waits[robot] = way is None

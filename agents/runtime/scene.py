@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.ndimage import label
@@ -57,7 +57,7 @@ class Scene:
     middle: np.ndarray
     near: np.ndarray
     rng: np.random.Generator
-    xp: ClassVar = np
+    xp: ClassVar[Any] = np
 
     @property
     def cell(self) -> float:

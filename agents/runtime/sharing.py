@@ -95,7 +95,7 @@ class Shares:
         own, offers = self.way[robot], []
         single = self.reached[robot] & (self.holders(robot) == 1)
         for other in self.others(robot):
-            for target in np.flatnonzero(single & self.too_near(robot, other)):
+            for target in np.flatnonzero(single & self.too_near(robot, other)).tolist():
                 theirs = self.way[other, self.taken[other]]
                 if (own[target], robot) < (theirs, other) or self.can_move(other, robot, target):
                     offers.append((own[target], target, other))

@@ -57,7 +57,7 @@ def read_team(poses, velocities, radius, notes: list[str]) -> Team:
         _read_speeds(velocities, names, notes),
         _read_radius(radius, names),
     )
-    for row in np.flatnonzero(np.isnan(pose[:, :2]).any(-1)):
+    for row in np.flatnonzero(np.isnan(pose[:, :2]).any(-1)).tolist():
         notes.append(f"{team.title(row)} has no pose and was left out")
     return team
 

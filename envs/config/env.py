@@ -80,20 +80,20 @@ class EnvSettings:
             for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
         )
         others = {name: kind for name, kind in GROUPS.items() if name not in ("robot", "radar")}
-        groups = {name: one_config(name, getattr(self, name), kind) for name, kind in others.items()}
+        groups: dict[str, Any] = {name: one_config(name, getattr(self, name), kind) for name, kind in others.items()}
         local_steps = scenario.local_steps if self.local_steps is None else self.local_steps
         macro_steps = scenario.macro_steps if self.macro_steps is None else self.macro_steps
         if not macro_steps and maps:
             team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
             macro_steps = default_macro_steps(maps, scenario, team, local_steps)
         groups = {name: one.completed(scenario) for name, one in groups.items()}
-        steps = {"local_steps": local_steps, "macro_steps": macro_steps}
+        steps: dict[str, Any] = {"local_steps": local_steps, "macro_steps": macro_steps}
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
     @property
     def episode_steps(self) -> int:
         """Local steps of a whole episode."""
-        return self.local_steps * self.macro_steps
+        return (self.local_steps or 0) * (self.macro_steps or 0)
 
 
 GROUPS: dict[str, type[Group]] = {

@@ -1,12 +1,13 @@
 """What the groups of an env's settings share: they fill in what is None from the scenario, and check themselves."""
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 from maexp.envs.fields import check_settings
 from maexp.envs.scenarios import Scenario
 
 
+@dataclass(frozen=True)
 class Group:
     """Settings that go together, called ``group`` on the command line."""
 

@@ -40,18 +40,17 @@ class RobotConfig(Group):
     def completed(self, scenario: Scenario) -> "RobotConfig":
         """With what the radius or the scenario fixes."""
         if self.radius is not None:
-            self._check_radius()
+            self._check_radius(self.radius)
             scenario = scenario.with_radius(self.radius)
         config = super().completed(scenario)
         if config.wheelbase in (None, "width", "length"):
             config = replace(config, wheelbase=getattr(config, config.wheelbase or "width"))
-        if config.max_steer >= math.pi / 2:
+        if config.max_steer is not None and config.max_steer >= math.pi / 2:
             raise ValueError(f"robot.max_steer={config.max_steer} must stay below pi/2 = 1.5708 rad")
         return config
 
-    def _check_radius(self) -> None:
+    def _check_radius(self, radius: float) -> None:
         """It is one, and agrees with what else is said of the body."""
-        radius = self.radius
         metadata = {one.name: one.metadata for one in fields(self)}["radius"]
         check_value("robot.radius", radius, kinds(RobotConfig)["radius"], metadata)
         for name in BODY:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from numbers import Integral
+from typing import Any
 
 from maexp.envs.fields import setting
 from maexp.envs.map import PointCloudMap
@@ -48,13 +49,15 @@ class Scenario:
         return replace(self, body_length=2 * radius, body_width=2 * radius, collision_threshold=radius)
 
 
-_CAR = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)
-_MAZE = dict(_CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20)
-_RANDOM = dict(
+_CAR: dict[str, Any] = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)
+_MAZE: dict[str, Any] = dict(
+    _CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20
+)
+_RANDOM: dict[str, Any] = dict(
     _CAR, count=32, resolution=1.0, size=125.0, radar_range=10.0, max_speed=6.0, clearance_factor=3.0,
     local_steps=40, macro_steps=15,
 )  # fmt: skip
-_INDOOR = dict(
+_INDOOR: dict[str, Any] = dict(
     resolution=0.1, radar_range=1.0, max_speed=0.6, max_accel=0.2, body_length=0.15, body_width=0.1,
     collision_threshold=0.06, clearance_factor=4.2, local_steps=40, macro_steps=15, num_steering=21,
 )  # fmt: skip
@@ -141,7 +144,7 @@ def cut_last_fifth(indices: range) -> tuple[range, range]:
 
 
 def default_macro_steps(
-    maps: list[PointCloudMap],
+    maps: Sequence[PointCloudMap],
     scenario: Scenario,
     team: Sequence[tuple[float, float]] | None = None,
     local_steps: int | None = None,
