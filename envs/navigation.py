@@ -163,7 +163,7 @@ class Navigation:
         values = self.values() | {"point": view(self.point, wp.vec2)} | {
             name: view(getattr(self, name)) for name in ("block", "cell", "way", "around")
         }  # fmt: skip
-        launch_named(self.launch, targets._list_targets, (looks, most), "block cell point way around", values)
+        launch_named(self.launch, targets._list_targets, (looks, most), values)
 
     def _update(self, launch: Launch) -> None:
         """The launches of `update` that are always the same."""
@@ -171,7 +171,7 @@ class Navigation:
         self.passable.paint(launch)
         self.blocks.mark(launch)
         launch_named(
-            launch, targets._locate_robots, self.paths.shape, "sources stop", self.values()
+            launch, targets._locate_robots, self.paths.shape, self.values()
         )
         self.paths.flood(launch)
         self.blocks.place(launch)
@@ -220,9 +220,9 @@ class Navigation:
         middle = torch.empty((*start.shape, 2), device=self.device)
         self.launch(
             outlook._look_around, tuple(area.shape),
-            inputs=[self.grids, self.known_grids.grid_of_row, grid, wp.from_torch(start),
-                    *self._spread_rays(radius), float(radius)],
-            outputs=[wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
+            [self.grids, self.known_grids.grid_of_row, grid, wp.from_torch(start),
+             *self._spread_rays(radius), float(radius),
+             wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
         )  # fmt: skip
         shape = (self.num_envs, self.rows, -1)
         return self.pick(area.view(shape)), self.pick(middle.view(*shape, 2))
@@ -240,8 +240,7 @@ class Navigation:
             "radius": radius, "block": view(self.block), "cell": view(self.cell),
             "ray_cell": ray_cell, "ray_part": ray_part, "area": view(area), "middle": view(middle, wp.vec2),
         }  # fmt: skip
-        writes = "looked_from kept_area kept_middle looked_at area middle"
-        launch_named(self.launch, outlook._look_from_targets, tuple(self.cell.shape), writes, values)
+        launch_named(self.launch, outlook._look_from_targets, tuple(self.cell.shape), values)
         return area, middle
 
     def _spread_rays(self, radius: float) -> list[wp.array]:
@@ -251,7 +250,7 @@ class Navigation:
             shape = (RAYS, int(min(radius / float(self.cell_size.min()), across)) + 2)
             rays = [wp.zeros(shape, dtype=kind, device=str(self.device)) for kind in (wp.vec2i, wp.vec3)]
             finish_filling(self.device)
-            self.launch(outlook._spread_rays, shape, inputs=[], outputs=rays)
+            self.launch(outlook._spread_rays, shape, rays)
             self._rays[radius] = rays
         return self._rays[radius]
 
@@ -270,9 +269,9 @@ class Navigation:
         cells = branch / float(self.cell_size.max())
         self.launch(
             _grow_tree, items,
-            inputs=[self.grids, self.arrays["map_id"], self.blocks.block, *state, self.known_grids.known,
-                    self.paths.search.sources, self.rows, self.num_robots, samples, cells],
-            outputs=[wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
+            [self.grids, self.arrays["map_id"], self.blocks.block, *state, self.known_grids.known,
+             self.paths.search.sources, self.rows, self.num_robots, samples, cells,
+             wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
         )  # fmt: skip
         return found.view(self.num_envs, self.rows, -1) != 0
 
@@ -307,9 +306,9 @@ class Navigation:
         cell = torch.empty_like(wanted)
         self.launch(
             targets._first_cells, tuple(wanted.shape),
-            inputs=[self.grids, self.arrays["map_id"], self.passable.passable, self.paths.row_of_item,
-                    self.paths.search.distance, wp.from_torch(wanted), int(STRAIGHT * ahead)],
-            outputs=[wp.from_torch(cell)],
+            [self.grids, self.arrays["map_id"], self.passable.passable, self.paths.row_of_item,
+             self.paths.search.distance, wp.from_torch(wanted), int(STRAIGHT * ahead),
+             wp.from_torch(cell)],
         )  # fmt: skip
         return self.points(self.pick(cell).clamp_min(0).long())
 
@@ -356,9 +355,9 @@ class Navigation:
         found = torch.empty(index.shape[:2], dtype=torch.bool, device=self.device)
         self.launch(
             targets._find_open_ground, tuple(found.shape),
-            inputs=[self.grids, self.arrays["map_id"], self.known_grids.known, self.known_grids.walls, self.rows,
-                    wp.from_torch(index.to(torch.int32).contiguous()), self.room],
-            outputs=[wp.from_torch(found)],
+            [self.grids, self.arrays["map_id"], self.known_grids.known, self.known_grids.walls, self.rows,
+             wp.from_torch(index.to(torch.int32).contiguous()), self.room,
+             wp.from_torch(found)],
         )  # fmt: skip
         return found
 
@@ -375,7 +374,7 @@ class Navigation:
             "chosen": view(chosen), "cell": view(cell), "toward": view(toward, wp.vec2),
             "target": view(target, wp.vec2),
         }  # fmt: skip
-        launch_named(self.launch, goals._aim, tuple(chosen.shape), "cell toward target", values)
+        launch_named(self.launch, goals._aim, tuple(chosen.shape), values)
         return target
 
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -395,5 +394,5 @@ def _to_action(points: torch.Tensor, arrays: dict, launch: Launch) -> tuple[torc
     region = torch.empty(points.shape[:2], dtype=torch.int64, device=points.device)
     offset = torch.empty_like(points)
     values = arrays | {"point": view(points, wp.vec2), "region": view(region), "offset": view(offset, wp.vec2)}
-    launch_named(launch, goals._to_action, tuple(region.shape), "region offset", values)
+    launch_named(launch, goals._to_action, tuple(region.shape), values)
     return region, offset

@@ -308,10 +308,10 @@ class TargetTracker:
             "least": STUCK * nav.clearance, "shared": int(nav.rows == 1), "most": DWELL,
         }  # fmt: skip
         robots, slots = (len(way), way.shape[1]), (len(way), way.shape[2])
-        launch_named(nav.launch, targets._note_stuck, robots, "chosen stood dwell", values)
-        launch_named(nav.launch, targets._count_visits, slots, "dwell", values)
-        launch_named(nav.launch, targets._drop_targets, robots, "kept left counted", values)
-        launch_named(nav.launch, targets._try_again, robots, "kept dwell", values)
+        launch_named(nav.launch, targets._note_stuck, robots, values)
+        launch_named(nav.launch, targets._count_visits, slots, values)
+        launch_named(nav.launch, targets._drop_targets, robots, values)
+        launch_named(nav.launch, targets._try_again, robots, values)
         return kept
 
 
@@ -320,5 +320,5 @@ def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
     state = env.simulation.tensors
     draw = torch.empty((env.num_envs, env.num_robots, count), device=env.device)
     keys = [view(state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
-    launch_on(env.device)(goals._draw_uniform, tuple(draw.shape), keys, [view(draw)])
+    launch_on(env.device)(goals._draw_uniform, tuple(draw.shape), [*keys, view(draw)])
     return draw

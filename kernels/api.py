@@ -136,9 +136,8 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
         "viewers_free": wp.from_torch(views), "error": wp.from_torch(zeros(1)),
     }  # fmt: skip
     launch = launch_on(device)
-    found = "error bins direction limit occluder_count wall_count visible_count"
-    launch_named(launch, visibility._collect_occluders, dim, found, values)
-    launch_named(launch, visibility._scan_free, (*dim, lanes), "viewers_free error visible_count visible", values)
+    launch_named(launch, visibility._collect_occluders, dim, values)
+    launch_named(launch, visibility._scan_free, (*dim, lanes), values)
     return views[0, 0] != 0
 
 
@@ -171,8 +170,8 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     values = {"active": wp.from_torch(active), "hears": wp.from_torch(hears), "seen": words, "told": told}
     values |= {"known": wp.from_torch(known), "lanes": lanes, "maps": Maps(), "map_id": values["active"]}
     values |= {"weighed": 0, "known_weight": wp.from_torch(torch.zeros_like(active).view(-1, 1))}
-    written, dim = "known known_weight told", (seen.shape[0], lanes)
-    launch_named(launch_on(words.device), merge._share_points, dim, written, values)
+    dim = (seen.shape[0], lanes)
+    launch_named(launch_on(words.device), merge._share_points, dim, values)
     return unpack_flags(known, robots)
 
 
@@ -221,7 +220,7 @@ def received_power(
     values |= {"grids": grids, "open": wp.from_torch(free.flatten().to(torch.uint8)), "radio": radio}
     values["power"] = wp.from_torch(arrived)
     if len(arrived):
-        launch_named(launch_on(free.device), _measure_signals, len(arrived), "power", values)
+        launch_named(launch_on(free.device), _measure_signals, len(arrived), values)
     return arrived
 
 

@@ -101,7 +101,6 @@ def assign_targets(cost: torch.Tensor) -> torch.Tensor:
     launch_on(cost.device)(
         _assign_targets,
         envs,
-        inputs=[wp.from_torch(padded)],
-        outputs=[*map(wp.from_torch, scratch), wp.from_torch(match)],
+        [wp.from_torch(padded), *map(wp.from_torch, scratch), wp.from_torch(match)],
     )
     return match.long()

@@ -315,19 +315,14 @@ def _recall(
 
 def write_worlds(launch: Launch, worlds: int, cells: int, tiles: int, values: dict) -> None:
     """Write what W worlds are made of into their arrays; `values` names them as the kernels do."""
-    launch_named(launch, _find_walls, (worlds, values["lanes"]), "wall", values)
-    launch_named(launch, _believe, (worlds, cells), "state certain", values)
-    launch_named(launch, _count_tiles, (worlds, tiles), "count", values)
-    launch_named(
-        launch, _place_tiles, worlds, "free_cell boundary_cell pair_begin total neighbour_begin", values
-    )
-    launch_named(
-        launch, _write_points, (worlds, tiles), "free_weight free boundary cell_of_free cell_of_boundary index", values
-    )
-    launch_named(launch, _join_points, (worlds, tiles), "neighbour_begin neighbour", values)
+    launch_named(launch, _find_walls, (worlds, values["lanes"]), values)
+    launch_named(launch, _believe, (worlds, cells), values)
+    launch_named(launch, _count_tiles, (worlds, tiles), values)
+    launch_named(launch, _place_tiles, worlds, values)
+    launch_named(launch, _write_points, (worlds, tiles), values)
+    launch_named(launch, _join_points, (worlds, tiles), values)
 
 
 def recall(launch: Launch, envs: int, values: dict) -> None:
     """Let the robots of E envs know what is certain in their worlds."""
-    writes = "seen_free viewers_free seen_boundary viewers_boundary"
-    launch_named(launch, _recall, (envs, values["lanes"]), writes, values)
+    launch_named(launch, _recall, (envs, values["lanes"]), values)

@@ -346,17 +346,17 @@ class FrontierBlocks:
 
     def mark(self, launch: Launch) -> None:
         """Note which rows are to be brought up to date."""
-        launch_named(launch, _mark_rows, self.grid_of_row.shape, "grid_of_row", self.values())
+        launch_named(launch, _mark_rows, self.grid_of_row.shape, self.values())
 
     def place(self, launch: Launch) -> None:
         """Bring frontiers, blocks and targets up to date with the known grids and the distances."""
         values, rows = self.values(), self.grid_of_row.shape[0]
         split = (rows, values["lanes"])
-        launch_named(launch, _note_changes, split, "changed renewed size sums frontier", values)
-        launch_named(launch, _sum_frontier, (rows, self.tallest), "frontier size sums", values)
-        launch_named(launch, _place_targets, split, "target_cell looked_from", values)
-        launch_named(launch, _forget_changes, split, "changed renewed", values)
-        launch_named(launch, _list_blocks, self.count.shape, "listed count", values)
+        launch_named(launch, _note_changes, split, values)
+        launch_named(launch, _sum_frontier, (rows, self.tallest), values)
+        launch_named(launch, _place_targets, split, values)
+        launch_named(launch, _forget_changes, split, values)
+        launch_named(launch, _list_blocks, self.count.shape, values)
 
 
 def block_memory_per_env(cells: int, known_rows: int, wall_words: int, blocks: int) -> int:

@@ -97,4 +97,4 @@ def _detect_collisions(
 
 def detect_collisions(launch: Launch, shard: "Shard") -> None:
     """Stop the robots that collide in this local step."""
-    shard.call(launch, _detect_collisions, "pose collided slip crashed")
+    shard.call(launch, _detect_collisions)

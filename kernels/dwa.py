@@ -342,6 +342,6 @@ def list_curvatures(robots: dict[str, torch.Tensor], num_steering: int) -> torch
     shape, device = (*robots["kind"].shape, num_steering), robots["kind"].device
     curvatures = torch.empty(shape, device=device)
     launch_on(device)(
-        _list_curvatures, shape, [robots_struct(robots, 0, shape[0]), num_steering], [wp.from_torch(curvatures)]
+        _list_curvatures, shape, [robots_struct(robots, 0, shape[0]), num_steering, wp.from_torch(curvatures)]
     )
     return curvatures

@@ -132,4 +132,4 @@ def _move_robots(
 
 def move_robots(launch: Launch, shard: "Shard") -> None:
     """Move the robots by one local step."""
-    shard.call(launch, _move_robots, "pose slip path_length center facing")
+    shard.call(launch, _move_robots)

@@ -68,4 +68,4 @@ def fail_robots(launch: Launch, shard: "Shard", running: wp.array) -> None:
     """Stop the robots that have failed, in the envs where ``running`` [env] is set, if any may fail."""
     if shard.settings.faults:
         given = {"active": running, "fault_at": shard.sim.fault_at}
-        shard.call(launch, _fail_robots, "pose failed slip control", **given)
+        shard.call(launch, _fail_robots, **given)

@@ -80,10 +80,10 @@ def mark_frontier(
         width, height: int32 [grids], cells of each grid along x and y.
         frontier: uint8 [rows, cells], out: 1 on frontier cells, 0 elsewhere.
         tallest: cells of the tallest grid along y.
-        launch: launches or records ``launch(kernel, dim, inputs, outputs)``; on the arrays' device.
+        launch: launches or records ``launch(kernel, dim, arguments)``; on the arrays' device.
     """
     launch = launch or launch_on(known.device)
-    launch(_mark_frontier, (known.shape[0], tallest), [known, grid_of_row, width, height], [frontier])
+    launch(_mark_frontier, (known.shape[0], tallest), [known, grid_of_row, width, height, frontier])
 
 
 def frontier_cells(known_free: torch.Tensor, known_obstacle: torch.Tensor) -> torch.Tensor:

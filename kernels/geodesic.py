@@ -212,7 +212,7 @@ class DistanceSearch:
         """Fill `distance`.
 
         Args:
-            launch: ``launch(kernel, dim, inputs, outputs)`` launches or records.
+            launch: ``launch(kernel, dim, arguments)`` launches or records.
             passable: uint8 [rows, cells], `BLOCKED`, `OPEN` or `TIGHT`; cell = iy * width + ix, own width.
             row_of_item: int32 [items], the row of `passable` that a search runs on.
             grid_of_row: int32 [rows], which grid (map) a row has now.
@@ -220,8 +220,8 @@ class DistanceSearch:
         """
         launch(
             _search_distance, self.distance.shape[0],
-            [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop],
-            [self.next, self.previous, self.touched, self.distance],
+            [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop,
+             self.next, self.previous, self.touched, self.distance],
         )  # fmt: skip
 
 

@@ -278,10 +278,10 @@ class KnownGrids:
     def paint(self, launch: Launch) -> None:
         """Bring `known` up to date."""
         rows, values = self.known.shape[0], vars(self) | {"capacity": self.news.shape[1]}
-        launch_named(launch, _begin_painting, rows, "met news_count", values)
+        launch_named(launch, _begin_painting, rows, values)
         self._paint_layers(launch, again=0)
-        launch_named(launch, _find_stale, rows, "total grid_of_row news_count stale", values)
-        launch_named(launch, _clear_stale, (rows, self.lanes), "painted known walls", values)
+        launch_named(launch, _find_stale, rows, values)
+        launch_named(launch, _clear_stale, (rows, self.lanes), values)
         self._paint_layers(launch, again=1)
 
     def _paint_layers(self, launch: Launch, again: int) -> None:
@@ -296,10 +296,8 @@ class KnownGrids:
             "value": wp.uint8(FREE), "shift": 0,
         }  # fmt: skip
         for layer in (obstacles, free):
-            launch_named(
-                launch, _paint_points, (self.known.shape[0], self.lanes),
-                "painted known walls met total news_count news", vars(self) | layer | {"again": again},
-            )  # fmt: skip
+            given = vars(self) | layer | {"again": again}
+            launch_named(launch, _paint_points, (self.known.shape[0], self.lanes), given)
 
 
 def news_capacity(cells: int) -> int:

@@ -14,8 +14,8 @@ import warp as wp
 
 from maexp.kernels.startup import KNOWN
 
-Launch = Callable[[wp.Kernel, int | tuple[int, ...], Sequence, Sequence], None]
-"""``launch(kernel, dim, inputs, outputs)`` launches a kernel at once, or records it."""
+Launch = Callable[[wp.Kernel, int | tuple[int, ...], Sequence], None]
+"""``launch(kernel, dim, arguments)`` launches a kernel at once, or records it."""
 
 CPU_LANES = 1
 """Threads that share the work of a robot or a row on the CPU, where a thread costs more than an item."""
@@ -32,32 +32,22 @@ def current_stream(device: wp.Device) -> wp.Stream | None:
 
 
 def launch_on(device: wp.Device | torch.device | str) -> Launch:
-    """``launch(kernel, dim, inputs, outputs)`` on a device, in order with what torch does there."""
+    """``launch(kernel, dim, arguments)`` on a device, in order with what torch does there."""
     device = wp.get_device(str(device))
 
-    def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence, outputs: Sequence) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, stream=current_stream(device))
+    def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], arguments: Sequence) -> None:
+        wp.launch(kernel, dim=dim, inputs=arguments, device=device, stream=current_stream(device))
 
     return launch
 
 
-def launch_named(
-    launch: Launch, kernel: wp.Kernel, dim: int | tuple[int, ...], writes: str, values: Mapping[str, Any]
-) -> None:
-    """Launch a kernel with the values that its parameters are named after.
-
-    Args:
-        writes: the parameters that it writes: its last ones, in their order.
-        values: by name; more than it takes.
-    """
-    names, outputs = [argument.label for argument in kernel.adj.args], writes.split()
-    first = len(names) - len(outputs)
-    if names[first:] != outputs:
-        raise ValueError(f"{kernel.key} ends with the parameters {' '.join(names[first:])}, not with {writes}")
+def launch_named(launch: Launch, kernel: wp.Kernel, dim: int | tuple[int, ...], values: Mapping[str, Any]) -> None:
+    """Launch a kernel with the values that its parameters are named after; there may be more."""
+    names = [argument.label for argument in kernel.adj.args]
     missing = [name for name in names if name not in values]
     if missing:
         raise ValueError(f"{kernel.key} takes {', '.join(missing)}, which nothing here is named")
-    launch(kernel, dim, [values[name] for name in names[:first]], [values[name] for name in outputs])
+    launch(kernel, dim, [values[name] for name in names])
 
 
 def view(tensor: torch.Tensor, dtype: type | None = None) -> Any:
@@ -88,11 +78,9 @@ class RecordedLaunch:
     Warp packs them anew at every launch of a recorded command: 5 us each, a fifth of what 32 robots take.
     """
 
-    def __init__(
-        self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence, outputs: Sequence, device: wp.Device
-    ):
+    def __init__(self, kernel: wp.Kernel, dim: int | tuple[int, ...], arguments: Sequence, device: wp.Device):
         self.kernel, self.device = kernel, device
-        self.command = wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=device, record_cmd=True)
+        self.command = wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_cmd=True)
         self.call: Any = None
         if KNOWN and device.is_cpu and self.command.block_dim == 1:
             bounds, *arguments = self.command.params
@@ -109,7 +97,7 @@ class RecordedLaunch:
 def record(stage: Callable[[Launch], None], device: wp.Device) -> list[RecordedLaunch]:
     """The launches of ``stage(launch)``, for `replay`."""
     launches: list[RecordedLaunch] = []
-    stage(lambda kernel, dim, inputs, outputs: launches.append(RecordedLaunch(kernel, dim, inputs, outputs, device)))
+    stage(lambda kernel, dim, arguments: launches.append(RecordedLaunch(kernel, dim, arguments, device)))
     return launches
 
 

@@ -256,19 +256,19 @@ def _share_points(
 
 def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
     """Count what is new and what overlaps, and add the scan to the team's map, where ``running`` [env] is set."""
-    shard.call(launch, _count_points, "discovered overlap", active=running)
-    shard.call(launch, _merge_scan, "seen_free viewers_free covered shared", active=running)
+    shard.call(launch, _count_points, active=running)
+    shard.call(launch, _merge_scan, active=running)
 
 
 def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
     """Let radios hear from others, where communication is limited and ``running`` [env] is set."""
     if not shard.settings.limited:
         return
-    shard.call(launch, _hear_robots, "comm hears", shard.radios, active=running)
+    shard.call(launch, _hear_robots, shard.radios, active=running)
     receive_signals(launch, shard, running)
     for what in ("free", "boundary"):
         seen, known, told = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "known", "told"))
         given = {"seen": seen, "known": known, "told": told, "lanes": lanes_on(shard.device, 1024)}
         given["weighed"] = int(what == "free")
         dim = (shard.shape[0], given["lanes"])
-        shard.call(launch, _share_points, "known known_weight told", dim, active=running, **given)
+        shard.call(launch, _share_points, dim, active=running, **given)

@@ -80,5 +80,5 @@ def _list_near(
 
 def list_near(launch: Launch, shard: "Shard", running: wp.array) -> None:
     """Who is near whom, and which way robots face, in the envs where ``running`` [env] is set."""
-    shard.call(launch, _face_robots, "facing place", active=running)
-    shard.call(launch, _list_near, "near near_count", active=running)
+    shard.call(launch, _face_robots, active=running)
+    shard.call(launch, _list_near, active=running)

@@ -328,7 +328,7 @@ def _observe_pose(
 
 def record_track(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
     """Note where the robots are, where ``running`` [env] is set: in the step being finished (1) or at its start (0)."""
-    shard.call(launch, _record_track, "track", active=running, ahead=ahead, **shard.believed)
+    shard.call(launch, _record_track, active=running, ahead=ahead, **shard.believed)
 
 
 def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: torch.Tensor) -> None:
@@ -346,9 +346,9 @@ def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: t
         "team_bits": int(settings.draw_known and not settings.limited),
         "lanes": lanes_on(shard.device, 1024),
     }  # fmt: skip
-    shard.call(launch, _draw_points, "picture team", (shard.shape[0], given["lanes"]), **given)
-    shard.call(launch, _list_bodies, "error body_pixel body_count", **shard.believed)
-    shard.call(launch, _draw_robots, "picture", picture=given["picture"])
+    shard.call(launch, _draw_points, (shard.shape[0], given["lanes"]), **given)
+    shard.call(launch, _list_bodies, **shard.believed)
+    shard.call(launch, _draw_robots, picture=given["picture"])
 
 
 def observe_pose(launch: Launch, shard: "Shard", pose: torch.Tensor, grid: torch.Tensor) -> None:
@@ -358,4 +358,4 @@ def observe_pose(launch: Launch, shard: "Shard", pose: torch.Tensor, grid: torch
         pose, grid: float32 [env, robot, 4] and [env, robot, 4, 8, 8], of this shard's envs.
     """
     given = {"scaled_pose": wp.from_torch(pose, dtype=wp.vec4), "grid": wp.from_torch(grid.flatten(3))}
-    shard.call(launch, _observe_pose, "scaled_pose grid", **given, **shard.believed)
+    shard.call(launch, _observe_pose, **given, **shard.believed)

@@ -153,18 +153,17 @@ def _take_aim(
 def drift_odometry(launch: Launch, shard: "Shard") -> None:
     """Let the robots' estimates drift, if they do, by the way that they drive next."""
     if shard.settings.drifts:
-        shard.call(launch, _drift_odometry, "odometry_error")
+        shard.call(launch, _drift_odometry)
 
 
 def estimate_poses(launch: Launch, shard: "Shard", running: wp.array, begins: int) -> None:
     """Where robots believe to be, if that drifts, in the envs where ``running`` [env] is set; ``begins``: 1 at a
     reset."""
     if shard.settings.drifts:
-        writes = "odometry_error pose_estimate center_estimate"
-        shard.call(launch, _estimate_poses, writes, active=running, begins=begins)
+        shard.call(launch, _estimate_poses, active=running, begins=begins)
 
 
 def take_aim(launch: Launch, shard: "Shard") -> None:
     """Where robots drive that are elsewhere than they believe (`Shard.aims`), once their waypoints are set."""
     if shard.settings.drifts:
-        shard.call(launch, _take_aim, "goal_aim waypoint_aim")
+        shard.call(launch, _take_aim)

@@ -232,7 +232,7 @@ def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> Non
     """Fit the clearance that DWA is to keep to the paths."""
     known, paths = wavefront.known, wavefront.paths
     shard.call(
-        launch, _fit_clearance, "clearance",
+        launch, _fit_clearance,
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
         path=paths.path, path_total=paths.path_total, path_used=paths.path_used,
         clearance=wavefront.narrowed.clearance, **shard.believed,
@@ -243,7 +243,7 @@ def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     """Draw waypoints nearer, so that robots can brake."""
     known, settings = wavefront.known, shard.settings
     shard.call(
-        launch, _hold_back, "waypoint",
+        launch, _hold_back,
         grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
         lead_time=settings.horizon * settings.dt, **shard.aims,
     )  # fmt: skip

@@ -236,10 +236,10 @@ class PassableGrids:
             "grids": known.grids, "map_id": known.map_id, "known": known.known, "news": known.news,
             "news_count": known.news_count, "walls": known.walls, "rows_per_env": self.masks, "lanes": lanes,
         }  # fmt: skip
-        launch_named(launch, _assign_grids, self.grid_of_row.shape, "grid_of_row", values)
-        launch_named(launch, _open_cells, dim, "passable", values)
+        launch_named(launch, _assign_grids, self.grid_of_row.shape, values)
+        launch_named(launch, _open_cells, dim, values)
         if not self.through_unknown:
-            launch_named(launch, _open_news, dim, "passable", values)
+            launch_named(launch, _open_news, dim, values)
         for radius, value in self.rings:
             ring = {"radius": radius, "value": wp.uint8(value)}
-            launch_named(launch, _close_cells, dim, "passable", values | ring)
+            launch_named(launch, _close_cells, dim, values | ring)

@@ -73,20 +73,18 @@ def _set_goal(
 def set_goals(launch: Launch, shard: "Shard") -> None:
     """Turn the policy's regions and offsets into goals."""
     if shard.settings.planner != "direct":
-        shard.call(launch, _set_goal, "error goal waypoint")
+        shard.call(launch, _set_goal)
 
 
 def plan(launch: Launch, shard: "Shard") -> None:
     """How to go: controls of every robot. Under `wavefront` DWA drives to its waypoints with its clearances."""
     if shard.settings.planner == "direct":
-        shard.call(launch, _plan_direct, "control")
+        shard.call(launch, _plan_direct)
         return
     robots = shard.robots
     if shard.wavefront is None:
         take_aim(launch, shard)
     else:
         robots = shard.wavefront.narrowed
-    shard.call(
-        launch, _plan_dwa, "error control nearby mates",
-        robots=robots, known_boundary=shard.known("boundary"), waypoint=shard.aims["waypoint"],
-    )  # fmt: skip
+    boundary, waypoint = shard.known("boundary"), shard.aims["waypoint"]
+    shard.call(launch, _plan_dwa, robots=robots, known_boundary=boundary, waypoint=waypoint)

@@ -272,8 +272,7 @@ def _note_links(
 def place_base(launch: Launch, shard: "Shard") -> None:
     """Put the base stations of the envs of ``mask`` in their places, where communication is limited."""
     if shard.settings.limited:
-        written = "base known_weight base_sum worst_sum told_step connected"
-        shard.call(launch, _place_base, written, shard.shape[0])
+        shard.call(launch, _place_base, shard.shape[0])
 
 
 def receive_signals(launch: Launch, shard: "Shard", running: wp.array) -> None:
@@ -281,11 +280,10 @@ def receive_signals(launch: Launch, shard: "Shard", running: wp.array) -> None:
     if shard.settings.signal:
         sim = shard.sim
         given = {"grids": sim.nav_grids, "open": sim.open_cells, "radio": sim.radio, "active": running}
-        shard.call(launch, _receive_signals, "hears comm", shard.radios, **given)
+        shard.call(launch, _receive_signals, shard.radios, **given)
 
 
 def note_links(launch: Launch, shard: "Shard") -> None:
     """Sum up who knows how much and who is connected, where communication is limited."""
     if shard.settings.limited:
-        written = "base_sum worst_sum told_step connected counted reached"
-        shard.call(launch, _note_links, written, shard.shape[0])
+        shard.call(launch, _note_links, shard.shape[0])

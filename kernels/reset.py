@@ -293,22 +293,13 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
         flags += [s.known_free, s.known_boundary]
     lanes = lanes_on(shard.device, 1024)
     for one in flags:
-        shard.call(launch, _clear_flags, "flags", (*one.shape[:2], lanes), flags=one, lanes=lanes)
+        shard.call(launch, _clear_flags, (*one.shape[:2], lanes), flags=one, lanes=lanes)
     forget_returns(launch, shard)
-    shard.call(
-        launch, _clear_env,
-        "covered covered_before covered_sum shared "
-        "local_step macro_step terminated milestone_step milestone_overlap",
-        shard.shape[0],
-    )  # fmt: skip
-    shard.call(launch, _place_team, "error map_id pose center", shard.shape[0])
-    shard.call(
-        launch, _clear_robots,
-        "slip control goal waypoint collided "
-        "path_length milestone_path terms unscaled episode_reward crashed",
-    )  # fmt: skip
+    shard.call(launch, _clear_env, shard.shape[0])
+    shard.call(launch, _place_team, shard.shape[0])
+    shard.call(launch, _clear_robots)
 
 
 def start_episodes(launch: Launch, shard: "Shard") -> None:
     """Let the envs of ``mask`` run, once their robots have taken the first scan."""
-    shard.call(launch, _start_env, "covered_before active discovered overlap", shard.shape[0])
+    shard.call(launch, _start_env, shard.shape[0])

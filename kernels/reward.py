@@ -180,14 +180,9 @@ def _close_step(
 
 def reward_robots(launch: Launch, shard: "Shard") -> None:
     """Add this local step's reward."""
-    shard.call(launch, _reward_robots, "terms unscaled")
+    shard.call(launch, _reward_robots)
 
 
 def close_step(launch: Launch, shard: "Shard") -> None:
     """Count the local step, note milestones, end episodes."""
-    shard.call(
-        launch, _close_step,
-        "active covered_sum local_step milestone_step "
-        "covered_before milestone_overlap milestone_path terminated",
-        shard.shape[0],
-    )  # fmt: skip
+    shard.call(launch, _close_step, shard.shape[0])

@@ -153,11 +153,7 @@ def _forget_returns(
 def sense(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
     """What radars that miss returns make of what is in view, where ``running`` [env] is set; ``ahead``: 0 in the scan
     of a reset, 1 in that of a local step."""
-    shard.call(
-        launch, _sense_points,
-        "evidence_free evidence_boundary seen_boundary viewers_free viewers_boundary visible visible_count",
-        active=running, ahead=ahead, sensing=shard.sim.sensing,
-    )  # fmt: skip
+    shard.call(launch, _sense_points, active=running, ahead=ahead, sensing=shard.sim.sensing)
 
 
 def forget_returns(launch: Launch, shard: "Shard") -> None:
@@ -166,4 +162,4 @@ def forget_returns(launch: Launch, shard: "Shard") -> None:
         lanes = lanes_on(shard.device, 1024)
         for one in (shard.view.evidence_free, shard.view.evidence_boundary):
             dim = (*one.shape[:2], lanes)
-            shard.call(launch, _forget_returns, "evidence", dim, evidence=one, lanes=lanes)
+            shard.call(launch, _forget_returns, dim, evidence=one, lanes=lanes)

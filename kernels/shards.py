@@ -81,15 +81,13 @@ class Shard:
     def _as_drifting(self, suffix: str, *names: str) -> dict[str, wp.array]:
         return {name: getattr(self.view, f"{name}_{suffix}" if self.settings.drifts else name) for name in names}
 
-    def call(
-        self, launch: Launch, kernel: wp.Kernel, writes: str, dim: int | tuple[int, ...] | None = None, **given
-    ) -> None:
+    def call(self, launch: Launch, kernel: wp.Kernel, dim: int | tuple[int, ...] | None = None, **given) -> None:
         """Launch a kernel, once for every robot unless ``dim`` says else.
 
         Its parameters are named after what they get: a field of the state, a setting, ``maps``, ``robots``; what else
-        they are is ``given``. ``writes`` names those that it writes, its last ones.
+        they are is ``given``.
         """
-        launch_named(launch, kernel, self.shape if dim is None else dim, writes, self._values | given)
+        launch_named(launch, kernel, self.shape if dim is None else dim, self._values | given)
 
     def record(self, stage: Stage) -> list[RecordedLaunch]:
         """The launches of a stage, recorded when first asked for."""

@@ -188,7 +188,7 @@ def share_targets(
     wish, waiting = torch.empty_like(taken, dtype=torch.int32), torch.empty_like(taken, dtype=torch.bool)
     launch_on(preference.device)(
         _share_targets, len(taken),
-        [view(preference), view(way), view(point, wp.vec2), view(hears), view(body)],
-        [view(wish), view(waiting), view(taken)],
+        [view(preference), view(way), view(point, wp.vec2), view(hears), view(body),
+         view(wish), view(waiting), view(taken)],
     )  # fmt: skip
     return taken

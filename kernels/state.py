@@ -53,14 +53,12 @@ class Field:
         axes: letters of `AXES`; a vector's own length is none of them.
         unit: of an entry, "" for numbers, flags and counts.
         meaning: what an entry is.
-        written: who writes it: kernels, and ``host`` for torch code of `Simulation` and of the env.
     """
 
     kind: type
     axes: str
     unit: str
     meaning: str
-    written: str
 
     @property
     def dtype(self) -> torch.dtype:
@@ -76,155 +74,117 @@ class Field:
 # fmt: off
 STATE = {
     # Which episode an env plays.
-    "seed": Field(wp.int32, "1", "", "key of all random numbers, with env_id and episode", "host"),
-    "env_id": Field(wp.int32, "E", "", "number of the env in keys of random numbers; of an evaluation episode", "host"),
-    "episode": Field(wp.int32, "E", "", "number of the episode; evaluation's begin at 2^30, -1: none yet", "host"),
-    "map_id": Field(wp.int32, "E", "", "map of the episode", "_place_team"),
+    "seed": Field(wp.int32, "1", "", "key of all random numbers, with env_id and episode"),
+    "env_id": Field(wp.int32, "E", "", "number of the env in keys of random numbers; of an evaluation episode"),
+    "episode": Field(wp.int32, "E", "", "number of the episode; evaluation's begin at 2^30, -1: none yet"),
+    "map_id": Field(wp.int32, "E", "", "map of the episode"),
     "starts": Field(wp.vec3, "E N", "m, m, rad",
-        "x, y, heading of following resets; inf: those of the map, or drawn", "host"),
+        "x, y, heading of following resets; inf: those of the map, or drawn"),
 
     # Its clock and its end.
-    "active": Field(wp.int32, "E", "", "1 while the episode runs: local steps leave other envs alone",
-        "_start_env _close_step host"),
-    "local_step": Field(wp.int32, "E", "steps", "local steps made in this episode", "_clear_env _close_step"),
-    "macro_step": Field(wp.int32, "E", "steps", "decisions made in this episode", "_clear_env host"),
-    "terminated": Field(wp.int32, "E", "", "1 once the coverage is reached or all robots have collided",
-        "_clear_env _close_step"),
-    "error": Field(wp.int32, "E", "", "bits `ERROR_*` of `types`, raised and cleared after every macro step",
-        "_set_goal _plan_dwa _collect_occluders _scan_free _list_bodies _place_team host"),
+    "active": Field(wp.int32, "E", "", "1 while the episode runs: local steps leave other envs alone"),
+    "local_step": Field(wp.int32, "E", "steps", "local steps made in this episode"),
+    "macro_step": Field(wp.int32, "E", "steps", "decisions made in this episode"),
+    "terminated": Field(wp.int32, "E", "", "1 once the coverage is reached or all robots have collided"),
+    "error": Field(wp.int32, "E", "", "bits `ERROR_*` of `types`, raised and cleared after every macro step"),
 
     # Where the robots are and where they go.
-    "pose": Field(wp.vec4, "E N", "m, m, m/s, rad", "x, y, speed forward, heading of the reference point (`dynamics`)",
-        "_place_team _fail_robots _move_robots _detect_collisions"),
-    "slip": Field(wp.float32, "E N", "m/s", "speed to the left, of omnidirectional robots; 0 for the others",
-        "_clear_robots _fail_robots _move_robots _detect_collisions"),
-    "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it",
-        "_place_team _move_robots"),
+    "pose": Field(wp.vec4, "E N", "m, m, m/s, rad", "x, y, speed forward, heading of the reference point (`dynamics`)"),
+    "slip": Field(wp.float32, "E N", "m/s", "speed to the left, of omnidirectional robots; 0 for the others"),
+    "center": Field(wp.vec3, "E N", "m", "centre of the body, z = 0: radar, planner and collisions measure from it"),
     "odometry_error": Field(wp.vec3, "E J", "m, m, rad", "what the robot takes its pose to be, less what it is: x, y,"
-        " heading of the reference point", "_drift_odometry _estimate_poses"),
-    "pose_estimate": Field(wp.vec4, "E J", "m, m, m/s, rad", "the pose that the robot believes to have, on the map",
-        "_estimate_poses"),
-    "center_estimate": Field(wp.vec3, "E J", "m", "where it believes its centre to be", "_estimate_poses"),
-    "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot", "_clear_robots _set_goal"),
-    "waypoint": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there",
-        "_clear_robots _set_goal _pick_waypoint _hold_back _hold_turns"),
+        " heading of the reference point"),
+    "pose_estimate": Field(wp.vec4, "E J", "m, m, m/s, rad", "the pose that the robot believes to have, on the map"),
+    "center_estimate": Field(wp.vec3, "E J", "m", "where it believes its centre to be"),
+    "goal": Field(wp.vec2, "E N", "m", "where the policy sends the robot"),
+    "waypoint": Field(wp.vec2, "E N", "m", "where it drives now: the goal, or a waypoint on the way there"),
     "control": Field(wp.vec2, "E N", "m/s^2, rad", "acceleration, then steering [rad], yaw rate [rad/s] or sideways"
-        " acceleration [m/s^2], as its kind has it", "_clear_robots _plan_dwa _plan_direct _fail_robots"),
-    "collided": Field(wp.int32, "E N", "", "1 once the robot has collided: it stands for good",
-        "_clear_robots _detect_collisions"),
-    "failed": Field(wp.int32, "E N", "", "1 while the robot has failed: it stands, sees nothing and says nothing",
-        "_fail_robots"),
-    "path_length": Field(wp.float32, "E N", "m", "way driven in this episode", "_clear_robots _move_robots"),
-    "track": Field(wp.int32, "E N T", "", "pixel of the body's centre after each local step (ix * 125 + iy)",
-        "_record_track"),
+        " acceleration [m/s^2], as its kind has it"),
+    "collided": Field(wp.int32, "E N", "", "1 once the robot has collided: it stands for good"),
+    "failed": Field(wp.int32, "E N", "", "1 while the robot has failed: it stands, sees nothing and says nothing"),
+    "path_length": Field(wp.float32, "E N", "m", "way driven in this episode"),
+    "track": Field(wp.int32, "E N T", "", "pixel of the body's centre after each local step (ix * 125 + iy)"),
 
     # What they have seen and know. Points are numbered within their map, sorted by cell (`types.Maps`).
-    "seen_free": Field(wp.int32, "E W F", "", "bit of every robot that has scanned the free point",
-        "_clear_flags _merge_scan"),
-    "seen_boundary": Field(wp.int32, "E W B", "", "the same of boundary points",
-        "_clear_flags _scan_boundary _sense_points"),
+    "seen_free": Field(wp.int32, "E W F", "", "bit of every robot that has scanned the free point"),
+    "seen_boundary": Field(wp.int32, "E W B", "", "the same of boundary points"),
     "viewers_free": Field(wp.int32, "E 1 F", "", "robots that have ever scanned the point; during a scan also"
-        " `VIEWER_NOW` for each that sees it now", "_clear_flags _scan_free _sense_points _merge_scan"),
-    "viewers_boundary": Field(wp.int32, "E 1 B", "", "robots that have ever scanned the point",
-        "_clear_flags _scan_boundary _sense_points"),
-    "evidence_free": Field(wp.uint8, "E A C", "", "returns of the free point that the robot has had, until it knows it",
-        "_forget_returns _sense_points"),
-    "evidence_boundary": Field(wp.uint8, "E A I", "", "the same of boundary points", "_forget_returns _sense_points"),
-    "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it",
-        "_clear_flags _share_points"),
-    "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_clear_flags _share_points"),
-    "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited",
-        "_hear_robots _receive_signals"),
-    "hears": Field(wp.int32, "E U W", "", "the same in bits, of all radios that radio i hears",
-        "_hear_robots _receive_signals"),
-    "base": Field(wp.vec3, "E", "m", "where the base station is, or would be, z = 0", "_place_base"),
+        " `VIEWER_NOW` for each that sees it now"),
+    "viewers_boundary": Field(wp.int32, "E 1 B", "", "robots that have ever scanned the point"),
+    "evidence_free": Field(wp.uint8, "E A C", "",
+        "returns of the free point that the robot has had, until it knows it"),
+    "evidence_boundary": Field(wp.uint8, "E A I", "", "the same of boundary points"),
+    "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it"),
+    "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
+    "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited"),
+    "hears": Field(wp.int32, "E U W", "", "the same in bits, of all radios that radio i hears"),
+    "base": Field(wp.vec3, "E", "m", "where the base station is, or would be, z = 0"),
 
     # How much that is. Weights: `Maps.free_weight`, 1 a point on maps of even density.
-    "covered": Field(wp.int32, "E", "weight", "of the free points that the team has seen", "_clear_env _merge_scan"),
-    "covered_before": Field(wp.int32, "E", "weight", "the same before this local step",
-        "_clear_env _start_env _close_step"),
-    "covered_sum": Field(wp.int64, "E", "weight", "sum of `covered` over the episode's local steps",
-        "_clear_env _close_step"),
-    "shared": Field(wp.int32, "E", "weight", "of the free points that two robots or more have seen",
-        "_clear_env _merge_scan"),
+    "covered": Field(wp.int32, "E", "weight", "of the free points that the team has seen"),
+    "covered_before": Field(wp.int32, "E", "weight", "the same before this local step"),
+    "covered_sum": Field(wp.int64, "E", "weight", "sum of `covered` over the episode's local steps"),
+    "shared": Field(wp.int32, "E", "weight", "of the free points that two robots or more have seen"),
     "known_weight": Field(wp.int32, "E U", "weight", "of the free points that a radio knows, where communication is"
-        " limited", "_place_base _share_points"),
-    "base_sum": Field(wp.int64, "E", "weight", "sum of what the base station knows over the episode's local steps",
-        "_place_base _note_links"),
-    "worst_sum": Field(wp.int64, "E", "weight", "the same of the robot that knows least at each step",
-        "_place_base _note_links"),
-    "told_step": Field(wp.int32, "E", "steps", "local step after which every radio knew 95 %; -1 before",
-        "_place_base _note_links"),
-    "connected": Field(wp.int32, "E N", "steps", "local steps in which the robot was connected (`radio._note_links`)",
-        "_place_base _note_links"),
-    "milestone_step": Field(wp.int32, "E M", "steps", "local step that reached the mark; -1 before",
-        "_clear_env _close_step"),
-    "milestone_overlap": Field(wp.float32, "E M", "", "shared / covered at that moment", "_clear_env _close_step"),
-    "milestone_path": Field(wp.float32, "E N M", "m", "`path_length` at that moment", "_clear_robots _close_step"),
+        " limited"),
+    "base_sum": Field(wp.int64, "E", "weight", "sum of what the base station knows over the episode's local steps"),
+    "worst_sum": Field(wp.int64, "E", "weight", "the same of the robot that knows least at each step"),
+    "told_step": Field(wp.int32, "E", "steps", "local step after which every radio knew 95 %; -1 before"),
+    "connected": Field(wp.int32, "E N", "steps", "local steps in which the robot was connected (`radio._note_links`)"),
+    "milestone_step": Field(wp.int32, "E M", "steps", "local step that reached the mark; -1 before"),
+    "milestone_overlap": Field(wp.float32, "E M", "", "shared / covered at that moment"),
+    "milestone_path": Field(wp.float32, "E N M", "m", "`path_length` at that moment"),
 
     # What it earns.
-    "terms": Field(wp.float32, "E N R", "", "terms of the reward, scaled and summed over the macro step",
-        "_clear_robots _reward_robots host"),
-    "unscaled": Field(wp.float32, "E N R", "", "the same without the scales w and v, summed over the episode",
-        "_clear_robots _reward_robots"),
-    "episode_reward": Field(wp.float32, "E N", "", "reward of the episode up to the last macro step",
-        "_clear_robots host"),
+    "terms": Field(wp.float32, "E N R", "", "terms of the reward, scaled and summed over the macro step"),
+    "unscaled": Field(wp.float32, "E N R", "", "the same without the scales w and v, summed over the episode"),
+    "episode_reward": Field(wp.float32, "E N", "", "reward of the episode up to the last macro step"),
 }
 """What a simulation is at a moment: saved, loaded, and all that the future depends on."""
 
 SCRATCH = {
     # What the host asks for.
-    "mask": Field(wp.int32, "E", "", "1 for the envs that a reset starts anew, or whose pictures are drawn", "host"),
-    "region": Field(wp.int64, "E N", "", "the policy's region, ix * 8 + iy", "host"),
-    "offset": Field(wp.vec2, "E N", "", "its offset in that region, in [-1, 1] half regions", "host"),
-    "command": Field(wp.vec2, "E N", "", "its controls, if it drives itself, shares of the limits in [-1, 1]", "host"),
+    "mask": Field(wp.int32, "E", "", "1 for the envs that a reset starts anew, or whose pictures are drawn"),
+    "region": Field(wp.int64, "E N", "", "the policy's region, ix * 8 + iy"),
+    "offset": Field(wp.vec2, "E N", "", "its offset in that region, in [-1, 1] half regions"),
+    "command": Field(wp.vec2, "E N", "", "its controls, if it drives itself, shares of the limits in [-1, 1]"),
 
     # Who is near whom in this local step.
-    "facing": Field(wp.vec2, "E N", "", "unit vector ahead of the robot", "_face_robots _move_robots"),
-    "place": Field(wp.vec3, "E N", "m", "x, y and radius of a disc that the body stays in", "_face_robots"),
-    "near": Field(wp.int32, "E N S", "", "robots that may be in radar range, or touch", "_list_near"),
-    "near_count": Field(wp.int32, "E N", "", "how many those are", "_list_near"),
+    "facing": Field(wp.vec2, "E N", "", "unit vector ahead of the robot"),
+    "place": Field(wp.vec3, "E N", "m", "x, y and radius of a disc that the body stays in"),
+    "near": Field(wp.int32, "E N S", "", "robots that may be in radar range, or touch"),
+    "near_count": Field(wp.int32, "E N", "", "how many those are"),
 
     # Planning.
-    "goal_aim": Field(wp.vec2, "E J", "m", "where the goal lies for a robot that is elsewhere than it believes",
-        "_take_aim"),
-    "waypoint_aim": Field(wp.vec2, "E J", "m", "the same of the waypoint", "_take_aim _hold_back _hold_turns"),
-    "nearby": Field(wp.vec2, "E N O", "m", "known boundary points that may be in the way", "_plan_dwa"),
-    "mates": Field(wp.int32, "E N S", "", "robots that may be in the way", "_plan_dwa"),
+    "goal_aim": Field(wp.vec2, "E J", "m", "where the goal lies for a robot that is elsewhere than it believes"),
+    "waypoint_aim": Field(wp.vec2, "E J", "m", "the same of the waypoint"),
+    "nearby": Field(wp.vec2, "E N O", "m", "known boundary points that may be in the way"),
+    "mates": Field(wp.int32, "E N S", "", "robots that may be in the way"),
 
     # Colliding.
-    "crashed": Field(wp.int32, "E N", "", "1 where the robot collides in this local step",
-        "_clear_robots _detect_collisions"),
+    "crashed": Field(wp.int32, "E N", "", "1 where the robot collides in this local step"),
 
     # Scanning.
-    "bins": Field(wp.float32, "E N D", "m", "distances of what is nearest in each bin of directions (`shadows`)",
-        "_collect_occluders"),
-    "direction": Field(wp.vec3, "E N K", "", "unit vector from the sensor to each occluder", "_collect_occluders"),
-    "limit": Field(wp.vec2, "E N K", "1, m", "cosine of its angular half-width, its distance", "_collect_occluders"),
-    "occluder_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders"),
-    "wall_count": Field(wp.int32, "E N", "", "how many of them, the first, belong to the map; 0: no matter",
-        "_collect_occluders"),
-    "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now", "_scan_free _sense_points"),
-    "visible_count": Field(wp.int32, "E N", "", "how many those are", "_collect_occluders _scan_free _sense_points"),
+    "bins": Field(wp.float32, "E N D", "m", "distances of what is nearest in each bin of directions (`shadows`)"),
+    "direction": Field(wp.vec3, "E N K", "", "unit vector from the sensor to each occluder"),
+    "limit": Field(wp.vec2, "E N K", "1, m", "cosine of its angular half-width, its distance"),
+    "occluder_count": Field(wp.int32, "E N", "", "how many those are"),
+    "wall_count": Field(wp.int32, "E N", "", "how many of them, the first, belong to the map; 0: no matter"),
+    "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now"),
+    "visible_count": Field(wp.int32, "E N", "", "how many those are"),
 
     # Merging.
-    "discovered": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team",
-        "_count_points _start_env"),
-    "overlap": Field(wp.int32, "E N", "weight", "of the visible points that another robot sees now",
-        "_count_points _start_env"),
-    "told_free": Field(wp.int32, "E H P", "", "what each can tell of before it hears others",
-        "_share_points"),
-    "told_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points", "_share_points"),
+    "discovered": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team"),
+    "overlap": Field(wp.int32, "E N", "weight", "of the visible points that another robot sees now"),
+    "told_free": Field(wp.int32, "E H P", "", "what each can tell of before it hears others"),
+    "told_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
 
-    "counted": Field(wp.int32, "E", "weight", "what may end the episode where that is not what the team has seen",
-        "_note_links"),
-    "reached": Field(wp.int32, "E W", "", "bits of the radios found to be connected with the base station",
-        "_note_links"),
+    "counted": Field(wp.int32, "E", "weight", "what may end the episode where that is not what the team has seen"),
+    "reached": Field(wp.int32, "E W", "", "bits of the radios found to be connected with the base station"),
 
     # Drawing.
-    "body_pixel": Field(wp.int32, "E N G", "", "pixels of the robot's body, that of its centre first",
-        "_list_bodies"),
-    "body_count": Field(wp.int32, "E N", "", "how many those are", "_list_bodies"),
+    "body_pixel": Field(wp.int32, "E N G", "", "pixels of the robot's body, that of its centre first"),
+    "body_count": Field(wp.int32, "E N", "", "how many those are"),
 }
 """What the kernels of a step, a reset or an observation hand to each other: no later one reads it."""
 # fmt: on

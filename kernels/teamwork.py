@@ -122,8 +122,8 @@ def choose_in_turn(
     taken = torch.empty(gain.shape[:2], dtype=torch.int64, device=gain.device)
     waiting, best = torch.empty_like(taken, dtype=torch.bool), torch.empty_like(taken, dtype=torch.float32)
     launch_on(gain.device)(
-        _choose_in_turn, len(gain), [view(gain), view(value), view(point, wp.vec2), view(hears)],
-        [view(one) for one in (left, waiting, best, taken, score, claimed)],
+        _choose_in_turn, len(gain), [view(gain), view(value), view(point, wp.vec2), view(hears),
+         *(view(one) for one in (left, waiting, best, taken, score, claimed))],
     )  # fmt: skip
     return score, taken, claimed
 
@@ -197,8 +197,8 @@ def compare_with_others(
     launch_on(point.device)(
         _compare_with_others, tuple(best.shape[:2]),
         [points(point), *(wp.from_torch(one.contiguous()) for one in (best, ways, hears)),
-         points(plans[0]), wp.from_torch(plans[1].contiguous()), points(last[0]), wp.from_torch(last[1].contiguous())],
-        [wp.from_torch(one) for one in found],
+         points(plans[0]), wp.from_torch(plans[1].contiguous()), points(last[0]), wp.from_torch(last[1].contiguous()),
+         *map(wp.from_torch, found)],
     )  # fmt: skip
     return found
 
@@ -236,7 +236,7 @@ def gather_gain(
     parts = [torch.empty((*gain.shape, gain.shape[-1]), device=gain.device) for _ in range(2)]
     launch_on(gain.device)(
         _gather_gain, tuple(gain.shape),
-        [wp.from_torch(point.contiguous(), dtype=wp.vec2), wp.from_torch(gain.contiguous()), reach, near, around],
-        [wp.from_torch(one) for one in parts],
+        [wp.from_torch(point.contiguous(), dtype=wp.vec2), wp.from_torch(gain.contiguous()), reach, near, around,
+         *map(wp.from_torch, parts)],
     )  # fmt: skip
     return parts[0].sum(-1), parts[1].sum(-1)

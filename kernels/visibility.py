@@ -326,12 +326,9 @@ def scan(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
     """What every robot sees now, in the envs where ``running`` [env] is set; maps of an env are planar. ``ahead`` is 0
     at a reset, 1 in a local step."""
     lanes = (*shard.shape, shard.lanes)
-    shard.call(
-        launch, _collect_occluders, "error bins direction limit occluder_count wall_count visible_count",
-        active=running, planar=1,
-    )  # fmt: skip
-    shard.call(launch, _scan_free, "viewers_free error visible_count visible", lanes, active=running, planar=1)
+    shard.call(launch, _collect_occluders, active=running, planar=1)
+    shard.call(launch, _scan_free, lanes, active=running, planar=1)
     if shard.sim.sensing is None:
-        shard.call(launch, _scan_boundary, "seen_boundary viewers_boundary", lanes, active=running)
+        shard.call(launch, _scan_boundary, lanes, active=running)
     else:
         sense(launch, shard, running, ahead)

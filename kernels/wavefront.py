@@ -226,7 +226,7 @@ class PathSearch:
     def find(self, launch: Launch, active, collided, center, goal, waypoint) -> None:
         """New paths for the robots that need one."""
         given = {"active": active, "collided": collided, "center": center, "goal": goal, "waypoint": waypoint}
-        launch_named(launch, _start_search, self.shape, "sources stop", self.values() | given)
+        launch_named(launch, _start_search, self.shape, self.values() | given)
         self.flood(launch)
         self.trace(launch, goal)
 
@@ -239,15 +239,12 @@ class PathSearch:
 
     def trace(self, launch: Launch, goal) -> None:
         """Paths to the cells of `search.stop`; where that is -1, to the reached cell nearest to `goal`."""
-        writes = "path path_total path_used path_ends"
-        launch_named(launch, _trace_path, self.shape, writes, self.values() | {"goal": goal})
+        launch_named(launch, _trace_path, self.shape, self.values() | {"goal": goal})
 
     def pick(self, launch: Launch, active, collided, center, goal, reach, waypoint) -> None:
         """The waypoint of every robot on its path."""
         given = {"active": active, "collided": collided, "center": center, "goal": goal, "reach": reach}
-        launch_named(
-            launch, _pick_waypoint, self.shape, "waypoint path_used", self.values() | given | {"waypoint": waypoint}
-        )
+        launch_named(launch, _pick_waypoint, self.shape, self.values() | given | {"waypoint": waypoint})
 
 
 def distinct_masks(

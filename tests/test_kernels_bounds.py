@@ -40,9 +40,7 @@ def test_a_block_of_millions_of_frontier_cells_has_its_target_in_the_middle():
     size, target, kept = (wp.full((1, 1), value, dtype=wp.int32, device="cpu") for value in (0, 0, -1))
     sums = wp.zeros((1, 1, 2), dtype=wp.int64, device="cpu")
     changed = ints(np.full((1, wall_words_of(side) * side), -1))
-    launch(
-        blocks._sum_frontier, (1, side), [grids, row, ints([side]), known, changed], [frontier, size, sums]
-    )  # fmt: skip
+    launch(blocks._sum_frontier, (1, side), [grids, row, ints([side]), known, changed, frontier, size, sums])
     count = side**2 // 2
     assert size.numpy()[0, 0] == count
     assert sums.numpy()[0, 0].tolist() == [count * (side - 1) // 2, count * side // 2]
@@ -52,8 +50,7 @@ def test_a_block_of_millions_of_frontier_cells_has_its_target_in_the_middle():
     launch(
         blocks._place_targets, (1, 1),
         [grids, row, ints([side]), ints([1]), size, sums, ints(reached), changed, row, ints(np.zeros((1, 1, 2))),
-         1, 1, 1],
-        [target, kept],
+         1, 1, 1, target, kept],
     )  # fmt: skip
     assert target.numpy()[0, 0] == middle
 
@@ -71,7 +68,8 @@ def test_ways_of_the_last_env_of_a_large_batch():
     found = ints(np.full((envs, 1, 1), -5))
     launch(
         targets._first_cells, (envs, 1, 1),
-        [grids, ints(np.zeros(envs)), passable, ints(np.arange(envs)), ints(distance), ints(wanted), STRAIGHT], [found],
+        [grids, ints(np.zeros(envs)), passable, ints(np.arange(envs)), ints(distance), ints(wanted), STRAIGHT,
+         found],
     )  # fmt: skip
     assert found.numpy()[-1, 0, 0] == 1 and (found.numpy()[:-1] == -1).all()
 

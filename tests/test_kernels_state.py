@@ -1,9 +1,9 @@
-"""The table of state and scratch (`kernels/state.py`) is true: arrays, shapes, types, and who writes what."""
+"""The table of state and scratch (`kernels/state.py`) is true: arrays, shapes, types."""
 
 import pytest
 import torch
-from kernel_source import arguments, kernels, uses
-from worlds import act, room
+from kernel_source import arguments, kernels
+from worlds import room
 
 from maexp.envs import (
     CommConfig,
@@ -42,8 +42,8 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
     for shard in env.simulation.shards:
         fields = {id(array): name for name, array in vars(shard.view).items()}
 
-        def launch(kernel, dim, inputs, outputs, fields=fields):
-            found.append((kernel, [fields.get(id(one)) for one in (*inputs, *outputs)], len(inputs)))
+        def launch(kernel, dim, given, fields=fields):
+            found.append((kernel, [fields.get(id(one)) for one in given]))
 
         pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in picture_shapes(e, n)]
         for stage in (set_goals, find_paths, pick_waypoints, step.local_step, step.reset):
@@ -86,25 +86,11 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
         assert view.dtype is field.kind and view.shape == given[: len(axes)], name
 
 
-def test_who_writes_each_array(met):
-    """Kernels as their source says, at every launch; the host by the counters that torch keeps of writes."""
-    writers = {name: set() for name in FIELDS}
-    for kernel, fields, _ in met:
-        written = uses(kernel.func).written
-        for argument, name in zip(arguments(kernel), fields, strict=True):
-            if name is not None and argument.name in written:
-                writers[name].add(kernel.key)
-    for name in host_writes():
-        writers[name].add("host")
-    assert writers == {name: set(field.written.split()) for name, field in FIELDS.items()}
-
-
 def test_headings_name_the_table_that_an_array_is_of(met):
     """`State in:` and the like for the fields of `STATE`, `Scratch` ones for those of `SCRATCH`, neither for others."""
     given = {}
-    for kernel, fields, inputs in met:
-        for place, (argument, name) in enumerate(zip(arguments(kernel), fields, strict=True)):
-            assert argument.dims == 0 or (place >= inputs) == (argument.name in uses(kernel.func).written), kernel.key
+    for kernel, fields in met:
+        for argument, name in zip(arguments(kernel), fields, strict=True):
             given.setdefault((kernel.key, argument.name), (argument, set()))[1].add(name)
     for kernel in kernels().values():  # those of `Navigation` are met by their names only
         for argument in arguments(kernel):
@@ -121,7 +107,7 @@ def test_headings_name_the_table_that_an_array_is_of(met):
 def test_signatures_name_the_axes_of_the_table(met):
     """What a kernel calls the axes of an argument is what the table calls those of the array it gets."""
     common = {"free": "point", "boundary": "point", "1": "word"}
-    for kernel, fields, _ in met:
+    for kernel, fields in met:
         for argument, name in zip(arguments(kernel), fields, strict=True):
             if name is not None:
                 axes = [AXES[axis][0] for axis in FIELDS[name].axes.split()]
@@ -129,22 +115,7 @@ def test_signatures_name_the_axes_of_the_table(met):
                 assert all(fits), f"{kernel.key}: {argument.name} {argument.shape}, the table has {name} {axes}"
 
 
-def host_writes() -> set[str]:
-    """Fields that torch writes from the first reset on, in all that an env is asked to do."""
-    found, generator = set(), torch.Generator().manual_seed(0)
-    for planner in PLANNERS:
-        env = make(planner, limited=True)
-        before = {name: tensor._version for name, tensor in env.simulation.tensors.items()}
-        td = env.reset()
-        env.set_seed(4)
-        env.set_starts(None)
-        env.set_episodes(torch.arange(2))
-        env.step(td.update(act(env, generator)))
-        found |= {name for name, tensor in env.simulation.tensors.items() if tensor._version != before[name]}
-    return found
-
-
 def test_each_field_says_what_it_is():
     for name, field in FIELDS.items():
-        assert len(field.meaning) > 10 and field.written, name
+        assert len(field.meaning) > 10, name
     assert not set(STATE) & set(SCRATCH)

@@ -58,12 +58,12 @@ KEY = ("scenario", "planner", "num_envs", "num_robots", "radar_range", "stage", 
 
 @dataclass
 class Step:
-    """A recorded launch and the arrays that it writes."""
+    """A recorded launch and the arrays that it takes."""
 
     stage: str
     kernel: str
     command: RecordedLaunch
-    outputs: list[wp.array]
+    arrays: list[wp.array]
 
 
 def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
@@ -153,8 +153,9 @@ def record_steps(env: ExplorationEnv, shard: Shard) -> list[Step]:
     steps: list[Step] = []
     stage = STAGES[0]
 
-    def launch(kernel, dim, inputs, outputs):
-        steps.append(Step(stage, kernel.key, RecordedLaunch(kernel, dim, inputs, outputs, shard.device), outputs))
+    def launch(kernel, dim, arguments):
+        arrays = [one for one in arguments if isinstance(one, wp.array) and one.ptr]
+        steps.append(Step(stage, kernel.key, RecordedLaunch(kernel, dim, arguments, shard.device), arrays))
 
     set_goals(launch, shard)
     stage = STAGES[1]
@@ -184,7 +185,7 @@ class Runner:
 
     def in_place(self, steps: list[Step], seconds: float) -> list[list[float]]:
         """Laps over all launches in their order, from the same state."""
-        saved = save_outputs(steps)
+        saved = self.save(steps)
         laps: list[list[float]] = [[] for _ in steps]
         end = time.perf_counter() + seconds
         while time.perf_counter() < end or len(laps[0]) <= LEAST_LAPS:
@@ -195,10 +196,10 @@ class Runner:
 
     def alone(self, steps: list[Step], seconds: float) -> list[list[float]]:
         """Laps of every launch by itself, its outputs put back after each."""
-        saved = save_outputs(steps)
+        saved = self.save(steps)
         laps = []
         for step in steps:
-            outputs = save_outputs([step])
+            outputs = self.save([step])
             mine: list[float] = []
             end = time.perf_counter() + seconds / len(steps)
             while time.perf_counter() < end or len(mine) <= LEAST_LAPS:
@@ -209,11 +210,15 @@ class Runner:
         restore(saved)
         return laps
 
-
-def save_outputs(steps: list[Step]) -> list[tuple[wp.array, wp.array]]:
-    """Every array that the launches write, and a copy of it."""
-    outputs = {one.ptr: one for step in steps for one in step.outputs if one.ptr}
-    return [(one, wp.clone(one)) for one in outputs.values()]
+    def save(self, steps: list[Step]) -> list[tuple[wp.array, wp.array]]:
+        """Every array that the launches change, and a copy of it; the arrays are as they were."""
+        arrays = {one.ptr: one for step in steps for one in step.arrays}
+        copies = [(one, wp.clone(one)) for one in arrays.values()]
+        for step in steps:
+            step.command.launch(self.stream)
+        changed = [(one, copy) for one, copy in copies if one.numpy().tobytes() != copy.numpy().tobytes()]
+        restore(changed)
+        return changed
 
 
 def restore(saved: list[tuple[wp.array, wp.array]]) -> None:
