@@ -289,6 +289,12 @@ def test_bad_settings_are_named(maps, settings, words):
         ExplorationEnv(**{"maps": maps[0], **settings})
 
 
+def test_a_base_in_a_wall_is_refused(maps):
+    x, y = maps[0].obstacles[len(maps[0].obstacles) // 2, :2].tolist()
+    with pytest.raises(ValueError, match="comm.base_station=.* is no free ground of map"):
+        ExplorationEnv(maps[0], comm=CommConfig(base_station=(x, y)))
+
+
 def test_an_env_is_made_of_its_settings(maps):
     team = [RobotConfig(), RobotConfig(kind="differential"), RobotConfig(max_speed=1.0)]
     env = ExplorationEnv(maps[0], 2, robot=team)

@@ -1,16 +1,20 @@
-"""Two robots that part, meet and merge their maps: `python -m tests.tools.meeting docs/pictures/meeting.png`."""
+"""Two robots that part, meet and merge their maps: `python -m tests.tools.meeting docs/pictures/meeting.png`, or
+`meeting.gif` for a film of the whole episode."""
 
 import sys
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.evaluation.figures import COLOURS, panels
 from maexp.agents.policies import POLICIES
-from maexp.envs import CommConfig, ExplorationEnv, make_map
+from maexp.envs import CommConfig, ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.files import whole_file
+from maexp.envs.film import write_gif
 from maexp.kernels import unpack_flags
 
 SCENARIO, MAPS, EPISODE = "indoor_medium", range(26, 38), 6
@@ -42,17 +46,28 @@ def choose(seen: list[dict]) -> list[tuple[str, dict]]:
 
 
 def draw(path: Path) -> None:
-    """Write the picture."""
+    """Write the picture, or the film."""
     maps, comm = [make_map(SCENARIO, k) for k in MAPS], CommConfig(range=4.0, line_of_sight=True)
     env = ExplorationEnv(maps, 1, 2, comm=comm, num_threads=1, starts="together")
     env.set_episodes(torch.tensor([EPISODE]))
-    moments = choose(play(env))
+    seen = play(env)
     tensors, m = env.simulation.map_tensors, int(env.simulation.tensors["map_id"])
     free = tensors["free"][tensors["free_begin"][m] : tensors["free_begin"][m + 1], :2].numpy()  # in the kernels' order
+    if path.suffix == ".gif":
+        titles = [f"{one['seconds']:.0f} s: {'they hear each other' if one['hears'] else 'apart'}" for one in seen]
+        figures = [draw_moments([moment], maps[m], free) for moment in zip(titles, seen, strict=True)]
+        write_gif([pixels(one) for one in figures], path, fps=2.0)
+        return
+    with whole_file(path) as file:
+        draw_moments(choose(seen), maps[m], free).savefig(file, format="png", dpi=90)
+
+
+def draw_moments(moments: list[tuple[str, dict]], world: PointCloudMap, free: np.ndarray) -> Figure:
+    """Moments side by side: who knows which of the free points, [count, 2]."""
     figure, axes = panels(len(moments), height=3.2)
     for ax, (title, one) in zip(axes, moments, strict=False):
         ax.set_title(title, loc="left")
-        ax.plot(*maps[m].boundary[:, :2].T, ".", color="black", markersize=1)
+        ax.plot(*world.boundary[:, :2].T, ".", color="black", markersize=1)
         known = one["known"][:, : len(free)]
         parts = ((~known[0] & ~known[1], GREY, None), (known[0] & ~known[1], COLOURS[0], "first alone"),
                  (known[1] & ~known[0], COLOURS[1], "second alone"), (known[0] & known[1], BOTH, "both"))  # fmt: skip
@@ -63,9 +78,16 @@ def draw(path: Path) -> None:
         ax.set_aspect("equal")
         ax.set_axis_off()
     shown = axes[0].get_legend_handles_labels()
-    figure.legend(*shown, loc="outside lower center", ncols=3, markerscale=4, title="known to")
-    with whole_file(path) as file:
-        figure.savefig(file, format="png", dpi=90)
+    columns = 3 if len(moments) > 1 else 2
+    figure.legend(*shown, loc="outside lower center", ncols=columns, markerscale=4, title="known to")
+    return figure
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    """A figure as a frame of a film, uint8 [height, width, 3]."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 if __name__ == "__main__":
