@@ -11,8 +11,9 @@ import warp as wp
 from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
 from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
-from maexp.kernels.blocks import block_memory_per_env
+from maexp.kernels.blocks import BLOCKS
 from maexp.kernels.dynamics import KINDS, Robots
+from maexp.kernels.fields import count_bytes
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
@@ -20,7 +21,8 @@ from maexp.kernels.sensing import Sensing, return_chance
 from maexp.kernels.simulation import Settings, Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
 from maexp.kernels.types import DT, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
-from maexp.kernels.wavefront import grid_memory_per_env
+from maexp.kernels.wavefront import grid_bytes
+from maexp.kernels.ways import PATH_CELLS
 
 TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""
@@ -189,31 +191,32 @@ def bytes_per_env(settings: EnvSettings, bank: MapBank) -> int:
     """What one env takes on its device: state, scratch, grids of the `wavefront` planner and of targets it shows."""
     total = sum(memory_per_env(sizes(settings, bank)).values())
     if settings.planner.name == "wavefront":
-        total += grid_memory_per_env(**grid_sizes(settings, bank))
+        total += grid_bytes(grid_sizes(settings, bank))
     return total + (navigation_bytes(settings, bank) if settings.observation.targets else 0)
 
 
 def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
-    """What `grid_memory_per_env` counts with."""
+    """Lengths of the axes of the planner's arrays for one env (`KNOWN`, `PASSABLE`, `SEARCH`, `PATHS`)."""
     limited, robots = settings.limited, settings.num_robots
     shapes = [grid_shape(one) for one in bank.maps]
     cells = max(width * height for width, height in shapes)
     return {
-        "cells": cells, "robots": robots, "known_rows": robots if limited else 1,
-        "masks": robots if limited else len({one.collision_threshold for one in settings.robot}),
-        "points": bank.max_free + bank.max_boundary, "news": news_capacity(cells),
-        "wall_words": max(-(-width // 32) * height for width, height in shapes),
+        "row": robots if limited else 1, "item": robots, "place": robots,
+        "mask": robots if limited else len({one.collision_threshold for one in settings.robot}),
+        "cell": cells, "slot": news_capacity(cells), "word": max(-(-width // 32) * height for width, height in shapes),
+        "point": bank.max_free + bank.max_boundary, "ring": 2, "source": 1, "end": 2, "step": PATH_CELLS,
     }  # fmt: skip
 
 
 def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
     """What a `Navigation` and the targets that it finds keep of one env."""
-    grids, reach = grid_sizes(settings, bank), min(one.range for one in settings.radar)
-    sides = zip(bank.maps, bank_block_sides(bank, reach).tolist(), strict=True)
+    sides = zip(bank.maps, bank_block_sides(bank, min(one.range for one in settings.radar)).tolist(), strict=True)
     blocks = max(math.prod(-(-cells // side) for cells in grid_shape(one)) for one, side in sides)
-    kept = block_memory_per_env(grids["cells"], grids["known_rows"], grids["wall_words"], blocks)
-    in_vain = 4 * grids["robots"] * blocks  # decisions in vain of every robot (`TargetTracker`)
-    return grid_memory_per_env(**grids, shared=settings.device.type == "cpu") + kept + in_vain
+    lengths = grid_sizes(settings, bank) | {"env": 1, "block": blocks, "two": 2}
+    if settings.device.type == "cpu":
+        lengths["place"] = 0  # all search in one place, which no env counts
+    in_vain = 4 * settings.num_robots * blocks  # decisions in vain of every robot (`TargetTracker`)
+    return grid_bytes(lengths) + sum(count_bytes(BLOCKS, lengths).values()) + in_vain
 
 
 def check_memory(settings: EnvSettings, bank: MapBank) -> None:

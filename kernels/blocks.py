@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from maexp.kernels.constants import MARGIN_CELLS, UNREACHED
+from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.frontier import is_frontier
 from maexp.kernels.known_grid import NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
@@ -293,6 +294,25 @@ def _list_blocks(
     count[e] = found
 
 
+BLOCKS = {
+    "looked": Field(wp.int32, "env", "", "1: bring the env up to date; 0: leave it, what changes counts later", 1),
+    "grid_of_row": Field(wp.int32, "row", "", "the map of rows of those envs, else -1; set by `mark`"),
+    "renewed": Field(wp.int32, "row", "", "1 where nothing holds that was kept"),
+    "changed": Field(wp.int32, "row word", "", "a bit for every cell that has changed since"),
+    "frontier": Field(wp.uint8, "row cell", "", "1 for known free cells with an unknown neighbour"),
+    "size": Field(wp.int32, "row block", "", "frontier cells in the block"),
+    "sums": Field(wp.int64, "row block two", "cells", "sums of their x and y, from the block's corner"),
+    "target_cell": Field(wp.int32, "row block", "", "the cell to go to; -1 = none"),
+    "listed": Field(wp.int32, "env block", "", "the blocks with a target in some row of the env, in order"),
+    "count": Field(wp.int32, "env", "", "how many those are"),
+    "looked_from": Field(wp.int32, "row block", "", "the target whose outlook still holds; -1 = none", -1),
+    "looked_at": Field(wp.int32, "row block two", "", "lower and upper corner of what was looked at from there"),
+    "kept_area": Field(wp.float32, "row block", "cells", "unknown ones seen from there"),
+    "kept_middle": Field(wp.vec2, "row block", "m", "their middle, from there"),
+}
+"""Arrays of `FrontierBlocks`; rows are those of `KNOWN`."""
+
+
 class FrontierBlocks:
     """The blocks of a run of envs, brought up to date after every search of `paths` from all robots.
 
@@ -301,15 +321,7 @@ class FrontierBlocks:
         side: int32 [grid], edges of blocks in cells (`block_size.block_sides`).
         threshold: the largest collision threshold [m]: so far outside its block, and a little more, may a target lie.
 
-    Attributes:
-        looked: int32 [E], 1: bring this env up to date; 0: leave what is there as it is, what changes counts later.
-        grid_of_row: int32 [E * R], the map of each row of those envs, else -1; set by `mark`.
-        frontier: uint8 [E * R, cells], 1 for known free cells with an unknown neighbour.
-        size: int32 [E * R, K], frontier cells in each block.
-        target_cell: int32 [E * R, K], the cell to go to for each block with frontier cells; -1 = none.
-        listed, count: int32 [E, K] and [E], the blocks with a target in some row of an env, in order.
-        looked_from: int32 [E * R, K], the target whose outlook (`kept_area`, `kept_middle`) still holds; -1 = none.
-        looked_at: int32 [E * R, K, 2], lower and upper corner of what was looked at from there.
+    Attributes: those of `BLOCKS`.
     """
 
     def __init__(self, paths: PathSearch, side: np.ndarray, threshold: float):
@@ -322,18 +334,10 @@ class FrontierBlocks:
         self.num_blocks = int((-(-width // side) * -(-height // side)).max())
         self.block, self.search = (wp.array(v, dtype=wp.int32, device=device) for v in (side, search))
 
-        def zeros(*shape: int, dtype=wp.int32) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        self.looked = wp.full(envs, 1, dtype=wp.int32, device=device)
-        self.grid_of_row, self.renewed, self.changed = zeros(rows), zeros(rows), zeros(*known.walls.shape)
-        self.frontier, self.size = zeros(rows, cells, dtype=wp.uint8), zeros(rows, self.num_blocks)
-        self.sums, self.target_cell = zeros(rows, self.num_blocks, 2, dtype=wp.int64), zeros(rows, self.num_blocks)
-        self.listed, self.count = zeros(envs, self.num_blocks), zeros(envs)
-        self.looked_from = wp.full((rows, self.num_blocks), -1, dtype=wp.int32, device=device)
-        self.looked_at = zeros(rows, self.num_blocks, 2)
-        self.kept_area = zeros(rows, self.num_blocks, dtype=wp.float32)
-        self.kept_middle = zeros(rows, self.num_blocks, dtype=wp.vec2)
+        sizes = {
+            "env": envs, "row": rows, "word": known.walls.shape[1], "cell": cells, "block": self.num_blocks, "two": 2
+        }  # fmt: skip
+        vars(self).update(make_arrays(BLOCKS, sizes, device))
 
     def values(self) -> dict:
         """The arrays of grids, ways and blocks, by the names of the kernels' parameters."""
@@ -357,10 +361,3 @@ class FrontierBlocks:
         launch_named(launch, _place_targets, split, values)
         launch_named(launch, _forget_changes, split, values)
         launch_named(launch, _list_blocks, self.count.shape, values)
-
-
-def block_memory_per_env(cells: int, known_rows: int, wall_words: int, blocks: int) -> int:
-    """Bytes of `FrontierBlocks` for one env; arguments as in `grid_memory_per_env`, ``blocks`` of the largest map."""
-    # Of a row: frontier, changed cells, map, whether it is new. Of a block: size, sums, target, what was seen from it.
-    rows = known_rows * (cells + 4 * wall_words + 2 * 4 + blocks * (4 + 2 * 8 + 4 + 3 * 4 + 4 + 2 * 4))
-    return rows + 4 * blocks + 2 * 4  # list of blocks; its length, whether to look

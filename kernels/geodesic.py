@@ -19,6 +19,7 @@ import torch
 import warp as wp
 
 from maexp.kernels.constants import BLOCKED, DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
+from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.startup import MODULE_OPTIONS
 
@@ -170,6 +171,17 @@ def _search_distance(
     search_from(passable, row, sources, item, goal, place, w, h, next, previous, touched, distance)
 
 
+SEARCH = {
+    "sources": Field(wp.int32, "item source", "", "cell numbers, -1 = none. Fill before `search`", -1),
+    "stop": Field(wp.int32, "item", "", "the one cell whose distance is wanted, -1 = all; `SKIP` = leave them", -1),
+    "distance": Field(wp.int32, "item cell", "", "10 a straight step; `UNREACHED` elsewhere", UNREACHED),
+    "next": Field(wp.int32, "place cell", "", "lists of buckets"),
+    "previous": Field(wp.int32, "place cell", "", "the same backwards"),
+    "touched": Field(wp.int32, "item end", "", "first and last cell to clear; cell 0 is cleared in vain once"),
+}
+"""Arrays of `DistanceSearch`."""
+
+
 class DistanceSearch:
     """Buffers and launches of a batch of distance searches, allocated once and used again at every call.
 
@@ -180,25 +192,15 @@ class DistanceSearch:
         device: Warp device.
         shared: one place to search in for all on the CPU, where one search ends before the next begins.
 
-    Attributes:
-        sources: int32 [items, num_sources], cell numbers, -1 = none. Fill before `launch`.
-        stop: int32 [items], the one cell whose distance is wanted (other labels are upper bounds, but exact on all
-            shortest ways to it); -1 = search all; `SKIP` = do not search, leave the distances as they are.
-        distance: int32 [items, cells], 10 a straight step; `UNREACHED` elsewhere.
+    Attributes: those of `SEARCH`. With a `stop` other labels are upper bounds, but exact on all shortest ways to it.
     """
 
     def __init__(
         self, items: int, cells: int, num_sources: int = 1, device: str | wp.Device = "cpu", shared: bool = False
     ):
-        def numbers(*shape, value=0):
-            return wp.full(shape, value, dtype=wp.int32, device=device)
-
-        self.sources = numbers(items, num_sources, value=-1)
-        self.stop = numbers(items, value=-1)
-        self.distance = numbers(items, cells, value=UNREACHED)
         places = 1 if shared and wp.get_device(device).is_cpu else items
-        self.next, self.previous = numbers(places, cells), numbers(places, cells)
-        self.touched = numbers(items, 2)  # cell 0 is cleared in vain once
+        sizes = {"item": items, "cell": cells, "source": num_sources, "place": places, "end": 2}
+        vars(self).update(make_arrays(SEARCH, sizes, device))
 
     def search(
         self,

@@ -11,6 +11,7 @@ loaded), or whose env has another map, is cleared and painted anew: nobody has t
 import warp as wp
 
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
+from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
@@ -234,6 +235,20 @@ def _clear_stale(
             walls[row, word] = 0
 
 
+KNOWN = {
+    "known": Field(wp.uint8, "row cell", "", "`UNKNOWN`, `FREE` or `OBSTACLE`"),
+    "walls": Field(wp.int32, "row word", "", "a bit for every `OBSTACLE`; rows of cells begin with a word"),
+    "painted": Field(wp.uint8, "row point", "", "1 for points that the grid shows"),
+    "grid_of_row": Field(wp.int32, "row", "", "the map; set by `paint`", -1),
+    "news": Field(wp.int32, "row slot", "", "cells that the last `paint` changed"),
+    "news_count": Field(wp.int32, "row", "", "how many; -1: any may have", -1),
+    "met": Field(wp.int32, "row", "", "known points"),
+    "total": Field(wp.int32, "row", "", "painted points"),
+    "stale": Field(wp.int32, "row", "", "1 where the grid is painted anew"),
+}
+"""Arrays of `KnownGrids`; a row is an env's where the team shares what it knows, else a robot's."""
+
+
 class KnownGrids:
     """Grids of a run of envs, painted from the flags of seen points.
 
@@ -244,11 +259,7 @@ class KnownGrids:
         rows_per_env: 1 (the team's knowledge) or the number of robots (each robot's own).
         cells: cells of the largest grid.
 
-    Attributes:
-        known: uint8 [E * rows_per_env, cells]: `UNKNOWN`, `FREE` or `OBSTACLE`.
-        walls: int32 [E * rows_per_env, words], a bit for every `OBSTACLE`; rows of cells begin with a word.
-        grid_of_row: int32 [E * rows_per_env], the map of each row; set by `paint`.
-        news, news_count: cells that the last `paint` changed, and how many; -1 = any may have.
+    Attributes: those of `KNOWN`.
     """
 
     def __init__(
@@ -267,13 +278,9 @@ class KnownGrids:
         self.lanes = lanes_on(map_id.device, 256)
         rows, device = map_id.shape[0] * rows_per_env, map_id.device
         points = free_flags.shape[2] + boundary_flags.shape[2]
-        self.known = wp.zeros((rows, cells), dtype=wp.uint8, device=device)
-        self.walls = wp.zeros((rows, wall_capacity(grids)), dtype=wp.int32, device=device)
-        self.painted = wp.zeros((rows, points), dtype=wp.uint8, device=device)
-        self.grid_of_row = wp.full(rows, -1, dtype=wp.int32, device=device)
-        self.news = wp.zeros((rows, news_capacity(cells)), dtype=wp.int32, device=device)
-        self.news_count = wp.full(rows, -1, dtype=wp.int32, device=device)
-        self.met, self.total, self.stale = (wp.zeros(rows, dtype=wp.int32, device=device) for _ in range(3))
+        words, slots = wall_capacity(grids), news_capacity(cells)
+        sizes = {"row": rows, "cell": cells, "word": words, "point": points, "slot": slots}
+        vars(self).update(make_arrays(KNOWN, sizes, device))
 
     def paint(self, launch: Launch) -> None:
         """Bring `known` up to date."""

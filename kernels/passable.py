@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from maexp.kernels.constants import BLOCKED, FREE, OBSTACLE, TIGHT, UNKNOWN
+from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.known_grid import KnownGrids, NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -189,6 +190,15 @@ def _close_cells(
                 passable[row, cell] = value
 
 
+PASSABLE = {
+    "passable": Field(wp.uint8, "mask cell", "", "`BLOCKED`, `OPEN` or `TIGHT`"),
+    "grid_of_row": Field(wp.int32, "mask", "", "the map; set by `paint`"),
+    "known_of_row": Field(wp.int32, "mask", "", "which known grid it is made of"),
+    "reach": Field(wp.float32, "ring mask", "m", "below which cells are tight, and blocked"),
+}
+"""Arrays of `PassableGrids`."""
+
+
 class PassableGrids:
     """Where robots fit on `KnownGrids`: one mask per env and distinct distance to keep. Paint after every painting
     of those.
@@ -201,9 +211,7 @@ class PassableGrids:
         margin: the same on top of both, in cells, for what the grid rounds away.
         through_unknown: whether unknown cells count as passable.
 
-    Attributes:
-        passable: uint8 [E * K, cells]: `BLOCKED`, `OPEN` or `TIGHT`.
-        grid_of_row: int32 [E * K], the map of each row; set by `paint`.
+    Attributes: those of `PASSABLE`; a row for each mask, [E * K].
     """
 
     def __init__(
@@ -221,12 +229,12 @@ class PassableGrids:
         self.known, self.masks = known, masks
         self.margin, self.through_unknown = float(margin), int(through_unknown)
         rings = [(comfort, TIGHT), (radius, BLOCKED)] if comfort is not None else [(radius, BLOCKED)]
-        self.rings = [(wp.array(r.reshape(-1), dtype=wp.float32, device=device), value) for r, value in rings]
-        rows = range(envs * masks)
-        source = [row if known.rows_per_env == masks else row // masks for row in rows]
-        self.known_of_row = wp.array(source, dtype=wp.int32, device=device)
-        self.grid_of_row = wp.zeros(len(rows), dtype=wp.int32, device=device)
-        self.passable = wp.zeros((len(rows), known.known.shape[1]), dtype=wp.uint8, device=device)
+        sizes = {"mask": envs * masks, "cell": known.known.shape[1], "ring": len(rings)}
+        vars(self).update(make_arrays(PASSABLE, sizes, device))
+        self.reach.assign(np.stack([reach.reshape(-1) for reach, _ in rings]).astype(np.float32))
+        self.rings = [(self.reach[k], value) for k, (_, value) in enumerate(rings)]
+        rows = np.arange(envs * masks, dtype=np.int32)
+        self.known_of_row.assign(rows if known.rows_per_env == masks else rows // masks)
 
     def paint(self, launch: Launch) -> None:
         """Bring `passable` up to date with `known`."""

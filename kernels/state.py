@@ -4,14 +4,13 @@ Rows of different envs never share memory, so a simulation is split into shards,
 Warp views of their own, and every shard may run in its own thread.
 """
 
-import math
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
+from maexp.kernels.fields import Field, count_bytes
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD
@@ -42,33 +41,6 @@ AXES = {
     "1": ("1", "one"),
 }
 """Letter: (name in the kernels' signatures, what is counted)."""
-
-
-@dataclass(frozen=True)
-class Field:
-    """An array of the simulation.
-
-    Attributes:
-        kind: Warp type of an entry.
-        axes: letters of `AXES`; a vector's own length is none of them.
-        unit: of an entry, "" for numbers, flags and counts.
-        meaning: what an entry is.
-    """
-
-    kind: type
-    axes: str
-    unit: str
-    meaning: str
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Type of the torch tensor that owns the memory."""
-        return wp.dtype_to_torch(getattr(self.kind, "_wp_scalar_type_", self.kind))
-
-    def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
-        """Shape of that tensor; a vector's entries are its last axis."""
-        vector = getattr(self.kind, "_shape_", ())
-        return (*(sizes[axis] for axis in self.axes.split()), *vector)
 
 
 # fmt: off
@@ -226,8 +198,7 @@ def allocate(fields: dict[str, Field], sizes: dict[str, int], device: torch.devi
 
 def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:
     """Bytes of every field for one env."""
-    one = sizes | {"E": 1}
-    return {name: math.prod(field.shape(one)) * field.dtype.itemsize for name, field in (STATE | SCRATCH).items()}
+    return count_bytes(STATE | SCRATCH, sizes | {"E": 1})
 
 
 def warp_views(tensors: dict[str, torch.Tensor], first: int, last: int) -> SimpleNamespace:

@@ -17,12 +17,13 @@ import numpy as np
 import warp as wp
 
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
-from maexp.kernels.geodesic import SKIP, DistanceSearch
-from maexp.kernels.known_grid import KnownGrids, NavGrids, nav_cell, nav_center
+from maexp.kernels.fields import Field, count_bytes, make_arrays
+from maexp.kernels.geodesic import SEARCH, SKIP, DistanceSearch
+from maexp.kernels.known_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.odometry import take_aim
 from maexp.kernels.pace import fit_clearance, hold_back
-from maexp.kernels.passable import PassableGrids
+from maexp.kernels.passable import PASSABLE, PassableGrids
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.state import robots_struct
 from maexp.kernels.stopping import hold_turns
@@ -193,6 +194,16 @@ def _pick_waypoint(
         waypoint[e, i] = nav_center(grids, m, path[item, path_slot(chosen, total)])
 
 
+PATHS = {
+    "row_of_item": Field(wp.int32, "item", "", "mask that the robot uses"),
+    "path": Field(wp.int32, "item step", "", "cells of its way"),
+    "path_total": Field(wp.int32, "item", "", "cells of the whole way; 0 = none"),
+    "path_used": Field(wp.int32, "item", "", "how far along it the waypoint is; -1 = out of sight"),
+    "path_ends": Field(wp.int32, "item", "", "1 = at the goal, 0 = at the nearest reached cell"),
+}
+"""Arrays of `PathSearch`; an item is a robot."""
+
+
 class PathSearch:
     """Paths of every robot of a run of envs over `PassableGrids`.
 
@@ -209,12 +220,9 @@ class PathSearch:
         items = envs * robots
         row_of_item = np.arange(envs)[:, None] * passable.masks + np.asarray(mask_of_robot)[None]
         self.passable, self.shape = passable, (envs, robots)
-        self.row_of_item = wp.array(row_of_item.reshape(-1), dtype=wp.int32, device=device)
         self.search = DistanceSearch(items, cells, 1, device, shared)
-        self.path = wp.zeros((items, PATH_CELLS), dtype=wp.int32, device=device)
-        self.path_total, self.path_used, self.path_ends = (
-            wp.zeros(items, dtype=wp.int32, device=device) for _ in range(3)
-        )
+        vars(self).update(make_arrays(PATHS, {"item": items, "step": PATH_CELLS}, device))
+        self.row_of_item.assign(row_of_item.reshape(-1).astype(np.int32))
 
     def values(self) -> dict:
         """The arrays of maps, masks and paths, by the names of the kernels' parameters."""
@@ -304,24 +312,6 @@ def pick_waypoints(launch: Launch, shard: "Shard") -> None:
         hold_turns(launch, shard, own)
 
 
-def grid_memory_per_env(
-    cells: int, robots: int, known_rows: int, masks: int, points: int, wall_words: int, news: int,
-    shared: bool = False,
-) -> int:
-    """Bytes of the `wavefront` planner's grids and paths for one env (`known_grid`, `passable`, `geodesic`, here).
-
-    Args:
-        cells: of the largest navigation grid.
-        robots: N.
-        known_rows: grids of what is known, 1 for the team or one per robot.
-        masks: grids of where robots fit.
-        points: free and boundary points of the largest maps.
-        wall_words: words of the bitmap of walls of the largest grid.
-        news: capacity of the list of cells that changed.
-        shared: as in `DistanceSearch`: all robots search in one place.
-    """  # fmt: skip
-    known = known_rows * (cells + points + 4 * (wall_words + news) + 5 * 4)  # bytes, flags, words; counters of a row
-    passable = masks * (cells + 4 + 4 + 2 * 4)  # uint8 per cell; its map, its source, two distances to keep
-    search = robots * ((4 if shared else 12) * cells + 4 * 4)  # distances and lists of buckets, int32; ends
-    paths = robots * (4 * PATH_CELLS + 4 * 4)  # cells; length, place, end, mask of each
-    return known + passable + search + paths
+def grid_bytes(sizes: dict[str, int]) -> int:
+    """Bytes of the grids and ways of the `wavefront` planner and of a `Navigation` for one env."""
+    return sum(sum(count_bytes(table, sizes).values()) for table in (KNOWN, PASSABLE, SEARCH, PATHS))
