@@ -180,13 +180,16 @@ class Beliefs(Branches):
 
     _own = (*OF_POINTS, "hears", "comm", "known_weight")
 
-    def __init__(self, env: ExplorationEnv, teams: int, copies: int, nav: Navigation, unknown: Guess | None = None):
+    def __init__(
+        self, env: ExplorationEnv, teams: int, copies: int, nav: Navigation, unknown: Guess | None = None,
+        local_steps: int | None = None,
+    ):  # fmt: skip
         self.nav, self.unknown = nav, unknown
         ranges = [one.range for one in env.radar_configs]
         self.true_grids = env.simulation.nav_grids or bank_nav_grids(env.bank, env.device)[0]
         self.sizes = WorldSizes.around(self.true_grids, max(ranges), min(ranges))
         self.rows, self.worlds = nav.rows, teams * nav.rows
-        super().__init__(env, teams, copies)
+        super().__init__(env, teams, copies, local_steps)
         self.one_world = self.rows == 1
         self.tracker: TargetTracker | None = None
         self._fill_tables()
@@ -195,7 +198,8 @@ class Beliefs(Branches):
         self.env.simulation.tensors["hears"].fill_(-1)
 
     def _make_env(self, count: int) -> ExplorationEnv:
-        return branch_env(self.origin, count, imagined_bank(self.origin, self.sizes, self.worlds), CommConfig())
+        bank = imagined_bank(self.origin, self.sizes, self.worlds)
+        return branch_env(self.origin, count, bank, CommConfig(), self.local_steps)
 
     def _source(self) -> dict[str, torch.Tensor]:
         return self.origin.simulation.believed

@@ -29,14 +29,16 @@ NOT_COPIED = (
 """State that no branch needs, for nobody asks it for metrics, or that is its own."""
 
 
-def branch_env(env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig | None = None) -> ExplorationEnv:
+def branch_env(
+    env: ExplorationEnv, count: int, bank: MapBank, comm: CommConfig | None = None, local_steps: int | None = None
+) -> ExplorationEnv:
     """An env of `count` branches of teams of `env`, on other maps perhaps, that draws no pictures."""
     from maexp.envs.environment import ExplorationEnv
 
     limited = env.settings.limited if comm is None else comm.limited
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
-        env.settings, num_envs=count, comm=comm, limited=limited,
+        env.settings, num_envs=count, comm=comm, limited=limited, local_steps=local_steps or env.local_steps,
         faults=FaultsConfig(), odometry=OdometryConfig(),  # nobody foresees what chance does
         radar=tuple(map(perfect, env.settings.radar)),
         observation=replace(env.settings.observation, pictures=False),
@@ -58,14 +60,15 @@ class Branches:
         env: whose teams; only read.
         teams: how many at once, T.
         copies: branches of each.
+        local_steps: of a decision in a branch; None: as in the env.
 
     Attributes:
         env: the env of the branches, T * `copies` teams.
         one_world: all robots of a team decide in the same world.
     """
 
-    def __init__(self, env: ExplorationEnv, teams: int, copies: int):
-        self.origin, self.teams, self.copies = env, teams, copies
+    def __init__(self, env: ExplorationEnv, teams: int, copies: int, local_steps: int | None = None):
+        self.origin, self.teams, self.copies, self.local_steps = env, teams, copies, local_steps
         self.one_world = True
         self.env = self._make_env(teams * copies)
         names = [name for name in STATE if name not in NOT_COPIED and name not in self._own]
@@ -76,7 +79,7 @@ class Branches:
     """State that is not copied, for the branches live in another world."""
 
     def _make_env(self, count: int) -> ExplorationEnv:
-        return branch_env(self.origin, count, self.origin.bank)
+        return branch_env(self.origin, count, self.origin.bank, local_steps=self.local_steps)
 
     def _source(self) -> dict[str, torch.Tensor]:
         """State of the teams that branches take up."""

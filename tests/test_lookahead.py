@@ -151,6 +151,21 @@ def test_plays_every_kind_of_team(settings, true_world):
     assert float(env.simulation.tensors["covered"].min()) > 0
 
 
+@pytest.mark.parametrize("true_world", [False, True])
+def test_imagined_decisions_may_be_longer_than_the_env_s(true_world):
+    """A team that decides five times as often plays the same futures: its first choice is the same, bit for bit."""
+    long, short, myopic = (
+        ExplorationEnv(make_map("maze_small", 4), num_envs=3, num_robots=3, seed=1, local_steps=steps)
+        for steps in (20, 4, 4)
+    )
+    found = [
+        actions(env, LookaheadConfig(horizon=2, prior=0.0, local_steps=steps), 1, true_world)
+        for env, steps in ((long, None), (short, 20), (myopic, None))
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(found[0], found[1], strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(found[0], found[2], strict=True))
+
+
 def test_looking_ahead_pays_in_the_true_world():
     """The reference that cheats is ahead of the planner that it plays on with, on every second map at least."""
     worlds = [make_map("maze_small", 1000 + k) for k in range(12)]
@@ -193,7 +208,7 @@ def test_robots_go_to_different_targets():
 
 @pytest.mark.parametrize("name, value", [
     ("candidates", 0), ("candidates", 2.5), ("horizon", 101), ("margin", -1.0), ("rest", float("nan")),
-    ("unknown", "rooms"), ("loss", True),
+    ("unknown", "rooms"), ("loss", True), ("local_steps", 0),
 ])  # fmt: skip
 def test_bad_settings_are_named(name, value):
     with pytest.raises(ValueError, match=f"lookahead.{name}="):

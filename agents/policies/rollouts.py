@@ -45,8 +45,8 @@ class Rollouts:
         self.config, self.tracker = config, tracker
         self.teams = max(1, min(env.num_envs, BRANCHES // config.candidates))
         self.branches = (
-            Branches(env, self.teams, config.candidates) if true_world
-            else Beliefs(env, self.teams, config.candidates, tracker.nav, GUESSES[config.unknown])
+            Branches(env, self.teams, config.candidates, config.local_steps) if true_world
+            else Beliefs(env, self.teams, config.candidates, tracker.nav, GUESSES[config.unknown], config.local_steps)
         )  # fmt: skip
         self.follower = None
         if config.horizon > 1:
