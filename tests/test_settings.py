@@ -20,6 +20,7 @@ from maexp.agents.settings.resolved import algorithm_settings, flatten, resolve,
 from maexp.agents.settings.runs import continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.envs import make_map
+from maexp.envs.config import GROUPS
 from maexp.envs.scenarios import SCENARIOS
 
 FILE = Path("run.pt")
@@ -84,6 +85,20 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     learner = make_learner(cfg, env)
     mine = {name: value for name, value in asdict(learner.updater.settings).items() if value is not None}
     assert {"name": "expert_iteration"} | mine == shown["algorithm"]
+
+
+def test_every_group_of_settings_reaches_the_env():
+    changed = {
+        "robot.max_yaw_rate": 1.0, "radar.evidence": 2, "planner.replan_steps": 7, "reward.time": 0.25, "observation.pictures": False,
+        "comm.range": 5.0, "faults.probability": 0.5, "odometry.drift": 0.01, "targets.distinct": False, "lookahead.horizon": 3,
+    }  # fmt: skip
+    assert {name.split(".")[0] for name in changed} == set(GROUPS)
+    cfg = compose_config("evaluate", ["num_envs=1", *(f"{name}={value}" for name, value in changed.items())])
+    env = make_env(cfg, [make_map("maze_small", 0)], 1)
+    for name, value in changed.items():
+        group, key = name.split(".")
+        config = getattr(env.settings, group)
+        assert getattr(config[0] if isinstance(config, tuple) else config, key) == value, name
 
 
 def test_a_map_of_ones_own_tells_its_scenario_and_the_length_of_an_episode(tmp_path):

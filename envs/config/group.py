@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 from maexp.envs.fields import check_settings
-from maexp.envs.scenarios import Scenario
+from maexp.envs.scenarios import SCENARIOS, Scenario
 
 
 @dataclass(frozen=True)
@@ -29,5 +29,6 @@ class Group:
 
 
 def supplied(kind: type[Group]) -> list[str]:
-    """Settings of a robot, radar or planner whose default is the scenario's value."""
-    return [one.name for one in fields(kind) if one.default is None and one.name != "radius"]
+    """Settings of a robot, radar or planner that are None by default and that a scenario, any one, fills in."""
+    filled = kind().completed(SCENARIOS["maze"])
+    return [one.name for one in fields(kind) if one.default is None and getattr(filled, one.name) is not None]
