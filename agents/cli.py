@@ -30,24 +30,38 @@ class Verb:
 VERBS = {
     "train": Verb(
         "trains a team, then evaluates it beside the untrained one and planners",
-        ("maexp train algorithm=mappo scenario=maze", "maexp train resume=outputs/DATE/RUN",
-         "maexp train -m algorithm=ippo,mappo seed=0,1,2"),
+        (
+            "maexp train algorithm=mappo scenario=maze",
+            "maexp train resume=outputs/DATE/RUN",
+            "maexp train -m algorithm=ippo,mappo seed=0,1,2",
+        ),
     ),
     "evaluate": Verb(
         "plays held-out episodes with a trained team or a classical policy",
-        ("maexp evaluate checkpoint=RUN num_robots=1,2,6,8", "maexp evaluate checkpoint=RUN render=true render_envs=4",
-         "maexp evaluate policy=universal,nearest_frontier scenario=maze",
-         "maexp evaluate policy=cost_utility scenario.success_coverage=0.99 scenario.macro_steps=45"),
+        (
+            "maexp evaluate checkpoint=RUN num_robots=1,2,6,8",
+            "maexp evaluate checkpoint=RUN render=true render_envs=4",
+            "maexp evaluate policy=universal,nearest_frontier scenario=maze",
+            "maexp evaluate policy=cost_utility scenario.success_coverage=0.99 scenario.macro_steps=45",
+        ),
     ),
     "benchmark": Verb(
         "compares algorithms and classical policies over scenarios and seeds, in one table; resumable",
-        ("maexp benchmark preset=smoke", "maexp benchmark scenarios=maze,indoor_small algorithms=mappo policies=random",
-         "maexp benchmark resume=outputs/DATE/RUN"),
+        (
+            "maexp benchmark preset=smoke",
+            "maexp benchmark scenarios=maze,indoor_small algorithms=mappo policies=random",
+            "maexp benchmark resume=outputs/DATE/RUN",
+        ),
     ),
     "suite": Verb(
         "plays frozen worlds with any policy, one score beside random and a reference, and checks results of others",
-        ("maexp suite list", "maexp suite show minival", "maexp suite run minival policy=universal",
-         "maexp suite run minival policy=my_module:MyPlanner", "maexp suite verify FOLDER"),
+        (
+            "maexp suite list",
+            "maexp suite show minival",
+            "maexp suite run minival policy=universal",
+            "maexp suite run minival policy=my_module:MyPlanner",
+            "maexp suite verify FOLDER",
+        ),
         ("task", "place"),
         ("list", "show", "run", "verify", "freeze"),
     ),
@@ -64,8 +78,12 @@ VERBS = {
     ),
     "view": Verb(
         "shows a run, a recorded episode or a map in 3D: window, picture or browser",
-        ("maexp view RUN", "maexp view RUN browser=true", "maexp view floor.yaml policy=nearest_frontier",
-         "maexp view maze index=7"),
+        (
+            "maexp view RUN",
+            "maexp view RUN browser=true",
+            "maexp view floor.yaml policy=nearest_frontier",
+            "maexp view maze index=7",
+        ),
         ("place",),
     ),
     "export": Verb(
@@ -81,26 +99,38 @@ VERBS = {
     ),
     "maps": Verb(
         "lists, makes, imports, fetches, checks and draws maps",
-        ("maexp maps list", "maexp maps make maze index=7", "maexp maps import floor.yaml",
-         "maexp maps import FOLDER", "maexp maps fetch floors", "maexp maps check floor.yaml",
-         "maexp maps show map.npz"),
+        (
+            "maexp maps list",
+            "maexp maps make maze index=7",
+            "maexp maps import floor.yaml",
+            "maexp maps import FOLDER",
+            "maexp maps fetch floors",
+            "maexp maps check floor.yaml",
+            "maexp maps show map.npz",
+        ),
         ("task", "file"),
         ("list", "make", "import", "fetch", "check", "show"),
     ),
     "irsim": Verb(
         "plays a team in another simulator, ir-sim, with lidars and a map of its own, beside the same team in ours",
-        ("maexp irsim floor.yaml policy=cost_utility",
-         "maexp irsim floor.yaml range_noise=0.05 pose_noise=0.02 pose_drift=0.02 people=4"),
+        (
+            "maexp irsim floor.yaml policy=cost_utility",
+            "maexp irsim floor.yaml range_noise=0.05 pose_noise=0.02 pose_drift=0.02 people=4",
+        ),
         ("floor",),
     ),
     "bench": Verb(
         "measures throughput, as a table and JSON",
-        ("maexp bench env scenario=maze num_robots=2,4", "maexp bench kernels radar.range=5,10 baseline=FILE",
-         "maexp bench train model=small,paper", "maexp bench scale axes=envs,robots"),
+        (
+            "maexp bench env scenario=maze num_robots=2,4",
+            "maexp bench kernels radar.range=5,10 baseline=FILE",
+            "maexp bench train model=small,paper",
+            "maexp bench scale axes=envs,robots",
+        ),
         ("task",),
         ("env", "kernels", "train", "scale"),
     ),
-}  # fmt: skip
+}
 
 
 def main(argv: list[str] | None = None) -> int:

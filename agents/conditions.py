@@ -99,10 +99,15 @@ def play(config: ConditionsConfig, scenario: str, team: int, condition: str, pol
     words = [f"resume={quote(str(where))}"]
     if not is_begun(where):
         words = [
-            f"policy={policy}", *scenario_words(config, scenario), f"num_robots={team}",
-            f"num_envs={config.num_envs}", f"seed={config.seed}", "num_threads=1",
-            f"hydra.run.dir={quote(str(where))}", *CONDITIONS[condition],
-        ]  # fmt: skip
+            f"policy={policy}",
+            *scenario_words(config, scenario),
+            f"num_robots={team}",
+            f"num_envs={config.num_envs}",
+            f"seed={config.seed}",
+            "num_threads=1",
+            f"hydra.run.dir={quote(str(where))}",
+            *CONDITIONS[condition],
+        ]
     print(f"{scenario}, {team} robots: {condition}, {policy}", flush=True)
     if cli.main(["evaluate", *words]):
         where = f"{scenario} with {team} robots stopped at {condition}, {policy}"

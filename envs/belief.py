@@ -92,8 +92,10 @@ class ImaginedBank(MapBank):
     def tensors(self, device: torch.device) -> dict[str, torch.Tensor]:
         """The arrays on ``device``; walls are what masks the radar."""
         tensors = super().tensors(device)
-        return tensors | {name: tensors[name.replace("occluder", "boundary")] for name in
-                          ("occluder", "occluder_begin", "occluder_cell")}  # fmt: skip
+        return tensors | {
+            name: tensors[name.replace("occluder", "boundary")]
+            for name in ("occluder", "occluder_begin", "occluder_cell")
+        }
 
 
 def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> ImaginedBank:
@@ -104,7 +106,7 @@ def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> Imagin
     scalars = {
         "total_weight": np.full(worlds, ENDLESS, np.int32),
         "outline_radius_max": np.repeat(env.bank.arrays["outline_radius_max"].max(), worlds),
-    } | {name: np.repeat(env.bank.arrays[name][:1], worlds, 0) for name in SCALARS}  # fmt: skip
+    } | {name: np.repeat(env.bank.arrays[name][:1], worlds, 0) for name in SCALARS}
     arrays = {
         "free": np.zeros((worlds * points, 3), np.float32),
         "free_weight": np.ones(worlds * points, np.int32),
@@ -116,13 +118,17 @@ def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> Imagin
         "boundary_cell": np.zeros(worlds * (tiles + 1), np.int32),
         "neighbour_begin": np.zeros(worlds * points + 1, np.int32),
         "neighbour": np.zeros(worlds * pairs, np.int32),
-        "occluder": np.zeros((0, 3), np.float32), "occluder_begin": begin, "occluder_cell": begin,
+        "occluder": np.zeros((0, 3), np.float32),
+        "occluder_begin": begin,
+        "occluder_cell": begin,
         "occluder_radius": np.zeros(worlds * points, np.float32),
         "cell_begin": begin[:-1] * (tiles + 1),
         "shown_begin": begin[:-1] * 0,
-        "point_pixel_begin": np.zeros(1, np.int32), "point_pixel": np.zeros(1, np.int32),
-        "pixel_point_begin": np.zeros(1, np.int32), "pixel_point": np.zeros(1, np.int32),
-    }  # fmt: skip
+        "point_pixel_begin": np.zeros(1, np.int32),
+        "point_pixel": np.zeros(1, np.int32),
+        "pixel_point_begin": np.zeros(1, np.int32),
+        "pixel_point": np.zeros(1, np.int32),
+    }
     finest, coarsest = float(sizes.edge.min()), float(sizes.edge.max())
     width, height = int(sizes.width.max()), int(sizes.height.max())
     in_range = (2 * math.ceil(max(one.range for one in env.radar_configs) / finest) + 3) ** 2
@@ -145,16 +151,31 @@ def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> Imagin
     side = ((0.0, 0.0), (finest * (width - 1), finest * (height - 1)))
     return ImaginedBank(
         maps=[ImaginedMap(f"imagined_{k}", finest, side) for k in range(worlds)],
-        arrays=arrays | scalars, order_free=[], order_boundary=[], max_free=points, max_boundary=points,
-        free_in_range=in_range, boundary_in_range=in_range, occluders_in_range=in_range,
-        grids=(grids, width * height), block_sides=np.full(worlds, sizes.block.min()),
-    )  # fmt: skip
+        arrays=arrays | scalars,
+        order_free=[],
+        order_boundary=[],
+        max_free=points,
+        max_boundary=points,
+        free_in_range=in_range,
+        boundary_in_range=in_range,
+        occluders_in_range=in_range,
+        grids=(grids, width * height),
+        block_sides=np.full(worlds, sizes.block.min()),
+    )
 
 
 SCALARS = (
-    "resolution", "occluder_radius_max", "cell_origin", "cell_size", "cells_x", "cells_y", "lower", "upper",
-    "frame_origin", "pixel_size",
-)  # fmt: skip
+    "resolution",
+    "occluder_radius_max",
+    "cell_origin",
+    "cell_size",
+    "cells_x",
+    "cells_y",
+    "lower",
+    "upper",
+    "frame_origin",
+    "pixel_size",
+)
 """What an imagined map has one of, set anew for every team."""
 
 
@@ -181,9 +202,14 @@ class Beliefs(Branches):
     _own = (*OF_POINTS, "hears", "comm", "known_weight")
 
     def __init__(
-        self, env: ExplorationEnv, teams: int, copies: int, nav: Navigation, unknown: Guess | None = None,
+        self,
+        env: ExplorationEnv,
+        teams: int,
+        copies: int,
+        nav: Navigation,
+        unknown: Guess | None = None,
         local_steps: int | None = None,
-    ):  # fmt: skip
+    ):
         self.nav, self.unknown = nav, unknown
         ranges = [one.range for one in env.radar_configs]
         self.true_grids = env.simulation.nav_grids or bank_nav_grids(env.bank, env.device)[0]
@@ -210,12 +236,22 @@ class Beliefs(Branches):
         radius = self.origin.radar_configs[0].obstacle_radius
         width = sizes.edge / math.sqrt(2.0) if radius == "auto" else np.full_like(sizes.edge, radius)
         columns = {
-            "resolution": sizes.edge, "occluder_radius_max": width, "cell_origin": sizes.origin,
-            "cell_size": sizes.edge * sizes.tile, "cells_x": sizes.tiles_x, "cells_y": sizes.tiles_y,
-            "lower": true["lower"], "upper": true["upper"], "frame_origin": true["frame_origin"],
-            "pixel_size": true["pixel_size"], "width": sizes.width, "height": sizes.height, "margin": sizes.margin,
-            "tile": sizes.tile, "block": sizes.block,
-        }  # fmt: skip
+            "resolution": sizes.edge,
+            "occluder_radius_max": width,
+            "cell_origin": sizes.origin,
+            "cell_size": sizes.edge * sizes.tile,
+            "cells_x": sizes.tiles_x,
+            "cells_y": sizes.tiles_y,
+            "lower": true["lower"],
+            "upper": true["upper"],
+            "frame_origin": true["frame_origin"],
+            "pixel_size": true["pixel_size"],
+            "width": sizes.width,
+            "height": sizes.height,
+            "margin": sizes.margin,
+            "tile": sizes.tile,
+            "block": sizes.block,
+        }
         device = self.origin.device
         self.table = {name: torch.from_numpy(np.ascontiguousarray(one)).to(device) for name, one in columns.items()}
 
@@ -236,20 +272,40 @@ class Beliefs(Branches):
         self.own = {name: torch.zeros(self.worlds, dtype=torch.int32, device=device) for name in ("margin", "tile")}
         own = {name: wp.from_torch(one) for name, one in self.own.items()}
         self.values = own | {
-            "maps": self.origin.simulation.maps, "grids": self.true_grids, "place": wp.from_torch(self.place),
-            "rows_per_env": self.rows, "lanes": self.nav.known_grids.lanes, "robots": env.num_robots,
-            "wall": wp.from_torch(self.wall), "guess": wp.from_torch(self.guess), "state": wp.from_torch(self.state),
-            "certain": wp.from_torch(self.certain), "count": wp.from_torch(count), "index": wp.from_torch(index),
-            "pair_begin": wp.from_torch(pair_begin), "total": wp.from_torch(self.total),
+            "maps": self.origin.simulation.maps,
+            "grids": self.true_grids,
+            "place": wp.from_torch(self.place),
+            "rows_per_env": self.rows,
+            "lanes": self.nav.known_grids.lanes,
+            "robots": env.num_robots,
+            "wall": wp.from_torch(self.wall),
+            "guess": wp.from_torch(self.guess),
+            "state": wp.from_torch(self.state),
+            "certain": wp.from_torch(self.certain),
+            "count": wp.from_torch(count),
+            "index": wp.from_torch(index),
+            "pair_begin": wp.from_torch(pair_begin),
+            "total": wp.from_torch(self.total),
             "most_pairs": maps.neighbour.shape[0] // self.worlds,
-            "tiles_x": maps.cells_x, "origin": grids.origin, "edge": grids.cell, "width": grids.width,
-            "height": grids.height, "begin": maps.cell_begin, "free_begin": maps.free_begin,
-            "boundary_begin": maps.boundary_begin, "free_cell": maps.free_cell, "boundary_cell": maps.boundary_cell,
-            "worth": wp.from_torch(self.worth), "free_weight": maps.free_weight,
-            "free": maps.free, "boundary": maps.boundary, "cell_of_free": grids.free_cell,
-            "cell_of_boundary": grids.boundary_cell, "neighbour_begin": maps.neighbour_begin,
+            "tiles_x": maps.cells_x,
+            "origin": grids.origin,
+            "edge": grids.cell,
+            "width": grids.width,
+            "height": grids.height,
+            "begin": maps.cell_begin,
+            "free_begin": maps.free_begin,
+            "boundary_begin": maps.boundary_begin,
+            "free_cell": maps.free_cell,
+            "boundary_cell": maps.boundary_cell,
+            "worth": wp.from_torch(self.worth),
+            "free_weight": maps.free_weight,
+            "free": maps.free,
+            "boundary": maps.boundary,
+            "cell_of_free": grids.free_cell,
+            "cell_of_boundary": grids.boundary_cell,
+            "neighbour_begin": maps.neighbour_begin,
             "neighbour": maps.neighbour,
-        }  # fmt: skip
+        }
         state = env.simulation.tensors
         names = ("map_id", "seen_free", "viewers_free", "seen_boundary", "viewers_boundary")
         recalled = {name: wp.from_torch(state[name]) for name in names}

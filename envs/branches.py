@@ -22,10 +22,27 @@ if TYPE_CHECKING:
 OF_POINTS = ("seen_free", "seen_boundary", "viewers_free", "viewers_boundary", "known_free", "known_boundary")
 """State about the points of maps: another world has its own."""
 NOT_COPIED = (
-    "track", "starts", "seed", "map_id", "milestone_step", "milestone_overlap", "milestone_path", "path_length",
-    "terms", "unscaled", "episode_reward", "base_sum", "worst_sum", "told_step", "connected",
-    "evidence_free", "evidence_boundary", "odometry_error", "pose_estimate", "center_estimate",
-)  # fmt: skip
+    "track",
+    "starts",
+    "seed",
+    "map_id",
+    "milestone_step",
+    "milestone_overlap",
+    "milestone_path",
+    "path_length",
+    "terms",
+    "unscaled",
+    "episode_reward",
+    "base_sum",
+    "worst_sum",
+    "told_step",
+    "connected",
+    "evidence_free",
+    "evidence_boundary",
+    "odometry_error",
+    "pose_estimate",
+    "center_estimate",
+)
 """State that no branch needs, for nobody asks it for metrics, or that is its own."""
 
 
@@ -38,11 +55,16 @@ def branch_env(
     limited = env.settings.limited if comm is None else comm.limited
     comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
     settings = replace(
-        env.settings, num_envs=count, comm=comm, limited=limited, local_steps=local_steps or env.local_steps,
-        faults=FaultsConfig(), odometry=OdometryConfig(),  # nobody foresees what chance does
+        env.settings,
+        num_envs=count,
+        comm=comm,
+        limited=limited,
+        local_steps=local_steps or env.local_steps,
+        faults=FaultsConfig(),
+        odometry=OdometryConfig(),  # nobody foresees what chance does
         radar=tuple(map(perfect, env.settings.radar)),
         observation=replace(env.settings.observation, pictures=False),
-    )  # fmt: skip
+    )
     made = ExplorationEnv.__new__(ExplorationEnv)
     made._set_up(settings, bank)
     return made

@@ -225,17 +225,20 @@ class ExplorationEnv(EnvBase):
         state = self.simulation.tensors
         left = 1.0 - state["macro_step"] / self.macro_steps
         observation = {
-            "pose": pose, "grid": grid, "comm": state["comm"].clone(),
+            "pose": pose,
+            "grid": grid,
+            "comm": state["comm"].clone(),
             "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
             "alive": (state["collided"] == 0) & (state["failed"] == 0),
-        } | ({"map": picture} if pictures else {})  # fmt: skip
+        } | ({"map": picture} if pictures else {})
         if self.target_view is not None:
             seen = self.target_view.observe(mask)
             observation |= {"targets": seen["features"], "targets_mask": seen["mask"]}
         agents = TensorDict(
             {"observation": TensorDict(observation, batch_size=[e, n], device=self.device)},
-            batch_size=[e, n], device=self.device,
-        )  # fmt: skip
+            batch_size=[e, n],
+            device=self.device,
+        )
         parts = {
             "agents": agents,
             "info": TensorDict(self._info(), batch_size=[e], device=self.device),

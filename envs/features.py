@@ -169,7 +169,7 @@ TABLE: dict[str, Feature] = {
         lambda now: now.xp.log(1.0 + now.area / (math.pi * now.reach**2)), f"log(1 + {DISCS})", "area known"
     ),
     "mates": Feature(lambda now: now.xp.sum(now.mates, -1)[..., None] / 4.0, "4 robots", "others that move"),
-}  # fmt: skip
+}
 FEATURES = tuple(TABLE)
 """Names of the last axis of the features."""
 

@@ -96,9 +96,7 @@ def check_settings(settings: Any, group: str = "", error: type[ValueError] = Val
             check_value(name, getattr(settings, one.name), allowed[one.name], one.metadata, error)
 
 
-def check_value(
-    name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError
-) -> None:
+def check_value(name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError) -> None:
     """Raise ``error`` unless the value is of one of the types and in the range of a setting."""
     if not _fits(value, allowed, **metadata["limits"]):
         raise error(f"{name}={value!r} must be {_wanted(allowed, metadata['unit'], **metadata['limits'])}.")

@@ -51,9 +51,15 @@ def write_mp4(frames, path, fps: float = 10.0) -> Path:
     border = ((0, height % 2), (0, width % 2), (0, 0))  # the codec wants even sides
     with whole_file(path) as part:
         writer = imageio_ffmpeg.write_frames(
-            part, (width + width % 2, height + height % 2), fps=fps, codec="libx264", quality=8, macro_block_size=2,
-            output_params=["-f", "mp4"], ffmpeg_log_level="error",
-        )  # fmt: skip
+            part,
+            (width + width % 2, height + height % 2),
+            fps=fps,
+            codec="libx264",
+            quality=8,
+            macro_block_size=2,
+            output_params=["-f", "mp4"],
+            ffmpeg_log_level="error",
+        )
         writer.send(None)
         for frame in frames:
             writer.send(np.ascontiguousarray(np.pad(frame, border, mode="edge")))

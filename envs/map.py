@@ -102,7 +102,8 @@ class PointCloudMap:
             "boundary_spacing": boundary_spacing,
             "free_height": None if free_height is None else _check_per_point("free_height", free_height, free_kept),
             "obstacle_height": (
-                None if obstacle_height is None
+                None
+                if obstacle_height is None
                 else _check_per_point("obstacle_height", obstacle_height, obstacles_kept)
             ),
         }

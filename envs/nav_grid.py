@@ -39,9 +39,7 @@ class NavGrid:
 
     def reorder(self, free_order: np.ndarray, boundary_order: np.ndarray) -> NavGrid:
         """The grid for points taken in another order (a bank sorts them): new point k is old `order[k]`."""
-        return replace(
-            self, free_cell=self.free_cell[free_order], boundary_cell=self.boundary_cell[boundary_order]
-        )
+        return replace(self, free_cell=self.free_cell[free_order], boundary_cell=self.boundary_cell[boundary_order])
 
 
 def grid_shape(map: PointCloudMap) -> tuple[int, int]:

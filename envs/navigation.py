@@ -160,9 +160,11 @@ class Navigation:
         self.cell = torch.empty((looks, self.rows, most), dtype=torch.int64, device=device)
         self.point, self.way = torch.empty((*shape, 2), device=device), torch.empty(shape, device=device)
         self.around = torch.empty(shape, device=device)
-        values = self.values() | {"point": view(self.point, wp.vec2)} | {
-            name: view(getattr(self, name)) for name in ("block", "cell", "way", "around")
-        }  # fmt: skip
+        values = (
+            self.values()
+            | {"point": view(self.point, wp.vec2)}
+            | {name: view(getattr(self, name)) for name in ("block", "cell", "way", "around")}
+        )
         launch_named(self.launch, targets._list_targets, (looks, most), values)
 
     def _update(self, launch: Launch) -> None:
@@ -170,9 +172,7 @@ class Navigation:
         self.known_grids.paint(launch)
         self.passable.paint(launch)
         self.blocks.mark(launch)
-        launch_named(
-            launch, targets._locate_robots, self.paths.shape, self.values()
-        )
+        launch_named(launch, targets._locate_robots, self.paths.shape, self.values())
         self.paths.flood(launch)
         self.blocks.place(launch)
 
@@ -219,11 +219,19 @@ class Navigation:
         area = torch.empty(start.shape, device=self.device)
         middle = torch.empty((*start.shape, 2), device=self.device)
         self.launch(
-            outlook._look_around, tuple(area.shape),
-            [self.grids, self.known_grids.grid_of_row, grid, wp.from_torch(start),
-             *self._spread_rays(radius), float(radius),
-             wp.from_torch(area), wp.from_torch(middle, dtype=wp.vec2)],
-        )  # fmt: skip
+            outlook._look_around,
+            tuple(area.shape),
+            [
+                self.grids,
+                self.known_grids.grid_of_row,
+                grid,
+                wp.from_torch(start),
+                *self._spread_rays(radius),
+                float(radius),
+                wp.from_torch(area),
+                wp.from_torch(middle, dtype=wp.vec2),
+            ],
+        )
         shape = (self.num_envs, self.rows, -1)
         return self.pick(area.view(shape)), self.pick(middle.view(*shape, 2))
 
@@ -237,9 +245,14 @@ class Navigation:
         radius = float(self.radar_range)
         ray_cell, ray_part = self._spread_rays(radius)
         values = self.values() | {
-            "radius": radius, "block": view(self.block), "cell": view(self.cell),
-            "ray_cell": ray_cell, "ray_part": ray_part, "area": view(area), "middle": view(middle, wp.vec2),
-        }  # fmt: skip
+            "radius": radius,
+            "block": view(self.block),
+            "cell": view(self.cell),
+            "ray_cell": ray_cell,
+            "ray_part": ray_part,
+            "area": view(area),
+            "middle": view(middle, wp.vec2),
+        }
         launch_named(self.launch, outlook._look_from_targets, tuple(self.cell.shape), values)
         return area, middle
 
@@ -268,11 +281,23 @@ class Navigation:
         state = [self.arrays[name] for name in ("seed", "env_id", "episode", "macro_step")]
         cells = branch / float(self.cell_size.max())
         self.launch(
-            _grow_tree, items,
-            [self.grids, self.arrays["map_id"], self.blocks.block, *state, self.known_grids.known,
-             self.paths.search.sources, self.rows, self.num_robots, samples, cells,
-             wp.from_torch(node, dtype=wp.vec2), wp.from_torch(found)],
-        )  # fmt: skip
+            _grow_tree,
+            items,
+            [
+                self.grids,
+                self.arrays["map_id"],
+                self.blocks.block,
+                *state,
+                self.known_grids.known,
+                self.paths.search.sources,
+                self.rows,
+                self.num_robots,
+                samples,
+                cells,
+                wp.from_torch(node, dtype=wp.vec2),
+                wp.from_torch(found),
+            ],
+        )
         return found.view(self.num_envs, self.rows, -1) != 0
 
     def alive(self) -> torch.Tensor:
@@ -305,11 +330,19 @@ class Navigation:
         wanted = self._spread(cells)
         cell = torch.empty_like(wanted)
         self.launch(
-            targets._first_cells, tuple(wanted.shape),
-            [self.grids, self.arrays["map_id"], self.passable.passable, self.paths.row_of_item,
-             self.paths.search.distance, wp.from_torch(wanted), int(STRAIGHT * ahead),
-             wp.from_torch(cell)],
-        )  # fmt: skip
+            targets._first_cells,
+            tuple(wanted.shape),
+            [
+                self.grids,
+                self.arrays["map_id"],
+                self.passable.passable,
+                self.paths.row_of_item,
+                self.paths.search.distance,
+                wp.from_torch(wanted),
+                int(STRAIGHT * ahead),
+                wp.from_torch(cell),
+            ],
+        )
         return self.points(self.pick(cell).clamp_min(0).long())
 
     def waypoints(self, cells: torch.Tensor, points: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
@@ -331,9 +364,14 @@ class Navigation:
         goal = wp.from_torch(goal, dtype=wp.vec2)
         self.paths.trace(self.launch, goal)
         self.paths.pick(
-            self.launch, a["active"], a["collided"], a["center"], goal, wp.from_torch(reach.contiguous()),
+            self.launch,
+            a["active"],
+            a["collided"],
+            a["center"],
+            goal,
+            wp.from_torch(reach.contiguous()),
             wp.from_torch(result, dtype=wp.vec2),
-        )  # fmt: skip
+        )
         return result
 
     def leads_through_open_ground(self, points: torch.Tensor) -> torch.Tensor:
@@ -354,11 +392,19 @@ class Navigation:
         index = torch.minimum(y, self.height[m] - 1) * self.width[m] + torch.minimum(x, self.width[m] - 1)
         found = torch.empty(index.shape[:2], dtype=torch.bool, device=self.device)
         self.launch(
-            targets._find_open_ground, tuple(found.shape),
-            [self.grids, self.arrays["map_id"], self.known_grids.known, self.known_grids.walls, self.rows,
-             wp.from_torch(index.to(torch.int32).contiguous()), self.room,
-             wp.from_torch(found)],
-        )  # fmt: skip
+            targets._find_open_ground,
+            tuple(found.shape),
+            [
+                self.grids,
+                self.arrays["map_id"],
+                self.known_grids.known,
+                self.known_grids.walls,
+                self.rows,
+                wp.from_torch(index.to(torch.int32).contiguous()),
+                self.room,
+                wp.from_torch(found),
+            ],
+        )
         return found
 
     def aim(self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
@@ -371,9 +417,11 @@ class Navigation:
         """
         target = torch.empty_like(toward)
         values = self.values() | {
-            "chosen": view(chosen), "cell": view(cell), "toward": view(toward, wp.vec2),
+            "chosen": view(chosen),
+            "cell": view(cell),
+            "toward": view(toward, wp.vec2),
             "target": view(target, wp.vec2),
-        }  # fmt: skip
+        }
         launch_named(self.launch, goals._aim, tuple(chosen.shape), values)
         return target
 

@@ -201,11 +201,19 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     shapes = [grid_shape(one) for one in bank.maps]
     cells = max(width * height for width, height in shapes)
     return {
-        "row": robots if limited else 1, "item": robots, "place": robots,
+        "row": robots if limited else 1,
+        "item": robots,
+        "place": robots,
         "mask": robots if limited else len({one.collision_threshold for one in settings.robot}),
-        "cell": cells, "slot": news_capacity(cells), "word": max(-(-width // 32) * height for width, height in shapes),
-        "point": bank.max_free + bank.max_boundary, "ring": 2, "source": 1, "end": 2, "step": PATH_CELLS,
-    }  # fmt: skip
+        "cell": cells,
+        "slot": news_capacity(cells),
+        "word": max(-(-width // 32) * height for width, height in shapes),
+        "point": bank.max_free + bank.max_boundary,
+        "ring": 2,
+        "source": 1,
+        "end": 2,
+        "step": PATH_CELLS,
+    }
 
 
 def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:

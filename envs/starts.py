@@ -134,13 +134,23 @@ def check_starts(env, poses) -> np.ndarray:
     _blame(env, shown, ~np.isfinite(shown).all(-1), lambda e, i: "is not finite: give numbers")
     for m in env.maps:
         wall = _in_wall(env, m, shown)
-        _blame(env, shown, wall, lambda e, i, m=m: (
-            f"lies in a wall of map {m.name} or outside it: give a place in free space "
-            + ("for the whole footprint" if env.collision == "footprint" else
-               f"at least {env.robot_configs[i].collision_threshold:g} m from obstacle points")))  # fmt: skip
+        _blame(
+            env,
+            shown,
+            wall,
+            lambda e, i, m=m: (
+                f"lies in a wall of map {m.name} or outside it: give a place in free space "
+                + (
+                    "for the whole footprint"
+                    if env.collision == "footprint"
+                    else f"at least {env.robot_configs[i].collision_threshold:g} m from obstacle points"
+                )
+            ),
+        )
     with_other = _on_top(env, shown)
-    _blame(env, shown, with_other.any(-1), lambda e, i: (
-        f"collides with robot {with_other[e, i].argmax()}: move them apart"))  # fmt: skip
+    _blame(
+        env, shown, with_other.any(-1), lambda e, i: f"collides with robot {with_other[e, i].argmax()}: move them apart"
+    )
     return poses.astype(np.float32)
 
 

@@ -58,11 +58,17 @@ class Strategy:
             return torch.zeros(shape, dtype=dtype, device=device)
 
         self.state = {
-            "met": zeros(e, n, u), "place": zeros(e, n, u, 2, dtype=torch.float32),
-            "driven": zeros(e, n, u, dtype=torch.float32), "told": zeros(e, n, u), "knew": zeros(e, n),
-            "grew": zeros(e, n), "duty": zeros(e, n, dtype=torch.bool), "due": zeros(e, n),
-            "spot": zeros(e, n, 2, dtype=torch.float32), "party": zeros(e, n, u, dtype=torch.bool),
-        }  # fmt: skip
+            "met": zeros(e, n, u),
+            "place": zeros(e, n, u, 2, dtype=torch.float32),
+            "driven": zeros(e, n, u, dtype=torch.float32),
+            "told": zeros(e, n, u),
+            "knew": zeros(e, n),
+            "grew": zeros(e, n),
+            "duty": zeros(e, n, dtype=torch.bool),
+            "due": zeros(e, n),
+            "spot": zeros(e, n, 2, dtype=torch.float32),
+            "party": zeros(e, n, u, dtype=torch.bool),
+        }
 
     @torch.no_grad()
     def direct(self, region: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

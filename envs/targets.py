@@ -302,11 +302,22 @@ class TargetTracker:
             idle = idle | self.env.strategy.state["duty"]
         s["chosen"] = s["chosen"].masked_fill(idle.unsqueeze(-1), -1)
         left, kept = torch.zeros(len(way), dtype=torch.int32, device=way.device), torch.empty_like(way)
-        values = nav.values() | {name: view(one) for name, one in s.items() if name != "stood"} | {
-            "stood": view(s["stood"], wp.vec2), "block": view(block), "way": view(way), "kept": view(kept),
-            "point": view(point, wp.vec2), "left": view(left), "clearance": nav.clearance,
-            "least": STUCK * nav.clearance, "shared": int(nav.rows == 1), "most": DWELL,
-        }  # fmt: skip
+        values = (
+            nav.values()
+            | {name: view(one) for name, one in s.items() if name != "stood"}
+            | {
+                "stood": view(s["stood"], wp.vec2),
+                "block": view(block),
+                "way": view(way),
+                "kept": view(kept),
+                "point": view(point, wp.vec2),
+                "left": view(left),
+                "clearance": nav.clearance,
+                "least": STUCK * nav.clearance,
+                "shared": int(nav.rows == 1),
+                "most": DWELL,
+            }
+        )
         robots, slots = (len(way), way.shape[1]), (len(way), way.shape[2])
         launch_named(nav.launch, targets._note_stuck, robots, values)
         launch_named(nav.launch, targets._count_visits, slots, values)

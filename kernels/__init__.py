@@ -14,8 +14,6 @@ _HOMES = {
     "unpack_flags": "api",
     "visible_points": "api",
 }
-__all__ = [
-    "frontier_cells", "geodesic_distance", "merge_maps", "received_power", "unpack_flags", "visible_points"
-]  # fmt: skip
+__all__ = ["frontier_cells", "geodesic_distance", "merge_maps", "received_power", "unpack_flags", "visible_points"]
 
 __getattr__ = lazy_names(__name__, _HOMES)

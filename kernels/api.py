@@ -122,19 +122,28 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     pose[..., 3] = heading
     views, dim, lanes = zeros(1, 1, count), (1, 1), lanes_on(wp.device_from_torch(device), 4096)
     values = {
-        "maps": maps, "map_id": ints(0), "robots": robots, "active": ints(1), "lanes": lanes,
+        "maps": maps,
+        "map_id": ints(0),
+        "robots": robots,
+        "active": ints(1),
+        "lanes": lanes,
         "failed": wp.from_torch(zeros(1, 1)),
         "planar": int(not free[:, 2].any() and not occluders[:, 2].any()),
-        "pose": wp.from_torch(pose, dtype=wp.vec4), "center": wp.from_torch(center, dtype=wp.vec3),
-        "near": wp.from_torch(zeros(1, 1, 1)), "near_count": wp.from_torch(zeros(1, 1)),  # nobody else is there
+        "pose": wp.from_torch(pose, dtype=wp.vec4),
+        "center": wp.from_torch(center, dtype=wp.vec3),
+        "near": wp.from_torch(zeros(1, 1, 1)),
+        "near_count": wp.from_torch(zeros(1, 1)),  # nobody else is there
         "facing": wp.from_torch(zeros(1, 1, 2, dtype=torch.float32), dtype=wp.vec2),  # only other robots' are read
         "bins": wp.from_torch(zeros(1, 1, 3 * BINS, dtype=torch.float32)),
         "direction": wp.from_torch(zeros(1, 1, blocks, 3, dtype=torch.float32), dtype=wp.vec3),
         "limit": wp.from_torch(zeros(1, 1, blocks, 2, dtype=torch.float32), dtype=wp.vec2),
-        "occluder_count": wp.from_torch(zeros(1, 1)), "wall_count": wp.from_torch(zeros(1, 1)),
-        "visible": wp.from_torch(zeros(1, 1, count)), "visible_count": wp.from_torch(zeros(1, 1)),
-        "viewers_free": wp.from_torch(views), "error": wp.from_torch(zeros(1)),
-    }  # fmt: skip
+        "occluder_count": wp.from_torch(zeros(1, 1)),
+        "wall_count": wp.from_torch(zeros(1, 1)),
+        "visible": wp.from_torch(zeros(1, 1, count)),
+        "visible_count": wp.from_torch(zeros(1, 1)),
+        "viewers_free": wp.from_torch(views),
+        "error": wp.from_torch(zeros(1)),
+    }
     launch = launch_on(device)
     launch_named(launch, visibility._collect_occluders, dim, values)
     launch_named(launch, visibility._scan_free, (*dim, lanes), values)

@@ -95,9 +95,7 @@ def assign_targets(cost: torch.Tensor) -> torch.Tensor:
     padded = torch.full((envs, robots, width), FORBIDDEN, dtype=torch.int32, device=cost.device)
     padded[..., :targets] = cost.clamp(max=FORBIDDEN)
     match = torch.empty((envs, robots), dtype=torch.int32, device=cost.device)
-    scratch = [
-        torch.empty((envs, 1 + n), dtype=torch.int32, device=cost.device) for n in (robots, *[width] * 5)
-    ]
+    scratch = [torch.empty((envs, 1 + n), dtype=torch.int32, device=cost.device) for n in (robots, *[width] * 5)]
     launch_on(cost.device)(
         _assign_targets,
         envs,

@@ -52,9 +52,7 @@ def _find_walls(
 
 
 @wp.func
-def believed(
-    state: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int
-) -> int:
+def believed(state: wp.array2d(dtype=wp.uint8), row: int, x: int, y: int, w: int, h: int) -> int:
     """What is believed of a cell of a world; outside of it nothing, as `UNKNOWN`."""
     if x < 0 or y < 0 or x >= w or y >= h:
         return UNKNOWN

@@ -36,9 +36,7 @@ def _mark_rows(
 
 
 @wp.func
-def is_reached(
-    distance: wp.array2d(dtype=wp.int32), e: int, first: int, last: int, robots: int, cell: int
-) -> bool:
+def is_reached(distance: wp.array2d(dtype=wp.int32), e: int, first: int, last: int, robots: int, cell: int) -> bool:
     """Whether one of the robots `first` to `last` (not included) gets to a cell."""
     for i in range(first, last):
         if distance[e * robots + i, cell] < UNREACHED:
@@ -172,10 +170,19 @@ def scaled_gap(step: int, count: int, sum: wp.int64) -> wp.int64:
 
 @wp.func
 def place_target(
-    row: int, k: int, w: int, h: int, b: int, search: int, size: wp.array2d(dtype=wp.int32),
-    sums: wp.array3d(dtype=wp.int64), distance: wp.array2d(dtype=wp.int32), rows_per_env: int, robots: int,
+    row: int,
+    k: int,
+    w: int,
+    h: int,
+    b: int,
+    search: int,
+    size: wp.array2d(dtype=wp.int32),
+    sums: wp.array3d(dtype=wp.int64),
+    distance: wp.array2d(dtype=wp.int32),
+    rows_per_env: int,
+    robots: int,
 ) -> int:
-    """The reached cell nearest to the middle of a block's frontier cells, in or close to it; -1: none."""  # fmt: skip
+    """The reached cell nearest to the middle of a block's frontier cells, in or close to it; -1: none."""
     count = size[row, k]
     across = (w + b - 1) / b
     x0 = (k % across) * b
@@ -335,18 +342,32 @@ class FrontierBlocks:
         self.block, self.search = (wp.array(v, dtype=wp.int32, device=device) for v in (side, search))
 
         sizes = {
-            "env": envs, "row": rows, "word": known.walls.shape[1], "cell": cells, "block": self.num_blocks, "two": 2
-        }  # fmt: skip
+            "env": envs,
+            "row": rows,
+            "word": known.walls.shape[1],
+            "cell": cells,
+            "block": self.num_blocks,
+            "two": 2,
+        }
         vars(self).update(make_arrays(BLOCKS, sizes, device))
 
     def values(self) -> dict:
         """The arrays of grids, ways and blocks, by the names of the kernels' parameters."""
         known = self.paths.passable.known
-        return self.paths.values() | vars(self) | {
-            "width": known.grids.width, "map_of_row": known.grid_of_row, "known": known.known, "news": known.news,
-            "news_count": known.news_count, "rows_per_env": known.rows_per_env, "robots": self.paths.shape[1],
-            "lanes": known.lanes,
-        }  # fmt: skip
+        return (
+            self.paths.values()
+            | vars(self)
+            | {
+                "width": known.grids.width,
+                "map_of_row": known.grid_of_row,
+                "known": known.known,
+                "news": known.news,
+                "news_count": known.news_count,
+                "rows_per_env": known.rows_per_env,
+                "robots": self.paths.shape[1],
+                "lanes": known.lanes,
+            }
+        )
 
     def mark(self, launch: Launch) -> None:
         """Note which rows are to be brought up to date."""

@@ -81,9 +81,15 @@ def _detect_collisions(
             there = point_xy(center[e, other])
             if footprint != 0:
                 gap = rectangles_gap(
-                    at, theta, robots.length[e, i], robots.width[e, i],
-                    there, pose[e, other][3], robots.length[e, other], robots.width[e, other],
-                )  # fmt: skip
+                    at,
+                    theta,
+                    robots.length[e, i],
+                    robots.width[e, i],
+                    there,
+                    pose[e, other][3],
+                    robots.length[e, other],
+                    robots.width[e, other],
+                )
                 hit = gap == 0.0
             else:
                 hit = wp.length(there - at) < robots.collision_threshold[e, i]

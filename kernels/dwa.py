@@ -323,9 +323,19 @@ def _plan_dwa(
                     if not score < best and b + n < num_steering:
                         if footprint != 0:
                             d[n] = footprint_clearance(
-                                robots, count, mate_count, e, i, wp.vec2(x[n], y[n]), theta[n], clearance,
-                                nearby, pose, center, mates,
-                            )  # fmt: skip
+                                robots,
+                                count,
+                                mate_count,
+                                e,
+                                i,
+                                wp.vec2(x[n], y[n]),
+                                theta[n],
+                                clearance,
+                                nearby,
+                                pose,
+                                center,
+                                mates,
+                            )
                         if d[n] < clearance:
                             score += clearance_weight * wp.log(wp.max(d[n], NEAREST) / clearance)
                         k = a * num_steering + b + n

@@ -132,10 +132,19 @@ SEARCH = f"""
 
 @wp.func_native(SEARCH)
 def search_from(
-    passable: wp.array2d(dtype=wp.uint8), row: int, sources: wp.array2d(dtype=wp.int32), item: int, goal: int,
-    place: int, w: int, h: int, next: wp.array2d(dtype=wp.int32), previous: wp.array2d(dtype=wp.int32),
-    touched: wp.array2d(dtype=wp.int32), distance: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
+    passable: wp.array2d(dtype=wp.uint8),
+    row: int,
+    sources: wp.array2d(dtype=wp.int32),
+    item: int,
+    goal: int,
+    place: int,
+    w: int,
+    h: int,
+    next: wp.array2d(dtype=wp.int32),
+    previous: wp.array2d(dtype=wp.int32),
+    touched: wp.array2d(dtype=wp.int32),
+    distance: wp.array2d(dtype=wp.int32),
+):
     """Distances of all cells, or of the ways to `goal`; those of the search before are cleared."""
     ...
 
@@ -221,10 +230,22 @@ class DistanceSearch:
             width, height: int32 [grids], cells of each grid along x and y.
         """
         launch(
-            _search_distance, self.distance.shape[0],
-            [passable, row_of_item, grid_of_row, width, height, self.sources, self.stop,
-             self.next, self.previous, self.touched, self.distance],
-        )  # fmt: skip
+            _search_distance,
+            self.distance.shape[0],
+            [
+                passable,
+                row_of_item,
+                grid_of_row,
+                width,
+                height,
+                self.sources,
+                self.stop,
+                self.next,
+                self.previous,
+                self.touched,
+                self.distance,
+            ],
+        )
 
 
 def geodesic_distance(passable: torch.Tensor, sources: torch.Tensor) -> torch.Tensor:

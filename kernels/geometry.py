@@ -32,8 +32,14 @@ def rectangle_corner(k: int, center: wp.vec2, theta: float, length: float, width
 
 @wp.func
 def separated(
-    center: wp.vec2, theta: float, length: float, width: float,
-    other: wp.vec2, theta_o: float, length_o: float, width_o: float,
+    center: wp.vec2,
+    theta: float,
+    length: float,
+    width: float,
+    other: wp.vec2,
+    theta_o: float,
+    length_o: float,
+    width_o: float,
 ) -> bool:
     """Whether an axis of the first rectangle separates the two."""
     c = wp.cos(theta)
@@ -48,8 +54,14 @@ def separated(
 
 @wp.func
 def rectangles_gap(
-    center: wp.vec2, theta: float, length: float, width: float,
-    other: wp.vec2, theta_o: float, length_o: float, width_o: float,
+    center: wp.vec2,
+    theta: float,
+    length: float,
+    width: float,
+    other: wp.vec2,
+    theta_o: float,
+    length_o: float,
+    width_o: float,
 ) -> float:
     """Distance of two oriented rectangles, 0 where they overlap.
 

@@ -111,9 +111,18 @@ NEXT_NEWS = """
 
 @wp.func_native(NEXT_NEWS)
 def next_news(
-    flags: wp.array3d(dtype=wp.int32), e: int, word: int, words: int, mask: int, painted: wp.array2d(dtype=wp.uint8),
-    row: int, shift: int, start: int, end: int, lanes: int,
-) -> wp.vec2i:  # fmt: skip
+    flags: wp.array3d(dtype=wp.int32),
+    e: int,
+    word: int,
+    words: int,
+    mask: int,
+    painted: wp.array2d(dtype=wp.uint8),
+    row: int,
+    shift: int,
+    start: int,
+    end: int,
+    lanes: int,
+) -> wp.vec2i:
     """The next point from `start` on that is known and not yet painted, and how many known ones were met up to it."""
     ...
 
@@ -295,13 +304,19 @@ class KnownGrids:
         """Paint obstacles, then free points."""
         maps, grids = self.maps, self.grids
         obstacles = {
-            "point_begin": maps.boundary_begin, "point_cell": grids.boundary_cell, "flags": self.boundary_flags,
-            "value": wp.uint8(OBSTACLE), "shift": self.free_flags.shape[2],
-        }  # fmt: skip
+            "point_begin": maps.boundary_begin,
+            "point_cell": grids.boundary_cell,
+            "flags": self.boundary_flags,
+            "value": wp.uint8(OBSTACLE),
+            "shift": self.free_flags.shape[2],
+        }
         free = {
-            "point_begin": maps.free_begin, "point_cell": grids.free_cell, "flags": self.free_flags,
-            "value": wp.uint8(FREE), "shift": 0,
-        }  # fmt: skip
+            "point_begin": maps.free_begin,
+            "point_cell": grids.free_cell,
+            "flags": self.free_flags,
+            "value": wp.uint8(FREE),
+            "shift": 0,
+        }
         for layer in (obstacles, free):
             given = vars(self) | layer | {"again": again}
             launch_named(launch, _paint_points, (self.known.shape[0], self.lanes), given)

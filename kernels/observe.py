@@ -342,10 +342,11 @@ def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: t
     given = {
         "picture": wp.from_torch(picture.flatten(3), dtype=wp.uint8),
         "team": wp.from_torch(team.flatten(2), dtype=wp.uint8),
-        "draw_free": getattr(s, f"{drawn}_free"), "draw_boundary": getattr(s, f"{drawn}_boundary"),
+        "draw_free": getattr(s, f"{drawn}_free"),
+        "draw_boundary": getattr(s, f"{drawn}_boundary"),
         "team_bits": int(settings.draw_known and not settings.limited),
         "lanes": lanes_on(shard.device, 1024),
-    }  # fmt: skip
+    }
     shard.call(launch, _draw_points, (shard.shape[0], given["lanes"]), **given)
     shard.call(launch, _list_bodies, **shard.believed)
     shard.call(launch, _draw_robots, picture=given["picture"])

@@ -82,23 +82,35 @@ found_from = wp.types.vector(length=5, dtype=wp.float64)
 
 @wp.func_native(LOOK_FROM)
 def look(
-    known: wp.array2d(dtype=wp.uint8), row: int, cell: int, w: int, h: int, reach: int,
-    ray_cell: wp.array2d(dtype=wp.vec2i), ray_part: wp.array2d(dtype=wp.vec3),
-) -> found_from:  # fmt: skip
+    known: wp.array2d(dtype=wp.uint8),
+    row: int,
+    cell: int,
+    w: int,
+    h: int,
+    reach: int,
+    ray_cell: wp.array2d(dtype=wp.vec2i),
+    ray_part: wp.array2d(dtype=wp.vec3),
+) -> found_from:
     """Unknown cells in sight, the sum of the ways there, and the corners of what was looked at."""
     ...
 
 
 @wp.func
 def look_from(
-    grids: NavGrids, m: int, known: wp.array2d(dtype=wp.uint8), row: int, cell: int,
-    ray_cell: wp.array2d(dtype=wp.vec2i), ray_part: wp.array2d(dtype=wp.vec3), radius: float,
+    grids: NavGrids,
+    m: int,
+    known: wp.array2d(dtype=wp.uint8),
+    row: int,
+    cell: int,
+    ray_cell: wp.array2d(dtype=wp.vec2i),
+    ray_part: wp.array2d(dtype=wp.vec3),
+    radius: float,
 ):
     """Unknown cells in sight of a cell, the middle of those, from there [m], and the corners of what was looked at.
 
     `RAYS` rays go out cell by cell, as far as the radius or a known obstacle; a cell of a ray stands for the share
     of its circle that falls to one ray.
-    """  # fmt: skip
+    """
     reach = int(wp.min(radius / grids.cell[m], float(ray_cell.shape[1] - 1)))  # no ray is longer
     found = look(known, row, cell, grids.width[m], grids.height[m], reach, ray_cell, ray_part)
     total = wp.float32(found[0])

@@ -35,7 +35,6 @@ FIT = 0.95  # share of its narrowest gap that DWA still keeps
 LEAST = 1.1  # the clearance never falls below so many collision thresholds
 
 
-
 @wp.func
 def clear_ahead(
     e: int,
@@ -232,18 +231,28 @@ def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> Non
     """Fit the clearance that DWA is to keep to the paths."""
     known, paths = wavefront.known, wavefront.paths
     shard.call(
-        launch, _fit_clearance,
-        grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        path=paths.path, path_total=paths.path_total, path_used=paths.path_used,
-        clearance=wavefront.narrowed.clearance, **shard.believed,
-    )  # fmt: skip
+        launch,
+        _fit_clearance,
+        grids=known.grids,
+        walls=known.walls,
+        rows_per_env=known.rows_per_env,
+        path=paths.path,
+        path_total=paths.path_total,
+        path_used=paths.path_used,
+        clearance=wavefront.narrowed.clearance,
+        **shard.believed,
+    )
 
 
 def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     """Draw waypoints nearer, so that robots can brake."""
     known, settings = wavefront.known, shard.settings
     shard.call(
-        launch, _hold_back,
-        grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        lead_time=settings.horizon * settings.dt, **shard.aims,
-    )  # fmt: skip
+        launch,
+        _hold_back,
+        grids=known.grids,
+        walls=known.walls,
+        rows_per_env=known.rows_per_env,
+        lead_time=settings.horizon * settings.dt,
+        **shard.aims,
+    )

@@ -84,9 +84,7 @@ def has_wall(walls: wp.array2d(dtype=wp.int32), row: int, line: int, first: int,
 
 
 @wp.func
-def near_wall(
-    walls: wp.array2d(dtype=wp.int32), row: int, x: int, y: int, w: int, h: int, radius: float
-) -> bool:
+def near_wall(walls: wp.array2d(dtype=wp.int32), row: int, x: int, y: int, w: int, h: int, radius: float) -> bool:
     """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
     across = wall_words(w)
     half = int(wp.ceil(radius))
@@ -126,9 +124,7 @@ def _open_news(
 
 
 @wp.func
-def close_around(
-    cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)
-):
+def close_around(cell: int, w: int, h: int, row: int, r: float, value: wp.uint8, passable: wp.array2d(dtype=wp.uint8)):
     """Give `value` to what is not blocked and lies nearer than `r` cells to an obstacle cell."""
     x = cell % w
     y = cell / w
@@ -241,9 +237,15 @@ class PassableGrids:
         known, lanes = self.known, self.known.lanes
         dim = (self.passable.shape[0], lanes)
         values = vars(self) | {
-            "grids": known.grids, "map_id": known.map_id, "known": known.known, "news": known.news,
-            "news_count": known.news_count, "walls": known.walls, "rows_per_env": self.masks, "lanes": lanes,
-        }  # fmt: skip
+            "grids": known.grids,
+            "map_id": known.map_id,
+            "known": known.known,
+            "news": known.news,
+            "news_count": known.news_count,
+            "walls": known.walls,
+            "rows_per_env": self.masks,
+            "lanes": lanes,
+        }
         launch_named(launch, _assign_grids, self.grid_of_row.shape, values)
         launch_named(launch, _open_cells, dim, values)
         if not self.through_unknown:

@@ -52,10 +52,18 @@ class Shard:
         self.radios = (last - first, sim.sizes["U"])
         self.lanes = lanes_on(self.device, 32)
         numbers = {name: int(one) if isinstance(one, bool) else one for name, one in vars(sim.settings).items()}
-        self._values = numbers | vars(self.view) | {
-            "maps": sim.maps, "num_maps": sim.num_maps, "map_starts": sim.map_starts_view, "weights": sim.weights,
-            "robots": self.robots, "lanes": self.lanes,
-        }  # fmt: skip
+        self._values = (
+            numbers
+            | vars(self.view)
+            | {
+                "maps": sim.maps,
+                "num_maps": sim.num_maps,
+                "map_starts": sim.map_starts_view,
+                "weights": sim.weights,
+                "robots": self.robots,
+                "lanes": self.lanes,
+            }
+        )
         self._recorded: dict[Stage, list[RecordedLaunch]] = {}
 
     @cached_property

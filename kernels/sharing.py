@@ -187,8 +187,17 @@ def share_targets(
     taken = torch.empty(preference.shape[:2], dtype=torch.int64, device=preference.device)
     wish, waiting = torch.empty_like(taken, dtype=torch.int32), torch.empty_like(taken, dtype=torch.bool)
     launch_on(preference.device)(
-        _share_targets, len(taken),
-        [view(preference), view(way), view(point, wp.vec2), view(hears), view(body),
-         view(wish), view(waiting), view(taken)],
-    )  # fmt: skip
+        _share_targets,
+        len(taken),
+        [
+            view(preference),
+            view(way),
+            view(point, wp.vec2),
+            view(hears),
+            view(body),
+            view(wish),
+            view(waiting),
+            view(taken),
+        ],
+    )
     return taken

@@ -181,14 +181,30 @@ def axis_sizes(
     radios = num_robots + base_station
     words = -(-radios // ROBOTS_PER_WORD)
     return {
-        "E": num_envs, "N": num_robots, "U": radios, "W": words, "F": max(free, 1), "B": max(boundary, 1),
-        "H": words if limited else 1, "P": max(free, 1) if limited else 1, "Q": max(boundary, 1) if limited else 1,
+        "E": num_envs,
+        "N": num_robots,
+        "U": radios,
+        "W": words,
+        "F": max(free, 1),
+        "B": max(boundary, 1),
+        "H": words if limited else 1,
+        "P": max(free, 1) if limited else 1,
+        "Q": max(boundary, 1) if limited else 1,
         "J": num_robots if drifts else 1,
-        "A": num_robots if sensing else 1, "C": max(free, 1) if sensing else 1, "I": max(boundary, 1) if sensing else 1,
-        "V": max(visible, 1), "K": max(occluders, 1),
-        "O": max(nearby, 1), "G": body_pixels, "T": track, "R": len(REWARD_TERMS), "D": 3 * BINS,
-        "S": num_robots, "M": len(MARKS), "1": 1,
-    }  # fmt: skip
+        "A": num_robots if sensing else 1,
+        "C": max(free, 1) if sensing else 1,
+        "I": max(boundary, 1) if sensing else 1,
+        "V": max(visible, 1),
+        "K": max(occluders, 1),
+        "O": max(nearby, 1),
+        "G": body_pixels,
+        "T": track,
+        "R": len(REWARD_TERMS),
+        "D": 3 * BINS,
+        "S": num_robots,
+        "M": len(MARKS),
+        "1": 1,
+    }
 
 
 def allocate(fields: dict[str, Field], sizes: dict[str, int], device: torch.device) -> dict[str, torch.Tensor]:

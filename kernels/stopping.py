@@ -141,7 +141,11 @@ def hold_turns(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
     """Draw the waypoints of differential drives to where they can stop on the way that they will drive."""
     known = wavefront.known
     shard.call(
-        launch, _hold_turns,
-        grids=known.grids, walls=known.walls, rows_per_env=known.rows_per_env,
-        clearance=wavefront.narrowed.clearance, waypoint=shard.aims["waypoint"],
-    )  # fmt: skip
+        launch,
+        _hold_turns,
+        grids=known.grids,
+        walls=known.walls,
+        rows_per_env=known.rows_per_env,
+        clearance=wavefront.narrowed.clearance,
+        waypoint=shard.aims["waypoint"],
+    )

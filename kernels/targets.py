@@ -45,9 +45,7 @@ def _locate_robots(
     sources[item, 0] = -1
     if active[e] != 0 and collided[e, i] == 0:
         here = nav_cell(grids, m, point_xy(center[e, i]))
-        sources[item, 0] = nearest_passable(
-            passable, row_of_item[item], here, grids.width[m], grids.height[m]
-        )
+        sources[item, 0] = nearest_passable(passable, row_of_item[item], here, grids.width[m], grids.height[m])
 
 
 @wp.kernel
@@ -103,9 +101,7 @@ def _first_cells(
         if distance[item, here] >= UNREACHED:
             here = -1
     while here >= 0 and distance[item, wp.max(here, 0)] > reach:
-        here = step_back(
-            passable, row_of_item[item], distance, item, here, grids.width[m], grids.height[m]
-        )
+        here = step_back(passable, row_of_item[item], distance, item, here, grids.width[m], grids.height[m])
     cell[e, i, k] = here
 
 

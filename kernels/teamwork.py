@@ -122,9 +122,16 @@ def choose_in_turn(
     taken = torch.empty(gain.shape[:2], dtype=torch.int64, device=gain.device)
     waiting, best = torch.empty_like(taken, dtype=torch.bool), torch.empty_like(taken, dtype=torch.float32)
     launch_on(gain.device)(
-        _choose_in_turn, len(gain), [view(gain), view(value), view(point, wp.vec2), view(hears),
-         *(view(one) for one in (left, waiting, best, taken, score, claimed))],
-    )  # fmt: skip
+        _choose_in_turn,
+        len(gain),
+        [
+            view(gain),
+            view(value),
+            view(point, wp.vec2),
+            view(hears),
+            *(view(one) for one in (left, waiting, best, taken, score, claimed)),
+        ],
+    )
     return score, taken, claimed
 
 
@@ -173,8 +180,12 @@ def _compare_with_others(
 
 
 def compare_with_others(
-    point: torch.Tensor, best: torch.Tensor, ways: torch.Tensor, hears: torch.Tensor,
-    plans: tuple[torch.Tensor, torch.Tensor], last: tuple[torch.Tensor, torch.Tensor],
+    point: torch.Tensor,
+    best: torch.Tensor,
+    ways: torch.Tensor,
+    hears: torch.Tensor,
+    plans: tuple[torch.Tensor, torch.Tensor],
+    last: tuple[torch.Tensor, torch.Tensor],
 ) -> list[torch.Tensor]:
     """Each robot's candidates against the ways, plans and last targets of the robots that it hears.
 
@@ -188,18 +199,25 @@ def compare_with_others(
     Returns:
         Four times float32 [E, N, M], infinite where there is nothing to compare with: the least way of another; the
         distance [m] to the nearest plan of another, to the own last target, to the nearest last target of another.
-    """  # fmt: skip
+    """
     found = [torch.empty(best.shape, device=point.device) for _ in range(4)]
 
     def points(values: torch.Tensor) -> wp.array:
         return wp.from_torch(values.contiguous(), dtype=wp.vec2)
 
     launch_on(point.device)(
-        _compare_with_others, tuple(best.shape[:2]),
-        [points(point), *(wp.from_torch(one.contiguous()) for one in (best, ways, hears)),
-         points(plans[0]), wp.from_torch(plans[1].contiguous()), points(last[0]), wp.from_torch(last[1].contiguous()),
-         *map(wp.from_torch, found)],
-    )  # fmt: skip
+        _compare_with_others,
+        tuple(best.shape[:2]),
+        [
+            points(point),
+            *(wp.from_torch(one.contiguous()) for one in (best, ways, hears)),
+            points(plans[0]),
+            wp.from_torch(plans[1].contiguous()),
+            points(last[0]),
+            wp.from_torch(last[1].contiguous()),
+            *map(wp.from_torch, found),
+        ],
+    )
     return found
 
 
@@ -235,8 +253,15 @@ def gather_gain(
     """
     parts = [torch.empty((*gain.shape, gain.shape[-1]), device=gain.device) for _ in range(2)]
     launch_on(gain.device)(
-        _gather_gain, tuple(gain.shape),
-        [wp.from_torch(point.contiguous(), dtype=wp.vec2), wp.from_torch(gain.contiguous()), reach, near, around,
-         *map(wp.from_torch, parts)],
-    )  # fmt: skip
+        _gather_gain,
+        tuple(gain.shape),
+        [
+            wp.from_torch(point.contiguous(), dtype=wp.vec2),
+            wp.from_torch(gain.contiguous()),
+            reach,
+            near,
+            around,
+            *map(wp.from_torch, parts),
+        ],
+    )
     return parts[0].sum(-1), parts[1].sum(-1)

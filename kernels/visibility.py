@@ -131,9 +131,25 @@ def add_body(
     if dist > 1.0001 * radius + half or (planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half)):
         return start
     return add_outline(
-        pose, forward, length, width, robots.center_offset[e, other], maps.resolution[m], maps.outline_radius_max[m],
-        origin, radius, cos_beam, spread, planar, e, i, start, bins, direction, limit,
-    )  # fmt: skip
+        pose,
+        forward,
+        length,
+        width,
+        robots.center_offset[e, other],
+        maps.resolution[m],
+        maps.outline_radius_max[m],
+        origin,
+        radius,
+        cos_beam,
+        spread,
+        planar,
+        e,
+        i,
+        start,
+        bins,
+        direction,
+        limit,
+    )
 
 
 @wp.kernel
@@ -194,9 +210,23 @@ def _collect_occluders(
             run = run_length(maps.occluder_cell, base, span, WORTH_AN_OCCLUDER, cull)
             for col in range(span[0], span[1] + 1, run):
                 count = add_cells(
-                    maps, m, row, col, run, origin, radius, cos_beam, spread, cull,
-                    e, i, count, bins, direction, limit,
-                )  # fmt: skip
+                    maps,
+                    m,
+                    row,
+                    col,
+                    run,
+                    origin,
+                    radius,
+                    cos_beam,
+                    spread,
+                    cull,
+                    e,
+                    i,
+                    count,
+                    bins,
+                    direction,
+                    limit,
+                )
     walls = int(count)
     for k in range(near_count[e, i]):
         other = near[e, i, k]
@@ -205,9 +235,25 @@ def _collect_occluders(
             if count == walls:
                 keep_walls(bins, e, i)
             count = add_body(
-                maps, m, robots, other, pose[e, other], facing[e, other], there, origin,
-                radius, cos_beam, spread, planar, e, i, count, bins, direction, limit,
-            )  # fmt: skip
+                maps,
+                m,
+                robots,
+                other,
+                pose[e, other],
+                facing[e, other],
+                there,
+                origin,
+                radius,
+                cos_beam,
+                spread,
+                planar,
+                e,
+                i,
+                count,
+                bins,
+                direction,
+                limit,
+            )
     if count > direction.shape[2]:
         wp.atomic_or(error, e, ERROR_CAPACITY)
         count = direction.shape[2]

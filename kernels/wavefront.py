@@ -227,9 +227,15 @@ class PathSearch:
     def values(self) -> dict:
         """The arrays of maps, masks and paths, by the names of the kernels' parameters."""
         masks, known = self.passable, self.passable.known
-        return vars(self) | vars(self.search) | {
-            "grids": known.grids, "map_id": known.map_id, "passable": masks.passable,
-        }  # fmt: skip
+        return (
+            vars(self)
+            | vars(self.search)
+            | {
+                "grids": known.grids,
+                "map_id": known.map_id,
+                "passable": masks.passable,
+            }
+        )
 
     def find(self, launch: Launch, active, collided, center, goal, waypoint) -> None:
         """New paths for the robots that need one."""
@@ -241,9 +247,7 @@ class PathSearch:
     def flood(self, launch: Launch) -> None:
         """Distances from `search.sources`, as far as `search.stop`."""
         masks, grids = self.passable, self.passable.known.grids
-        self.search.search(
-            launch, masks.passable, self.row_of_item, masks.grid_of_row, grids.width, grids.height
-        )
+        self.search.search(launch, masks.passable, self.row_of_item, masks.grid_of_row, grids.width, grids.height)
 
     def trace(self, launch: Launch, goal) -> None:
         """Paths to the cells of `search.stop`; where that is -1, to the reached cell nearest to `goal`."""
@@ -255,9 +259,7 @@ class PathSearch:
         launch_named(launch, _pick_waypoint, self.shape, self.values() | given | {"waypoint": waypoint})
 
 
-def distinct_masks(
-    radius: np.ndarray, comfort: np.ndarray, each: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def distinct_masks(radius: np.ndarray, comfort: np.ndarray, each: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The distances of robots that differ (of `each` robot if asked), [E, K] twice, and the mask of each robot."""
     robots = radius.shape[1]
     if each:
@@ -282,9 +284,14 @@ class Wavefront:
         robots = threshold.shape[1]
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.known = KnownGrids(
-            sim.maps, sim.nav_grids, shard.view.map_id, shard.known("free"), shard.known("boundary"),
-            robots if limited else 1, sim.nav_cells,
-        )  # fmt: skip
+            sim.maps,
+            sim.nav_grids,
+            shard.view.map_id,
+            shard.known("free"),
+            shard.known("boundary"),
+            robots if limited else 1,
+            sim.nav_cells,
+        )
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)
         self.narrowed = robots_struct(sim.robot_tensors, shard.first, shard.last)

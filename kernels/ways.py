@@ -36,10 +36,19 @@ def nearest_passable(passable: wp.array2d(dtype=wp.uint8), row: int, cell: int, 
 
 @wp.func
 def nearer(
-    x: int, y: int, dx: int, dy: int, found: wp.vec2i, passable: wp.array2d(dtype=wp.uint8), row: int,
-    distance: wp.array2d(dtype=wp.int32), item: int, w: int, h: int,
+    x: int,
+    y: int,
+    dx: int,
+    dy: int,
+    found: wp.vec2i,
+    passable: wp.array2d(dtype=wp.uint8),
+    row: int,
+    distance: wp.array2d(dtype=wp.int32),
+    item: int,
+    w: int,
+    h: int,
 ) -> wp.vec2i:
-    """`found` (a squared gap, a cell), or the cell at (x + dx, y + dy) if it is nearer and counts."""  # fmt: skip
+    """`found` (a squared gap, a cell), or the cell at (x + dx, y + dy) if it is nearer and counts."""
     result = found
     u = x + dx
     v = y + dy
@@ -59,13 +68,18 @@ def nearer(
 
 @wp.func
 def nearest_cell(
-    cell: int, passable: wp.array2d(dtype=wp.uint8), row: int, distance: wp.array2d(dtype=wp.int32), item: int,
-    w: int, h: int,
+    cell: int,
+    passable: wp.array2d(dtype=wp.uint8),
+    row: int,
+    distance: wp.array2d(dtype=wp.int32),
+    item: int,
+    w: int,
+    h: int,
 ) -> int:
     """The reached cell of `item` (the passable cell of `row`, if `item` is -1) nearest to a cell; -1 where none is.
 
     Of several as near the one with the lowest number.
-    """  # fmt: skip
+    """
     x = cell % w
     y = cell / w
     found = wp.vec2i(1 << 30, -1)
@@ -137,8 +151,6 @@ def step_back(
             weight = wp.where(k < 4, STRAIGHT, DIAGONAL) * factor
             if distance[item, v * w + u] == d - weight:
                 # A diagonal step cuts no corner: both cells beside it are reached (they touch reached cells).
-                if k < 4 or (
-                    distance[item, y * w + u] < UNREACHED and distance[item, v * w + x] < UNREACHED
-                ):
+                if k < 4 or (distance[item, y * w + u] < UNREACHED and distance[item, v * w + x] < UNREACHED):
                     found = v * w + u
     return found

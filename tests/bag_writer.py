@@ -29,9 +29,12 @@ def grid(values: np.ndarray, cell: float, corner=(0.0, 0.0), yaw: float = 0.0, t
     point = kind("geometry_msgs/msg/Point")(x=corner[0], y=corner[1], z=0.0)
     origin = kind("geometry_msgs/msg/Pose")(position=point, orientation=turn(yaw))
     info = kind("nav_msgs/msg/MapMetaData")(
-        map_load_time=header("", time).stamp, resolution=cell, width=values.shape[1], height=values.shape[0],
+        map_load_time=header("", time).stamp,
+        resolution=cell,
+        width=values.shape[1],
+        height=values.shape[0],
         origin=origin,
-    )  # fmt: skip
+    )
     return kind(GRID)(header=header("map", time), info=info, data=values.astype(np.int8).ravel())
 
 
@@ -43,22 +46,32 @@ def cloud(points: np.ndarray, frame: str, time: float, real: str = "<f4"):
     table = np.column_stack([np.ones(len(points)), points]).astype(real)
     data = np.frombuffer(table.tobytes(), dtype=np.uint8)
     return kind(CLOUD)(
-        header=header(frame, time), height=1, width=len(points), fields=fields, is_bigendian=real[0] == ">",
-        point_step=4 * size, row_step=4 * size * len(points), data=data, is_dense=False,
-    )  # fmt: skip
+        header=header(frame, time),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=real[0] == ">",
+        point_step=4 * size,
+        row_step=4 * size * len(points),
+        data=data,
+        is_dense=False,
+    )
 
 
 def transforms(entries: list[tuple[str, str, float, tuple[float, float, float], float]]):
     """A TFMessage of (parent, child, time [s], shift [m], yaw [rad])."""
     vector, transform = kind("geometry_msgs/msg/Vector3"), kind("geometry_msgs/msg/Transform")
     stamped = kind("geometry_msgs/msg/TransformStamped")
-    return kind(TF)(transforms=[
-        stamped(
-            header=header(parent, time), child_frame_id=child,
-            transform=transform(translation=vector(x=shift[0], y=shift[1], z=shift[2]), rotation=turn(yaw)),
-        )
-        for parent, child, time, shift, yaw in entries
-    ])  # fmt: skip
+    return kind(TF)(
+        transforms=[
+            stamped(
+                header=header(parent, time),
+                child_frame_id=child,
+                transform=transform(translation=vector(x=shift[0], y=shift[1], z=shift[2]), rotation=turn(yaw)),
+            )
+            for parent, child, time, shift, yaw in entries
+        ]
+    )
 
 
 def write_bag(path: Path, messages: list[tuple[str, float, object]], storage: str = "mcap") -> Path:

@@ -11,9 +11,16 @@ from pathlib import Path
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-angle=swiftshader", "--no-first-run",
-    "--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--window-size=1100,700", "--disable-dev-shm-usage",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu-sandbox",
+    "--use-angle=swiftshader",
+    "--no-first-run",
+    "--enable-unsafe-swiftshader",
+    "--remote-debugging-port=0",
+    "--window-size=1100,700",
+    "--disable-dev-shm-usage",
+)
 
 
 def find_browser() -> str | None:

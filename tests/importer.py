@@ -77,9 +77,13 @@ def try_import(path: str, options: dict) -> dict:
     clouds = (world.free, world.obstacles, world.boundary, world.free_spacing)
     verdict = check_map(world)
     return {
-        "kind": "map", "ok": verdict.ok, "finite": all(bool(np.isfinite(c).all()) for c in clouds),
-        "free": len(world.free), "area": world.free_area, "name": world.name,
-    }  # fmt: skip
+        "kind": "map",
+        "ok": verdict.ok,
+        "finite": all(bool(np.isfinite(c).all()) for c in clouds),
+        "free": len(world.free),
+        "area": world.free_area,
+        "name": world.name,
+    }
 
 
 def memory(field: str) -> float:

@@ -89,10 +89,22 @@ class Watch:
         state = {name: tensor.cpu().numpy() for name, tensor in env.simulation.tensors.items()}
         for e in range(env.num_envs):
             life = self.lives[e]
-            now = {name: state[name][e].copy() for name in (
-                "pose", "slip", "center", "collided", "crashed", "path_length", "local_step", "covered", "terms",
-                "discovered", "overlap",
-            )}  # fmt: skip
+            now = {
+                name: state[name][e].copy()
+                for name in (
+                    "pose",
+                    "slip",
+                    "center",
+                    "collided",
+                    "crashed",
+                    "path_length",
+                    "local_step",
+                    "covered",
+                    "terms",
+                    "discovered",
+                    "overlap",
+                )
+            }
             if life is None or life.number != state["episode"][e]:
                 self._begin(e, now, state)
             elif life.over or life.finished or self.resetting:
@@ -231,10 +243,16 @@ class Watch:
             over = life.coverage >= np.float32(env.success_coverage) > reached
             lapse = rest * (after - before + over * (1.0 - after + cfg.unfinished))
         won = reached < np.float32(env.success_coverage) <= life.coverage
-        life.terms += np.stack([
-            w * cfg.explore * found, -w * cfg.overlap * overlap * (1 + left), np.full(len(found), v * cfg.time * lapse),
-            np.full(len(found), v * cfg.success * won), -v * cfg.collision * (now["crashed"] != 0),
-        ], axis=1)  # fmt: skip
+        life.terms += np.stack(
+            [
+                w * cfg.explore * found,
+                -w * cfg.overlap * overlap * (1 + left),
+                np.full(len(found), v * cfg.time * lapse),
+                np.full(len(found), v * cfg.success * won),
+                -v * cfg.collision * (now["crashed"] != 0),
+            ],
+            axis=1,
+        )
         self.successes += int(won)
         for k, mark in enumerate((0.85, 0.95, 0.99)):
             if life.milestone[k][0] < 0 and life.coverage >= np.float32(mark):

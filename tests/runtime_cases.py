@@ -29,9 +29,14 @@ class Moment:
 def moments(kind: str, policy: str = "cost_utility", num_robots: int = 3, steps: int = 4, robot=None):
     """Moments of an episode, one for each decision."""
     env = ExplorationEnv(
-        maps=[MAPS[kind]()], num_envs=1, num_robots=num_robots, seed=5, planner=PlannerConfig(name="wavefront"),
-        robot=robot, num_threads=1,
-    )  # fmt: skip
+        maps=[MAPS[kind]()],
+        num_envs=1,
+        num_robots=num_robots,
+        seed=5,
+        planner=PlannerConfig(name="wavefront"),
+        robot=robot,
+        num_threads=1,
+    )
     play, nav = POLICIES[policy](env), Navigation(env)
     td = env.reset()
     for _ in range(steps):

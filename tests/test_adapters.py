@@ -125,9 +125,10 @@ def interfaces():
 
 
 def test_agents_choose_targets(world, interfaces):
-    env, twin = parallel_env(world, 3, action="targets", **SMALL), ExplorationEnv(
-        world, 1, 3, observation=ObservationConfig(targets=24, pictures=False), **SMALL
-    )  # fmt: skip
+    env, twin = (
+        parallel_env(world, 3, action="targets", **SMALL),
+        ExplorationEnv(world, 1, 3, observation=ObservationConfig(targets=24, pictures=False), **SMALL),
+    )
     twin._set_seed(5)
     seen, infos = env.reset(seed=5)
     expected = twin.reset()
@@ -149,10 +150,17 @@ def test_agents_choose_targets(world, interfaces):
 def test_the_env_says_what_agents_take(world, interfaces):
     """Where nothing is said of the action it is the env's own."""
     direct = PlannerConfig(name="direct")
-    spaces = [parallel_env(world, 2, **SMALL, **one).action_space("robot_0") for one in (
-        {}, {"observation": SHOWN}, {"planner": direct}, {"action": "targets", "observation": ObservationConfig()},
-        {"action": "targets", "observation": SHOWN}, {"action": "goal", "observation": SHOWN},
-    )]  # fmt: skip
+    spaces = [
+        parallel_env(world, 2, **SMALL, **one).action_space("robot_0")
+        for one in (
+            {},
+            {"observation": SHOWN},
+            {"planner": direct},
+            {"action": "targets", "observation": ObservationConfig()},
+            {"action": "targets", "observation": SHOWN},
+            {"action": "goal", "observation": SHOWN},
+        )
+    ]
     assert [getattr(one, "n", one.shape) for one in spaces] == [None, 8, (2,), 24, 8, (2,)]
     kept = parallel_env(world, 2, action="targets", observation=ObservationConfig(targets=4), **SMALL)
     assert kept.reset()[0]["robot_1"]["map"].any() and kept.state().shape == (3, 125, 125)

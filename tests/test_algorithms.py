@@ -172,9 +172,7 @@ def test_numbers_that_are_none_stop_the_update_by_name(name):
 
 def test_the_table_names_the_six():
     kinds = {name: row.critic for name, row in ALGORITHMS.items()}
-    assert kinds == dict(
-        ippo="local", mappo="team", itrpo="local", matrpo="team", vdppo="mixed", vda2c="mixed"
-    )
+    assert kinds == dict(ippo="local", mappo="team", itrpo="local", matrpo="team", vdppo="mixed", vda2c="mixed")
     assert ALGORITHMS["itrpo"].reference.max_kl == 0.06 and ALGORITHMS["ippo"].reference.kl_coeff == 0.2
 
 

@@ -12,9 +12,18 @@ from maexp.agents.evaluation.baseline import ALIKE, Baseline, describe_changes, 
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.results import FORMAT
 
-TINY = ["evaluate", "policy=random,nearest_frontier", "scenario.held_out=[70,71]", "scenario.macro_steps=2",
-        "scenario.local_steps=5", "num_robots=2", "num_envs=6", "episodes=6",
-        "device=cpu", "num_threads=1"]  # fmt: skip
+TINY = [
+    "evaluate",
+    "policy=random,nearest_frontier",
+    "scenario.held_out=[70,71]",
+    "scenario.macro_steps=2",
+    "scenario.local_steps=5",
+    "num_robots=2",
+    "num_envs=6",
+    "episodes=6",
+    "device=cpu",
+    "num_threads=1",
+]
 RUN = {"format": FORMAT, "scenario": "maze_small", "maps": ["a", "b"], "seed": 0, "episodes": 2, "steps": [300]}
 MAPS = np.repeat(["a", "b"], 5)
 ONE = np.linspace(0.1, 0.8, 10)
@@ -23,9 +32,11 @@ ONE = np.linspace(0.1, 0.8, 10)
 def result(coverage: list, size: int = 3, place: str = "", policy: str = "voronoi") -> EvaluationResult:
     count = len(coverage)
     episodes = {
-        "coverage_auc": np.array(coverage), "coverage_step_95": np.array([7.0] + [np.nan] * (count - 1)),
-        "coverage_step_95_censored": np.arange(count, dtype=float), "collisions": np.zeros(count),
-    }  # fmt: skip
+        "coverage_auc": np.array(coverage),
+        "coverage_step_95": np.array([7.0] + [np.nan] * (count - 1)),
+        "coverage_step_95_censored": np.arange(count, dtype=float),
+        "collisions": np.zeros(count),
+    }
     return EvaluationResult(policy, size, episodes, 1.0, np.full(count, place) if place else MAPS, place=place)
 
 
@@ -48,9 +59,12 @@ def test_episodes_come_back_as_they_were(saved):
 def test_changes_are_paired_and_maps_have_their_own(saved):
     """Episodes differ far more than the two runs do, and the change is certain all the same."""
     now = [
-        result(ONE + 0.1), result(ONE[:5] + 0.1, place="a"), result(ONE[5:] + 0.1, place="b"),
-        result([0.9] * 10, policy="hungarian"), result(ONE - 0.1, size=2),
-    ]  # fmt: skip
+        result(ONE + 0.1),
+        result(ONE[:5] + 0.1, place="a"),
+        result(ONE[5:] + 0.1, place="b"),
+        result([0.9] * 10, policy="hungarian"),
+        result(ONE - 0.1, size=2),
+    ]
     found = load_baseline(str(saved)).changes(now)
     assert list(found) == ["voronoi N=3", "voronoi on a N=3", "voronoi on b N=3", "voronoi N=2"]
     for name in list(found)[:3]:

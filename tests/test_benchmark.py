@@ -56,9 +56,17 @@ def test_the_papers_preset_has_its_288_runs():
 
 def test_every_setting_reaches_every_cell():
     cfg = settings(
-        "scenario=maze,indoor_small", "algorithm=mappo", "policies=[]", "seed=3", "planner=dwa", "radar.range=7",
-        "train_maps=2", "test_maps=1", "robot.team=[{kind: differential, radar: {range: 3}}]", "algorithm.lr=0.5",
-    )  # fmt: skip
+        "scenario=maze,indoor_small",
+        "algorithm=mappo",
+        "policies=[]",
+        "seed=3",
+        "planner=dwa",
+        "radar.range=7",
+        "train_maps=2",
+        "test_maps=1",
+        "robot.team=[{kind: differential, radar: {range: 3}}]",
+        "algorithm.lr=0.5",
+    )
     assert [one.name for one in list_cells(cfg)] == ["maze/mappo/seed_3", "indoor_small/mappo/seed_3"]
     run, _ = cell_config(cfg, list_cells(cfg)[1])
     assert (run.planner.name, run.radar.range, run.algorithm.lr, run.seed) == ("dwa", 7.0, 0.5, 3)
@@ -82,8 +90,16 @@ def test_benchmark_json_holds_no_null_and_yet_all_that_must_stay(tmp_path):
 
 
 def test_files_and_summaries(whole_run):
-    for name in ("table.csv", "table.md", "table.tex", "config.yaml", "coverage_maze_small.png", "overview.png",
-                 "improvement.png", "improvement.csv"):  # fmt: skip
+    for name in (
+        "table.csv",
+        "table.md",
+        "table.tex",
+        "config.yaml",
+        "coverage_maze_small.png",
+        "overview.png",
+        "improvement.png",
+        "improvement.csv",
+    ):
         assert (whole_run / name).stat().st_size > 200, name
     summary = json.loads((whole_run / "summary.json").read_text())
     flat = json.loads((whole_run / "summaries" / "maze_small.json").read_text())

@@ -16,11 +16,25 @@ from maexp.agents.training.checkpoint import find_checkpoint
 pytestmark = pytest.mark.slow  # trainings
 
 WORDS = [
-    "preset=smoke", "scenarios=maze_small,random_obstacles", "policies=cost_utility",
-    "algorithms=mappo", "seeds=0", "episodes=2", "num_envs=4", "num_robots=2", "scenario.local_steps=3",
-    "scenario.macro_steps=2", "total_frames=16", "estimate=false", "device=cpu", "observation.targets=4",
-    "together=true", "workers=1", "iterations=null", "train_maps=null",
-]  # fmt: skip
+    "preset=smoke",
+    "scenarios=maze_small,random_obstacles",
+    "policies=cost_utility",
+    "algorithms=mappo",
+    "seeds=0",
+    "episodes=2",
+    "num_envs=4",
+    "num_robots=2",
+    "scenario.local_steps=3",
+    "scenario.macro_steps=2",
+    "total_frames=16",
+    "estimate=false",
+    "device=cpu",
+    "observation.targets=4",
+    "together=true",
+    "workers=1",
+    "iterations=null",
+    "train_maps=null",
+]
 
 
 def settings(*words: str):

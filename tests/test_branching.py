@@ -17,9 +17,14 @@ from maexp.envs import ExplorationEnv, ObservationConfig, make_map
 
 def make_env() -> ExplorationEnv:
     return ExplorationEnv(
-        [make_map("maze_small", 1), room(45, 36, "rotated")], num_envs=3, num_robots=2, seed=2, local_steps=8,
-        macro_steps=6, observation=ObservationConfig(pictures=False, targets=8),
-    )  # fmt: skip
+        [make_map("maze_small", 1), room(45, 36, "rotated")],
+        num_envs=3,
+        num_robots=2,
+        seed=2,
+        local_steps=8,
+        macro_steps=6,
+        observation=ObservationConfig(pictures=False, targets=8),
+    )
 
 
 def play(env: ExplorationEnv, td, preference: torch.Tensor, index: torch.Tensor):
@@ -95,10 +100,15 @@ def test_the_files_and_that_those_there_are_kept(tmp_path, monkeypatch, capsys):
     assert len({*map(tuple, one["features"][:, 0, 0].tolist())}) > 1
 
 
-@pytest.mark.parametrize("word, told", [
-    ("horizon=0", "branching.horizon=0 must be"), ("scenarios=[pointcloud]", "has no training maps"),
-    ("teems=3", "teems"), ("scenarios=[cellar]", "cellar"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "word, told",
+    [
+        ("horizon=0", "branching.horizon=0 must be"),
+        ("scenarios=[pointcloud]", "has no training maps"),
+        ("teems=3", "teems"),
+        ("scenarios=[cellar]", "cellar"),
+    ],
+)
 def test_bad_settings_are_named(word, told, capsys):
     assert main([word]) == 2
     error = capsys.readouterr().err

@@ -16,9 +16,13 @@ from maexp.agents.policies import POLICIES
 from maexp.envs import make_map
 
 TINY = [
-    "action=regions", "scenario.maps=[0]", "scenario.held_out=[70]", "num_envs=2", "collector.steps=2",
+    "action=regions",
+    "scenario.maps=[0]",
+    "scenario.held_out=[70]",
+    "num_envs=2",
+    "collector.steps=2",
     "scenario.macro_steps=2",
-]  # fmt: skip
+]
 
 
 @pytest.fixture(autouse=True)
@@ -64,12 +68,20 @@ def test_help_waits_for_no_heavy_library(verb):
     assert done.stdout.splitlines()[-1] == "[]" and verb in done.stdout
 
 
-@pytest.mark.parametrize("words", [
-    ["train", "scenario=labyrinth"], ["train", "-m", "algorithm=ippo,mapo"], ["train", "num_robots=0"],
-    ["train", "robot.radius=0.3", "robot.length=1"], ["evaluate", "policy=clever"], ["benchmark", "scenario=labyrinth"],
-    ["evaluate", "checkpoint=gone", "polcy=random"], ["maps", "import", "x.png", "impoting.up=y"],
-    ["ros2", "serve", "minivall"],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "scenario=labyrinth"],
+        ["train", "-m", "algorithm=ippo,mapo"],
+        ["train", "num_robots=0"],
+        ["train", "robot.radius=0.3", "robot.length=1"],
+        ["evaluate", "policy=clever"],
+        ["benchmark", "scenario=labyrinth"],
+        ["evaluate", "checkpoint=gone", "polcy=random"],
+        ["maps", "import", "x.png", "impoting.up=y"],
+        ["ros2", "serve", "minivall"],
+    ],
+)
 def test_a_wrong_word_waits_for_no_heavy_library(words):
     program = (
         f"import sys; from maexp.agents.cli import main; print(main({words!r})); "

@@ -33,9 +33,15 @@ ROBOTS, STEPS = 2, 5
 def play(first: int, count: int) -> list[torch.Tensor]:
     """What teams `first` to `first + count` - 1 of 8 see and earn, over resets, all taking planned actions."""
     env = ExplorationEnv(
-        [make_map("maze_small", 0), make_map("maze_small", 1)], num_envs=count, num_robots=ROBOTS, seed=3,
-        local_steps=4, macro_steps=2, num_threads=1, first_env=first,
-    )  # fmt: skip
+        [make_map("maze_small", 0), make_map("maze_small", 1)],
+        num_envs=count,
+        num_robots=ROBOTS,
+        seed=3,
+        local_steps=4,
+        macro_steps=2,
+        num_threads=1,
+        first_env=first,
+    )
     plan = torch.Generator().manual_seed(1)
     regions = torch.randint(64, (STEPS, 8, ROBOTS), generator=plan)[:, first : first + count]
     td, seen = env.reset(), []
@@ -119,10 +125,19 @@ def grid(*sizes: int) -> list[tuple]:
 # Worker processes
 
 TINY = [
-    "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
-    "scenario.local_steps=5", "num_envs=4", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
-    "device=cpu", "evaluate_every=0",
-]  # fmt: skip
+    "action=regions",
+    "scenario.maps=[0,1]",
+    "scenario.held_out=[70]",
+    "scenario.macro_steps=3",
+    "scenario.local_steps=5",
+    "num_envs=4",
+    "num_robots=2",
+    "collector.steps=2",
+    "checkpoint_every=2",
+    "episodes=0",
+    "device=cpu",
+    "evaluate_every=0",
+]
 BATCH = 8
 
 

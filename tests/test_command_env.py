@@ -14,9 +14,15 @@ from maexp.agents.training.named import find_player
 from maexp.envs import ExplorationEnv, RewardConfig, make_map
 
 WORDS = [
-    "scenario=maze_small", "num_envs=3", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0,3]", "seed=4",
-    "device=cpu", "radar.range=8",
-]  # fmt: skip
+    "scenario=maze_small",
+    "num_envs=3",
+    "num_robots=2",
+    "scenario.local_steps=5",
+    "scenario.maps=[0,3]",
+    "seed=4",
+    "device=cpu",
+    "radar.range=8",
+]
 
 
 def same(first, second) -> None:
@@ -25,8 +31,9 @@ def same(first, second) -> None:
     assert [one.name for one in first.maps] == [one.name for one in second.maps]
     for env in (first, second):
         env.simulation.tensors["episode"].fill_(-1)  # a collector has begun an episode already
-    batches = [env.rollout(4, find_player("nearest_frontier").make(env), break_when_any_done=False)
-               for env in (first, second)]  # fmt: skip
+    batches = [
+        env.rollout(4, find_player("nearest_frontier").make(env), break_when_any_done=False) for env in (first, second)
+    ]
     keys = [{*batch.keys(True, True)} for batch in batches]
     assert keys[0] == keys[1] and len(keys[0]) > 20
     assert all(torch.equal(batches[0][key], batches[1][key]) for key in keys[0])

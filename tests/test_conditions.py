@@ -10,8 +10,14 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import resolve
 from maexp.envs import make_map
 
-WORDS = ["scenarios=[maze_small]", "teams=[2]", "policies=[cost_utility]", "episodes=2", "num_envs=2",
-         "conditions=[base_return]"]  # fmt: skip
+WORDS = [
+    "scenarios=[maze_small]",
+    "teams=[2]",
+    "policies=[cost_utility]",
+    "episodes=2",
+    "num_envs=2",
+    "conditions=[base_return]",
+]
 
 
 @pytest.mark.parametrize("words", conditions.CONDITIONS.values(), ids=list(conditions.CONDITIONS))

@@ -93,14 +93,22 @@ def test_it_chooses_as_its_class_does_inside(monkeypatch):
     assert float(states[0]["info", "coverage"].mean()) > 0.4
 
 
-@pytest.mark.parametrize(("kind", "reason"), {
-    "Raises": "it gave up: KeyError in hostile.py, line", "Exits": "it closed the connection",
-    "Dies": "it closed the connection", "Sleeps": "it gave no answer in 3 s", "Spins": "it gave no answer in 3 s",
-    "WrongShape": "it returned numbers of shape [4, 2]: goals must be numbers [3, 2]",
-    "Infinite": "it returned a goal that is infinite", "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
-    "Noise": "it answered garbage (a message that is no", "Deaf": "it gave no answer in 3 s",
-    "BadReset": "it gave up: RuntimeError in hostile.py, line",
-}.items())  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "reason"),
+    {
+        "Raises": "it gave up: KeyError in hostile.py, line",
+        "Exits": "it closed the connection",
+        "Dies": "it closed the connection",
+        "Sleeps": "it gave no answer in 3 s",
+        "Spins": "it gave no answer in 3 s",
+        "WrongShape": "it returned numbers of shape [4, 2]: goals must be numbers [3, 2]",
+        "Infinite": "it returned a goal that is infinite",
+        "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
+        "Noise": "it answered garbage (a message that is no",
+        "Deaf": "it gave no answer in 3 s",
+        "BadReset": "it gave up: RuntimeError in hostile.py, line",
+    }.items(),
+)
 def test_a_fault_costs_its_episode_and_nothing_else(kind, reason):
     with listening(f"hostile:{kind}") as (word, _):
         final, reasons, bad, _ = play_hosted(word, 60.0, 3.0 if "no answer" in reason else 60.0)
@@ -168,12 +176,16 @@ def silent(link):
     threading.Event().wait(5.0)
 
 
-@pytest.mark.parametrize(("reply", "told"), [
-    (silent, "it gave no answer in 1 s"), (lambda link: None, "it closed the connection"),
-    (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "garbage|unasked|without being asked"),
-    (lambda link: link.sendall(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
-    (lambda link: link.sendall(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("reply", "told"),
+    [
+        (silent, "it gave no answer in 1 s"),
+        (lambda link: None, "it closed the connection"),
+        (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "garbage|unasked|without being asked"),
+        (lambda link: link.sendall(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
+        (lambda link: link.sendall(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
+    ],
+)
 def test_who_is_no_policy_is_told_before_anything_is_played(reply, told, monkeypatch):
     monkeypatch.setattr(hosted, "START", 1.0 if reply is silent else 30.0)
     with answering(reply) as word, pytest.raises(UserError, match=told) as error:

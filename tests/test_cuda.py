@@ -20,9 +20,15 @@ DEVICES = [pytest.param("cuda", marks=[pytest.mark.cuda, gpu]), "cpu"]
 def play(device: str, planner: str, **settings) -> TensorDictBase:
     """Six macro steps of five teams of three, with fixed actions, on `device`."""
     env = ExplorationEnv(
-        [room(30, 22), room(26, 19, "rotated")], num_envs=5, num_robots=3, device=device, seed=3,
-        local_steps=5, planner=PlannerConfig(name=planner), **settings,
-    )  # fmt: skip
+        [room(30, 22), room(26, 19, "rotated")],
+        num_envs=5,
+        num_robots=3,
+        device=device,
+        seed=3,
+        local_steps=5,
+        planner=PlannerConfig(name=planner),
+        **settings,
+    )
     generator = torch.Generator().manual_seed(0)
     state, seen = env.reset(), []
     for _ in range(6):

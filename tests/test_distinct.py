@@ -24,9 +24,15 @@ def make_env(num_envs=4, num_robots=3, shown=24, **settings) -> ExplorationEnv:
     """Teams whose robots begin close to each other, so that they want the same."""
     settings = {"planner": PlannerConfig(name="wavefront"), "success_coverage": 0.999} | settings
     env = ExplorationEnv(
-        MAPS[0], num_envs=num_envs, num_robots=num_robots, num_threads=1, macro_steps=60, seed=3,
-        observation=ObservationConfig(pictures=False, targets=shown), **settings,
-    )  # fmt: skip
+        MAPS[0],
+        num_envs=num_envs,
+        num_robots=num_robots,
+        num_threads=1,
+        macro_steps=60,
+        seed=3,
+        observation=ObservationConfig(pictures=False, targets=shown),
+        **settings,
+    )
     free = torch.as_tensor(MAPS[0].free[:, :2])
     edge = torch.cdist(free, torch.as_tensor(MAPS[0].obstacles[:, :2])).amin(-1)
     room = free[edge > 1.5]

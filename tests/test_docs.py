@@ -31,10 +31,14 @@ SMALLER = {"num_envs=64": "num_envs=2", "rollout(10,": "rollout(2,"}
 """The README shows sizes that people use; here they would take too long."""
 PLANNERS = get_args(PlannerConfig.__dataclass_fields__["name"].type)
 SHIPPED = {
-    "reward terms": (len(REWARD_TERMS), 5), "parameters of robots": (len(fields(RobotConfig)), 10),
-    "kinds of robots": (len(ROBOT_KINDS), 3), "planners": (len(PLANNERS), 3), "features": (len(FEATURES), 32),
-    "channels": (PICTURE_CHANNELS, 4), "arrays of the state": (len(STATE), 49),
-}  # fmt: skip
+    "reward terms": (len(REWARD_TERMS), 5),
+    "parameters of robots": (len(fields(RobotConfig)), 10),
+    "kinds of robots": (len(ROBOT_KINDS), 3),
+    "planners": (len(PLANNERS), 3),
+    "features": (len(FEATURES), 32),
+    "channels": (PICTURE_CHANNELS, 4),
+    "arrays of the state": (len(STATE), 49),
+}
 """What the patches add to: how many there are, and how many they are written for."""
 
 
@@ -174,9 +178,12 @@ def test_extending_shows_every_patch():
 
 
 COUNTED = {
-    "a-scenario": "scenario", "a-parameter-of-robots": "robot_parameter", "a-robot-kind": "robot_kind",
-    "a-planner": "classical_planner", "a-reward-term": "reward_term",
-}  # fmt: skip
+    "a-scenario": "scenario",
+    "a-parameter-of-robots": "robot_parameter",
+    "a-robot-kind": "robot_kind",
+    "a-planner": "classical_planner",
+    "a-reward-term": "reward_term",
+}
 """Rows of the page's table, and the patch that shows how many files it takes."""
 
 

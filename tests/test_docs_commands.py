@@ -30,14 +30,31 @@ PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "dev
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger
     "train": (
-        *PLACES, "total_frames=8", "warm_start_frames=8", "collector.steps=2", "episodes=2", "model.channels=4",
+        *PLACES,
+        "total_frames=8",
+        "warm_start_frames=8",
+        "collector.steps=2",
+        "episodes=2",
+        "model.channels=4",
         "evaluate_episodes=2",
     ),
     "evaluate": (*PLACES, "episodes=2"),
     "benchmark": (
-        *PLACES, "scenarios=maze_small", "algorithms=mappo", "policies=random", "seeds=0", "iterations=null",
-        "total_frames=4", "collector.steps=2", "episodes=2", "model.channels=4", "train_maps=1",
-        "test_maps=1", "policy_per_map=null", "estimate=false", "workers=1",
+        *PLACES,
+        "scenarios=maze_small",
+        "algorithms=mappo",
+        "policies=random",
+        "seeds=0",
+        "iterations=null",
+        "total_frames=4",
+        "collector.steps=2",
+        "episodes=2",
+        "model.channels=4",
+        "train_maps=1",
+        "test_maps=1",
+        "policy_per_map=null",
+        "estimate=false",
+        "workers=1",
     ),
     "view": (*PLACES, "renderer=painter", "size=200"),
     "irsim": ("seconds=1", "beams=40", "num_robots=2", "people=1"),
@@ -57,9 +74,17 @@ ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
 """Words that need a cluster or another project's plugin; the rest of the command is run without them."""
 WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
 NOT_OURS = (
-    "pip ", "python3 -m venv", "sphinx-build ", "ray ", "cat ", "sbatch ", "python -m tests.", "MAEXP_",
-    "python -m maexp.agents.runtime", "python -m build",
-)  # fmt: skip
+    "pip ",
+    "python3 -m venv",
+    "sphinx-build ",
+    "ray ",
+    "cat ",
+    "sbatch ",
+    "python -m tests.",
+    "MAEXP_",
+    "python -m maexp.agents.runtime",
+    "python -m build",
+)
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""
 
 
@@ -214,8 +239,9 @@ FIRST = {tuple(small(line)) for line in COMMANDS if "README.md" in SHOWN[line]}
 """What a new reader tries: the other commands are slow tests, for there are many."""
 RUNS = [
     pytest.param(line, id=line, marks=[] if tuple(small(line)) in FIRST else [pytest.mark.slow])
-    for line in COMMANDS if line in DIFFERENT
-]  # fmt: skip
+    for line in COMMANDS
+    if line in DIFFERENT
+]
 
 
 @pytest.mark.parametrize("line", RUNS)

@@ -46,10 +46,11 @@ def odometry(frame: str, child: str, at=(0.0, 0.0, 0.0), speed=(0.0, 0.0), now: 
     )
     unsure = np.zeros(36)
     return STORE.types["nav_msgs/msg/Odometry"](
-        header=header(frame, now), child_frame_id=child,
+        header=header(frame, now),
+        child_frame_id=child,
         pose=kind("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=unsure),
         twist=kind("geometry_msgs/msg/TwistWithCovariance")(twist=twist, covariance=unsure),
-    )  # fmt: skip
+    )
 
 
 def goals(decision) -> dict:
@@ -184,9 +185,16 @@ def test_a_robot_that_is_lost_or_has_nothing_to_do_is_stopped_once():
 @pytest.mark.parametrize("policy", ["cost_utility", "universal"])
 def test_an_episode_of_the_arena_is_played_as_inside(policy):
     episode = {
-        "num_robots": 2, "radar_range": 3.0, "robot_radius": 0.2, "max_speed": 1.0, "max_accel": 1.0, "seconds": 40.0,
-        "decision_seconds": 2.0, "seed": 3, "robots": ["a", "b"],
-    }  # fmt: skip
+        "num_robots": 2,
+        "radar_range": 3.0,
+        "robot_radius": 0.2,
+        "max_speed": 1.0,
+        "max_accel": 1.0,
+        "seconds": 40.0,
+        "decision_seconds": 2.0,
+        "seed": 3,
+        "robots": ["a", "b"],
+    }
     driver, agent = TeamDriver(DriverSettings(robots=("a", "b"), policy=policy)), TeamAgent(policy)
     driver.begin(episode)
     agent.reset(episode)
@@ -202,11 +210,19 @@ def test_an_episode_of_the_arena_is_played_as_inside(policy):
         for k, name in enumerate("ab"):
             driver.take_odometry(name, odometry("odom", f"{name}/base_link", speed=(speed[k], 0.0)))
         orders = {order.name: order for order in driver.decide(now).orders}
-        wanted = agent.act({
-            "grid": np.stack([values] * 2), "resolution": 0.1, "origin": (0.0, 0.0), "poses": np.stack([poses] * 2),
-            "velocities": np.stack([np.stack([speed, np.zeros(2)], -1)] * 2), "heard": np.ones((2, 2), bool),
-            "alive": np.ones(2, bool), "time": 2.0 * step, "time_left": 1.0 - step / 20,
-        })  # fmt: skip
+        wanted = agent.act(
+            {
+                "grid": np.stack([values] * 2),
+                "resolution": 0.1,
+                "origin": (0.0, 0.0),
+                "poses": np.stack([poses] * 2),
+                "velocities": np.stack([np.stack([speed, np.zeros(2)], -1)] * 2),
+                "heard": np.ones((2, 2), bool),
+                "alive": np.ones(2, bool),
+                "time": 2.0 * step,
+                "time_left": 1.0 - step / 20,
+            }
+        )
         assert orders.keys() == {"a", "b"}, "each is answered for"
         for k, name in enumerate("ab"):
             stays = np.isnan(wanted[k, 0])

@@ -132,8 +132,15 @@ def test_truncation_apart_from_termination(maps):
 
 
 def test_success_terminates_once_and_the_rest_of_the_macro_step_is_frozen():
-    env = ExplorationEnv(open_room(15.0), num_envs=4, num_robots=2, radar=RadarConfig(range=7.0), local_steps=30,
-                         robot=RobotConfig(collision_threshold=0.2), macro_steps=40)  # fmt: skip
+    env = ExplorationEnv(
+        open_room(15.0),
+        num_envs=4,
+        num_robots=2,
+        radar=RadarConfig(range=7.0),
+        local_steps=30,
+        robot=RobotConfig(collision_threshold=0.2),
+        macro_steps=40,
+    )
     torch.manual_seed(0)
     td = env.reset()
     for _ in range(40):
@@ -152,9 +159,16 @@ def test_success_terminates_once_and_the_rest_of_the_macro_step_is_frozen():
 
 def test_an_episode_that_goes_on_to_99_percent_pays_for_it_there():
     """The marks come one after another; the reward of success comes with the end, not at 95 %."""
-    env = ExplorationEnv(open_room(15.0), num_envs=6, num_robots=2, radar=RadarConfig(range=7.0), local_steps=4,
-                         robot=RobotConfig(collision_threshold=0.2),
-                         macro_steps=200, success_coverage=0.99)  # fmt: skip
+    env = ExplorationEnv(
+        open_room(15.0),
+        num_envs=6,
+        num_robots=2,
+        radar=RadarConfig(range=7.0),
+        local_steps=4,
+        robot=RobotConfig(collision_threshold=0.2),
+        macro_steps=200,
+        success_coverage=0.99,
+    )
     torch.manual_seed(0)
     td, paid, passed = env.reset(), torch.zeros(6, 2), torch.zeros(6, dtype=torch.bool)
     for _ in range(200):
@@ -180,10 +194,18 @@ def test_mean_coverage_over_the_full_episode(every):
     """Some teams are done within a macro step, and points of a map have several weights; with and without a hook."""
     maps = [open_room(9.0), make_map("random_obstacles_adaptive", 0)]
     env, watched = (
-        ExplorationEnv(maps, num_envs=6, num_robots=2, radar=RadarConfig(range=5.0), local_steps=10,
-                       robot=RobotConfig(collision_threshold=0.2), macro_steps=12, seed=3)
+        ExplorationEnv(
+            maps,
+            num_envs=6,
+            num_robots=2,
+            radar=RadarConfig(range=5.0),
+            local_steps=10,
+            robot=RobotConfig(collision_threshold=0.2),
+            macro_steps=12,
+            seed=3,
+        )
         for _ in range(2)
-    )  # fmt: skip
+    )
     lines = [[] for _ in range(6)]
 
     def look(env) -> None:
@@ -216,8 +238,14 @@ def open_room(side: float) -> PointCloudMap:
 
 
 def test_collided_robots_stay_and_pay_once():
-    env = ExplorationEnv(open_room(20.0), num_envs=8, num_robots=2, planner=PlannerConfig(name="direct"),
-                         radar=RadarConfig(range=4.0), macro_steps=20)  # fmt: skip
+    env = ExplorationEnv(
+        open_room(20.0),
+        num_envs=8,
+        num_robots=2,
+        planner=PlannerConfig(name="direct"),
+        radar=RadarConfig(range=4.0),
+        macro_steps=20,
+    )
     td = env.reset()
     td["agents", "action", "control"] = torch.tensor([1.0, 0.0]).expand(8, 2, 2).clone()
     paid = torch.zeros(8, 2)
@@ -311,8 +339,9 @@ def test_no_room_for_the_team():
 
 
 def test_limited_communication(maps):
-    env = ExplorationEnv(maps[0], num_envs=2, num_robots=3, comm=CommConfig(range=1.0),
-                         observation=ObservationConfig(map="known"))  # fmt: skip
+    env = ExplorationEnv(
+        maps[0], num_envs=2, num_robots=3, comm=CommConfig(range=1.0), observation=ObservationConfig(map="known")
+    )
     full = ExplorationEnv(maps[0], num_envs=2, num_robots=3, observation=ObservationConfig(map="known"))
     a, b = env.rollout(3), full.rollout(3)
     eye = torch.eye(3, dtype=torch.bool)
@@ -329,8 +358,14 @@ def test_limited_communication(maps):
 
 @pytest.mark.parametrize("radius", [0.0, "auto"])
 def test_walls_block_what_must_be_in_sight(radius):
-    env = ExplorationEnv(make_map("maze", 0), num_envs=16, num_robots=3, comm=CommConfig(line_of_sight=True),
-                         radar=RadarConfig(obstacle_radius=radius), local_steps=1)  # fmt: skip
+    env = ExplorationEnv(
+        make_map("maze", 0),
+        num_envs=16,
+        num_robots=3,
+        comm=CommConfig(line_of_sight=True),
+        radar=RadarConfig(obstacle_radius=radius),
+        local_steps=1,
+    )
     comm = env.reset()["agents", "observation", "comm"]
     assert comm.diagonal(dim1=1, dim2=2).all() and torch.equal(comm, comm.transpose(1, 2))
     apart = comm.sum() - 16 * 3

@@ -18,8 +18,10 @@ def maps():
 def test_same_bits_for_any_number_of_envs_and_threads(maps):
     plan = actions(6, 3, 4)
     many = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=2, macro_steps=3), plan)
-    few = play(ExplorationEnv(maps, num_envs=2, seed=3, num_threads=1, macro_steps=3),
-               [{k: v[:2] for k, v in a.items()} for a in plan])  # fmt: skip
+    few = play(
+        ExplorationEnv(maps, num_envs=2, seed=3, num_threads=1, macro_steps=3),
+        [{k: v[:2] for k, v in a.items()} for a in plan],
+    )
     again = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=1, macro_steps=3), plan)
     other = play(ExplorationEnv(maps, num_envs=6, seed=4, num_threads=1, macro_steps=3), plan)
     for a, b, c in zip(many, few, again, strict=True):

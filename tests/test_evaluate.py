@@ -66,10 +66,18 @@ def test_recording_changes_nothing_and_ends_where_the_episodes_end(env):
 def test_pooled_curves_share_their_times():
     """A place with longer episodes and other moments: what is done keeps its coverage."""
     one, other = (
-        EvaluationResult("random", 1, {"exploration_ratio": np.ones(1)}, 1.0, np.array(["floor"]),
-                         times=np.array(times), coverage=np.array([coverage]), shares=np.ones((1, 1)))
+        EvaluationResult(
+            "random",
+            1,
+            {"exploration_ratio": np.ones(1)},
+            1.0,
+            np.array(["floor"]),
+            times=np.array(times),
+            coverage=np.array([coverage]),
+            shares=np.ones((1, 1)),
+        )
         for times, coverage in (([0.0, 2.0], [0.0, 0.5]), ([0.0, 1.0, 4.0], [0.1, 0.4, 1.0]))
-    )  # fmt: skip
+    )
     both = pool([one, other])
     assert both.times.tolist() == [0, 1, 2, 4] and both.seconds == 2 and both.shares.shape == (2, 1)
     np.testing.assert_allclose(both.coverage, [[0, 0.25, 0.5, 0.5], [0.1, 0.4, 0.6, 1.0]])
@@ -109,7 +117,7 @@ def test_the_longest_way_and_the_marks_of_an_episode():
     team, count = [2, 1], 2
     info = {name: torch.zeros(team) for name in ("coverage", "coverage_auc")} | {
         name: torch.zeros(count, 3) for name in ("episode_reward_unscaled", "episode_reward", "collided")
-    }  # fmt: skip
+    }
     for mark in (85, 95, 99):
         info |= {f"{name}_{mark}": torch.full(team, -1) for name in ("coverage_step", "mutual_overlap")}
     info |= {f"path_length_{mark}": torch.zeros(count, 3) for mark in (85, 95, 99)}
@@ -153,8 +161,17 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
     for index in (70, 71):
         make_map("maze_small", index).save(tmp_path / f"floor{index}.npz")
     monkeypatch.chdir(tmp_path)
-    words = ["evaluate", "policy=random,nearest_frontier", "scenario=pointcloud", "episodes=2", "num_envs=2",
-             "scenario.macro_steps=2", "scenario.local_steps=5", "num_robots=2", "device=cpu"]  # fmt: skip
+    words = [
+        "evaluate",
+        "policy=random,nearest_frontier",
+        "scenario=pointcloud",
+        "episodes=2",
+        "num_envs=2",
+        "scenario.macro_steps=2",
+        "scenario.local_steps=5",
+        "num_robots=2",
+        "device=cpu",
+    ]
     main([*words, "scenario.path=floor70.npz,floor71.npz", "hydra.run.dir=both"])
     told = capsys.readouterr().out
     assert re.search(r"pointcloud: 2 episodes on each of 2 maps *\n", told) and "held-out" not in told
@@ -170,10 +187,14 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
         assert together["n"] == 4 and together["mean"] == pytest.approx((first["mean"] + second["mean"]) / 2)
 
 
-@pytest.mark.parametrize(("words", "wanted"), [
-    (["episodes=3"], "3 held-out episodes"), (["episodes=1"], "1 held-out episode"),
-    (["episodes=3", "scenario.held_out=[0]"], "3 episodes"),  # a map that teams are trained on
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["episodes=3"], "3 held-out episodes"),
+        (["episodes=1"], "1 held-out episode"),
+        (["episodes=3", "scenario.held_out=[0]"], "3 episodes"),  # a map that teams are trained on
+    ],
+)
 def test_episodes_are_called_held_out_where_they_are(words, wanted):
     cfg = compose_config("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
     results = [EvaluationResult("random", 2, {"exploration_ratio": np.zeros(cfg.episodes)}, 1.0, np.array(["a"]))]
@@ -239,16 +260,26 @@ def test_copies_are_alike_on_one_map_in_all_metrics_of_all_policies():
     assert label_copies(np.array(list("aaab")), one, drawn).tolist() == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("rows, wanted", [
-    ([(64, 64, 16), (64, 64, 16)], []),
-    ([(8, 1, 1), (8, 1, 1)], ["Of 8 episodes 1 is distinct, the rest copies: too few for an interval, which takes 5."]),
-    ([(8, 1, 1), (8, 8, 1)], ["Of 8 episodes of p0 1 is distinct, the rest copies: too few for an interval, "
-                              "which takes 5.",
-                              "The intervals rest on 1 map: they tell little of others."]),
-    ([(64, 8, 5)], ["Of 64 episodes 8 are distinct, the rest copies: the intervals count each once."]),
-    ([(3, 3, 3)], ["3 episodes: too few for an interval, which takes 5."]),
-    ([(99, 99, 4)], ["The intervals rest on 4 maps: they tell little of others."]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "rows, wanted",
+    [
+        ([(64, 64, 16), (64, 64, 16)], []),
+        (
+            [(8, 1, 1), (8, 1, 1)],
+            ["Of 8 episodes 1 is distinct, the rest copies: too few for an interval, which takes 5."],
+        ),
+        (
+            [(8, 1, 1), (8, 8, 1)],
+            [
+                "Of 8 episodes of p0 1 is distinct, the rest copies: too few for an interval, which takes 5.",
+                "The intervals rest on 1 map: they tell little of others.",
+            ],
+        ),
+        ([(64, 8, 5)], ["Of 64 episodes 8 are distinct, the rest copies: the intervals count each once."]),
+        ([(3, 3, 3)], ["3 episodes: too few for an interval, which takes 5."]),
+        ([(99, 99, 4)], ["The intervals rest on 4 maps: they tell little of others."]),
+    ],
+)
 def test_what_figures_rest_on_is_said_where_it_is_little(rows, wanted):
     assert describe_evidence([Evidence(f"p{k}", *row) for k, row in enumerate(rows)]) == wanted
 
@@ -266,8 +297,17 @@ def test_a_team_that_sees_the_map_from_the_start_is_told(capsys):
 def test_eight_copies_are_not_ahead(tmp_path, monkeypatch, capsys):
     """All episodes from one start: policies that draw nothing play one and the same eight times."""
     monkeypatch.chdir(tmp_path)
-    words = ["policy=cost_utility,universal,random", "scenario.held_out=[70]", "scenario.macro_steps=2", "num_envs=4",
-             "scenario.local_steps=5", "num_robots=2", "episodes=8", "device=cpu", "num_threads=1"]  # fmt: skip
+    words = [
+        "policy=cost_utility,universal,random",
+        "scenario.held_out=[70]",
+        "scenario.macro_steps=2",
+        "num_envs=4",
+        "scenario.local_steps=5",
+        "num_robots=2",
+        "episodes=8",
+        "device=cpu",
+        "num_threads=1",
+    ]
     assert main(["evaluate", *words, "scenario.starts=fixed", "hydra.run.dir=run"]) == 0
     out = capsys.readouterr().out
     assert "Of 8 episodes of cost_utility, universal 1 is distinct" in out and "ahead" not in out
@@ -327,13 +367,17 @@ def test_the_typical_episode_is_the_closest_to_the_mean():
 def test_differences_pair_what_was_played_in_the_same_place_by_as_many():
     teams = [
         result(policy, [0.5, 0.5], [1.0, 1.0], policy == "trained", num_robots=size, place=place)
-        for size in (1, 2) for place in ("", "floor") for policy in ("trained", "random")
-    ]  # fmt: skip
+        for size in (1, 2)
+        for place in ("", "floor")
+        for policy in ("trained", "random")
+    ]
     found = paired_differences(teams)
     assert {one: list(others) for one, others in found.items()} == {
-        "trained N=1": ["random N=1"], "trained on floor N=1": ["random on floor N=1"],
-        "trained N=2": ["random N=2"], "trained on floor N=2": ["random on floor N=2"],
-    }  # fmt: skip
+        "trained N=1": ["random N=1"],
+        "trained on floor N=1": ["random on floor N=1"],
+        "trained N=2": ["random N=2"],
+        "trained on floor N=2": ["random on floor N=2"],
+    }
 
 
 def test_paths_of_several_maps():

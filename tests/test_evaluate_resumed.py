@@ -21,8 +21,14 @@ from maexp.envs import ExplorationEnv, make_map
 
 pytestmark = pytest.mark.slow  # evaluations that are stopped
 
-TINY = ["scenario.held_out=[70,71]", "scenario.macro_steps=3", "scenario.local_steps=10", "num_envs=3", "episodes=8",
-        "device=cpu"]  # fmt: skip
+TINY = [
+    "scenario.held_out=[70,71]",
+    "scenario.macro_steps=3",
+    "scenario.local_steps=10",
+    "num_envs=3",
+    "episodes=8",
+    "device=cpu",
+]
 PLAYERS = "policy=random,cost_utility,universal"
 
 
@@ -101,8 +107,17 @@ def test_what_cannot_go_on_is_a_sentence(unbroken, tmp_path, monkeypatch, capsys
 def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, capsys):
     """The planner's episodes stay; a policy of two halves would be nobody's."""
     monkeypatch.chdir(tmp_path)
-    small = ["scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2", "scenario.local_steps=3",
-             "num_envs=2", "num_robots=2", "collector.steps=2", "total_frames=8", "model.channels=4"]  # fmt: skip
+    small = [
+        "scenario.maps=[0]",
+        "scenario.held_out=[70]",
+        "scenario.macro_steps=2",
+        "scenario.local_steps=3",
+        "num_envs=2",
+        "num_robots=2",
+        "collector.steps=2",
+        "total_frames=8",
+        "model.channels=4",
+    ]
     assert main(["train", *small, "episodes=0", "hydra.run.dir=run"]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
@@ -120,9 +135,21 @@ def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, 
 
 def test_ctrl_c_in_the_evaluation_after_a_training(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = ["scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2", "scenario.local_steps=3",
-             "num_envs=2", "num_robots=2", "collector.steps=2", "total_frames=8", "model.channels=4", "episodes=4",
-             "classical=[cost_utility]", "evaluate_every=0", "evaluate_episodes=2"]  # fmt: skip
+    small = [
+        "scenario.maps=[0]",
+        "scenario.held_out=[70]",
+        "scenario.macro_steps=2",
+        "scenario.local_steps=3",
+        "num_envs=2",
+        "num_robots=2",
+        "collector.steps=2",
+        "total_frames=8",
+        "model.channels=4",
+        "episodes=4",
+        "classical=[cost_utility]",
+        "evaluate_every=0",
+        "evaluate_episodes=2",
+    ]
     assert main(["train", *small, "hydra.run.dir=whole"]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
@@ -170,10 +197,12 @@ def test_batches_are_of_what_their_bits_follow_from(tmp_path):
     base = identify(cfg, env, 6, policy, "random")
     assert base == identify(settings("num_threads=2"), env, 6, policy, "random")
     others = [
-        identify(cfg, env, 7, policy, "random"), identify(cfg, build(3), 6, policy, "random"),
-        identify(cfg, env, 6, policy, "other"), identify(cfg, env, 6, policy, "random", "changed"),
+        identify(cfg, env, 7, policy, "random"),
+        identify(cfg, build(3), 6, policy, "random"),
+        identify(cfg, env, 6, policy, "other"),
+        identify(cfg, env, 6, policy, "random", "changed"),
         identify(settings("radar.range=5"), env, 6, policy, "random"),
-    ]  # fmt: skip
+    ]
     assert all(one != base for one in others)
     Kept(tmp_path / "random", base).write(0, {"a": np.zeros(1)})
     assert Kept(tmp_path / "random", base).read(0) is not None and Kept(tmp_path / "random", base).read(6) is None

@@ -36,9 +36,15 @@ def somewhere(tmp_path, monkeypatch):
 
 def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
     return ExplorationEnv(
-        [room(45, 36, "rotated"), room(41, 44)], num_envs=envs, num_robots=robots, seed=2, local_steps=8, macro_steps=6,
-        observation=ObservationConfig(pictures=False, targets=8), **others,
-    )  # fmt: skip
+        [room(45, 36, "rotated"), room(41, 44)],
+        num_envs=envs,
+        num_robots=robots,
+        seed=2,
+        local_steps=8,
+        macro_steps=6,
+        observation=ObservationConfig(pictures=False, targets=8),
+        **others,
+    )
 
 
 def build(env: ExplorationEnv, **settings):
@@ -60,11 +66,14 @@ def batch(decisions: int, robots: int = 2, seed: int = 0) -> TensorDict:
     tried[::7], advantage[::7] = -1, torch.nan  # were not branched at
     return TensorDict(
         {
-            TARGETS: features, TARGETS_MASK: torch.ones(decisions, 1, robots, 8, dtype=torch.bool),
-            COMM: torch.ones(decisions, 1, robots, robots, dtype=torch.bool), TRIED: tried, ADVANTAGE: advantage,
+            TARGETS: features,
+            TARGETS_MASK: torch.ones(decisions, 1, robots, 8, dtype=torch.bool),
+            COMM: torch.ones(decisions, 1, robots, robots, dtype=torch.bool),
+            TRIED: tried,
+            ADVANTAGE: advantage,
         },
         (decisions, 1),
-    )  # fmt: skip
+    )
 
 
 def test_it_learns_what_branches_say():
@@ -140,11 +149,16 @@ def test_several_team_sizes_and_scenarios(somewhere):
     assert main(["train", *TINY, *WORDS, *teams, "total_frames=8", "episodes=2", "classical=[]"]) == 0
 
 
-@pytest.mark.parametrize("words, sentence", [
-    (("action=regions",), "needs action=targets"), (("planner=direct",), "needs action=targets"),
-    (("collector=processes",), "needs collector=single"), (("algorithm.candidates=1",), "from 2 to 24"),
-    (("tuning=reference",), "Leave tuning out"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        (("action=regions",), "needs action=targets"),
+        (("planner=direct",), "needs action=targets"),
+        (("collector=processes",), "needs collector=single"),
+        (("algorithm.candidates=1",), "from 2 to 24"),
+        (("tuning=reference",), "Leave tuning out"),
+    ],
+)
 def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):
     assert main(["train", "algorithm=expert_iteration", *words]) == 2
     error = capsys.readouterr().err

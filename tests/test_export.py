@@ -25,9 +25,14 @@ from maexp.envs.navigation import Navigation
 
 def make_env(num_robots: int = 3, scenario: str = "maze_small") -> ExplorationEnv:
     return ExplorationEnv(
-        maps=[make_map(scenario, 1)], num_envs=1, num_robots=num_robots, seed=5, num_threads=1,
-        planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(targets=24),
-    )  # fmt: skip
+        maps=[make_map(scenario, 1)],
+        num_envs=1,
+        num_robots=num_robots,
+        seed=5,
+        num_threads=1,
+        planner=PlannerConfig(name="wavefront"),
+        observation=ObservationConfig(targets=24),
+    )
 
 
 def motion_of(env: ExplorationEnv) -> Motion:
@@ -217,10 +222,22 @@ def test_weights_are_kept_without_pickle(policy, folder):
 
 def test_from_a_run_to_a_plan(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = ("scenario=maze_small", "scenario.macro_steps=2", "scenario.local_steps=3", "scenario.maps=[0]",
-             "scenario.held_out=[1]")  # fmt: skip
-    train = ("total_frames=8", "num_envs=2", "episodes=2", "evaluate_every=0", "classical=[]", "device=cpu",
-             "hydra.run.dir=run")  # fmt: skip
+    small = (
+        "scenario=maze_small",
+        "scenario.macro_steps=2",
+        "scenario.local_steps=3",
+        "scenario.maps=[0]",
+        "scenario.held_out=[1]",
+    )
+    train = (
+        "total_frames=8",
+        "num_envs=2",
+        "episodes=2",
+        "evaluate_every=0",
+        "classical=[]",
+        "device=cpu",
+        "hydra.run.dir=run",
+    )
     assert main(["train", "action=targets", *small, *train]) == 0
     assert main(["export", "run", "out=made", "note=The first of three."]) == 0
     told = capsys.readouterr().out

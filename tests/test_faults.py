@@ -33,9 +33,16 @@ pytestmark = pytest.mark.slow  # full disks, files that cannot be read
 CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
 RUN = [
-    "scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2", "scenario.local_steps=2", "num_envs=2",
-    "num_robots=2", "collector.steps=2", "episodes=2", "evaluate_episodes=2",
-]  # fmt: skip
+    "scenario.maps=[0]",
+    "scenario.held_out=[70]",
+    "scenario.macro_steps=2",
+    "scenario.local_steps=2",
+    "num_envs=2",
+    "num_robots=2",
+    "collector.steps=2",
+    "episodes=2",
+    "evaluate_episodes=2",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -76,11 +83,23 @@ def write(what: str, number: int) -> None:
         values = np.full(50_000, float(number))
         arrays = {"coverage_step_85": values, "curve_seconds": values, "curve_coverage": values}
         arrays["maps"] = np.full(3, "a")
-        write_result(folder, "held_out", arrays, {
-            "random": {"coverage_step_85": {}},
-            "run": {"format": FORMAT, "maps": [], "commit": None, "seconds": 1.0, "num_robots": 3,
-                    "success_coverage": 0.95, "numbers": [number] * 20_000},
-        })  # fmt: skip
+        write_result(
+            folder,
+            "held_out",
+            arrays,
+            {
+                "random": {"coverage_step_85": {}},
+                "run": {
+                    "format": FORMAT,
+                    "maps": [],
+                    "commit": None,
+                    "seconds": 1.0,
+                    "num_robots": 3,
+                    "success_coverage": 0.95,
+                    "numbers": [number] * 20_000,
+                },
+            },
+        )
     else:
         save_checkpoint(Path("."), state(number), number, keep=2, best=True)
 
@@ -200,9 +219,19 @@ def test_a_full_disk_during_a_run_is_one_sentence(place, monkeypatch, capsys):
 
 
 BENCHMARK = [
-    "preset=smoke", "scenarios=maze_small", "policies=random,voronoi", "algorithms=[]", "seeds=0", "episodes=2",
-    "num_envs=2", "num_robots=2", "scenario.local_steps=3", "workers=1", "estimate=false", "device=cpu",
-]  # fmt: skip
+    "preset=smoke",
+    "scenarios=maze_small",
+    "policies=random,voronoi",
+    "algorithms=[]",
+    "seeds=0",
+    "episodes=2",
+    "num_envs=2",
+    "num_robots=2",
+    "scenario.local_steps=3",
+    "workers=1",
+    "estimate=false",
+    "device=cpu",
+]
 
 
 def test_a_full_disk_during_a_benchmark_names_the_cells(capfd):

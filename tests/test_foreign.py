@@ -94,10 +94,15 @@ def test_an_episode_is_told_with_its_units_and_a_seed_of_its_own():
     env.reset()
     told = [sight.episode(team) for team in range(3)]
     assert told[0] == {
-        "num_robots": 2, "radar_range": 10.0, "robot_radius": 0.9, "max_speed": 8.0, "max_accel": 2.0,
+        "num_robots": 2,
+        "radar_range": 10.0,
+        "robot_radius": 0.9,
+        "max_speed": 8.0,
+        "max_accel": 2.0,
         "seconds": 160.0,
-        "decision_seconds": 2.0, "seed": told[0]["seed"],
-    }  # fmt: skip
+        "decision_seconds": 2.0,
+        "seed": told[0]["seed"],
+    }
     env.reset()
     seeds = {one["seed"] for one in told} | {sight.episode(team)["seed"] for team in range(3)}
     assert len(seeds) == 6 and all(0 <= one < 2**31 for one in seeds)

@@ -213,9 +213,13 @@ BEGIN = time.monotonic()
 
 
 @settings(
-    max_examples=EXAMPLES, deadline=None, derandomize=not LONG, database=None, phases=[Phase.generate],
+    max_examples=EXAMPLES,
+    deadline=None,
+    derandomize=not LONG,
+    database=None,
+    phases=[Phase.generate],
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
-)  # fmt: skip
+)
 @given(case=cases())
 def test_invariants(case):
     if LONG and time.monotonic() - BEGIN > SECONDS:
@@ -227,10 +231,16 @@ def test_invariants(case):
     watch = Watch(env)
     first = play(env, case, STEPS, watch)
     env.set_step_hook(None)
-    tried.update({
-        "configurations": 1, "macro steps": STEPS * env.num_envs, "local steps": watch.local_steps,
-        "episodes": watch.episodes, "collisions": watch.crashes, "successes": watch.successes,
-    })  # fmt: skip
+    tried.update(
+        {
+            "configurations": 1,
+            "macro steps": STEPS * env.num_envs,
+            "local steps": watch.local_steps,
+            "episodes": watch.episodes,
+            "collisions": watch.crashes,
+            "successes": watch.successes,
+        }
+    )
     few = build(case, max(1, case.num_envs - 1), case.threads[1])
     for one, other in zip(first, play(few, case, STEPS), strict=True):
         assert one[: few.num_envs] == other, "the bits depend on the run, the number of envs or of threads"

@@ -30,9 +30,12 @@ pytestmark = pytest.mark.slow  # fuzzing
 LONG = settings.get_current_profile_name() == "long"
 SECONDS = 60.0 * float(os.environ.get("MAEXP_FUZZ_MINUTES", 30))
 QUIET = settings(
-    deadline=None, derandomize=not LONG, database=None, phases=[Phase.generate],
+    deadline=None,
+    derandomize=not LONG,
+    database=None,
+    phases=[Phase.generate],
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.data_too_large],
-)  # fmt: skip
+)
 SHEET = "image: x.pgm\nresolution: 0.1\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
 COUNTED = ("npz", "pgm", "binary.pcd", "binary.ply", "las", "glb")
 """Kinds of files that say how much they hold: cut short, they must be refused."""
@@ -128,8 +131,9 @@ damages = st.lists(
         st.tuples(st.just("number"), st.floats(0, 0.9999), st.integers(0, len(NUMBERS) - 1)),
         st.tuples(st.sampled_from(["repeat", "drop"]), st.floats(0, 0.9999), st.integers(1, 5000)),
     ),
-    min_size=1, max_size=4,
-)  # fmt: skip
+    min_size=1,
+    max_size=4,
+)
 
 
 def damage(content: bytes, steps) -> bytes:
@@ -164,9 +168,22 @@ def time_is_over(name: str) -> bool:
 
 
 KINDS = (
-    "yaml", "pgm", "png", "npz", "npy", "pcd", "binary.pcd", "ply", "binary.ply", "xyz", "las", "laz", "obj", "glb",
+    "yaml",
+    "pgm",
+    "png",
+    "npz",
+    "npy",
+    "pcd",
+    "binary.pcd",
+    "ply",
+    "binary.ply",
+    "xyz",
+    "las",
+    "laz",
+    "obj",
+    "glb",
     "bt",
-)  # fmt: skip
+)
 
 
 def test_undamaged_files_are_maps(importer, tmp_path):

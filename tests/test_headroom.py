@@ -13,9 +13,11 @@ def result(policy: str, *auc: float, size: int = 3) -> EvaluationResult:
 
 def test_a_share_is_a_lead_by_that_of_the_search_that_cheats():
     results = [
-        result("cost_utility", 0.5, 0.6, 0.7, 0.8, 0.1), result("clairvoyant", 0.6, 0.7, 0.8, 0.9, 0.2),
-        result("mine", 0.52, 0.62, 0.72, 0.82, 0.12), result("worse", 0.4, 0.6, 0.7, 0.8, 0.075),
-    ]  # fmt: skip
+        result("cost_utility", 0.5, 0.6, 0.7, 0.8, 0.1),
+        result("clairvoyant", 0.6, 0.7, 0.8, 0.9, 0.2),
+        result("mine", 0.52, 0.62, 0.72, 0.82, 0.12),
+        result("worse", 0.4, 0.6, 0.7, 0.8, 0.075),
+    ]
     found = headroom_shares(results, [one.policy for one in results])
     assert set(found) == {"mine", "worse"}
     assert found["mine"]["mean"] == pytest.approx(0.2) and found["mine"]["ci95"] == pytest.approx([0.2, 0.2])

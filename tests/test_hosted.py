@@ -58,15 +58,21 @@ def play_hosted(word: str, limit: float = 20.0, patience: float = 20.0):
 
 GOOD = ("Stays", "IntoWalls", "Chats")
 FAULTS = {
-    "Raises": "it gave up: KeyError in hostile.py, line", "Exits": "it ended with status 3",
-    "Dies": "it ended with SIGABRT", "Sleeps": "it gave no answer in 3 s", "Spins": "it thought for more than 1 s",
+    "Raises": "it gave up: KeyError in hostile.py, line",
+    "Exits": "it ended with status 3",
+    "Dies": "it ended with SIGABRT",
+    "Sleeps": "it gave no answer in 3 s",
+    "Spins": "it thought for more than 1 s",
     "WrongShape": "it returned numbers of shape [4, 2]: goals must be numbers [3, 2]",
     "Words": "it gave up: ValueError: act() returned a str, and no goals",
     "Nothing": "it gave up: ValueError: act() returned nothing",
-    "Infinite": "it returned a goal that is infinite", "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
-    "Noise": "it answered garbage (a message that is no", "Deaf": "it closed its input or output", "Forks": "it ",
+    "Infinite": "it returned a goal that is infinite",
+    "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
+    "Noise": "it answered garbage (a message that is no",
+    "Deaf": "it closed its input or output",
+    "Forks": "it ",
     "BadReset": "it gave up: RuntimeError in hostile.py, line",
-}  # fmt: skip
+}
 
 
 def test_half_of_the_episodes_meet_a_fault():
@@ -122,13 +128,22 @@ def test_the_next_episode_has_a_new_process():
     assert all(one.returncode is not None for one in processes)
 
 
-@pytest.mark.parametrize(("word", "told"), [
-    ("hostile:Nobody", "AttributeError"), ("nowhere:Nobody", "ModuleNotFoundError"), ("exec:true", "it ended"),
-    ("exec:/no/such/program", "cannot be started"), ("exec:", "names no command"), ("exec:'a", "No closing quotation"),
-    ("exec:yes", "garbage|spoke without being asked"), ("exec:sleep 1000", "it gave no answer in 2 s"),
-    ("process:hostile:factory", "is no class with act"),
-    ("process:nobody", "policy=nobody is unknown"), ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("hostile:Nobody", "AttributeError"),
+        ("nowhere:Nobody", "ModuleNotFoundError"),
+        ("exec:true", "it ended"),
+        ("exec:/no/such/program", "cannot be started"),
+        ("exec:", "names no command"),
+        ("exec:'a", "No closing quotation"),
+        ("exec:yes", "garbage|spoke without being asked"),
+        ("exec:sleep 1000", "it gave no answer in 2 s"),
+        ("process:hostile:factory", "is no class with act"),
+        ("process:nobody", "policy=nobody is unknown"),
+        ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
+    ],
+)
 def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):
     monkeypatch.setattr(hosted, "START", 2.0 if "sleep" in word else 60.0)
     with pytest.raises(UserError, match=f"(?s){told}") as error:
@@ -293,10 +308,17 @@ def test_a_team_that_does_not_hear_each_other_plans_robot_by_robot():
 
 def test_messages_go_over_the_wire_and_back():
     sent = {
-        "type": "act", "n": 3, "name": "å", "none": None, "origin": (1.5, -2.0), "big": np.float32(2.5),
-        "grid": np.arange(-6, 6, dtype=np.int8).reshape(2, 3, 2), "poses": np.array([[np.nan, np.inf]]),
-        "heard": np.eye(2, dtype=bool), "turned": np.arange(6.0).reshape(2, 3).T,
-    }  # fmt: skip
+        "type": "act",
+        "n": 3,
+        "name": "å",
+        "none": None,
+        "origin": (1.5, -2.0),
+        "big": np.float32(2.5),
+        "grid": np.arange(-6, 6, dtype=np.int8).reshape(2, 3, 2),
+        "poses": np.array([[np.nan, np.inf]]),
+        "heard": np.eye(2, dtype=bool),
+        "turned": np.arange(6.0).reshape(2, 3).T,
+    }
     body = wire.pack(sent)
     assert struct.unpack("<I", body[:4])[0] == len(body) - 4
     got = wire.unpack(body[4:])
@@ -319,11 +341,17 @@ def test_garbage_is_told_as_such(body):
         pass
 
 
-@pytest.mark.parametrize("array", [
-    {"dtype": "object", "shape": [1], "data": b"x" * 8}, {"dtype": "float64", "shape": [2], "data": b"x" * 8},
-    {"dtype": "float64", "shape": [-1], "data": b"x" * 8}, {"dtype": "float64", "shape": [2**30, 2**30], "data": b""},
-    {"dtype": "float64", "shape": "1", "data": b"x" * 8}, {"dtype": 3, "shape": [1], "data": b"x" * 8},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "array",
+    [
+        {"dtype": "object", "shape": [1], "data": b"x" * 8},
+        {"dtype": "float64", "shape": [2], "data": b"x" * 8},
+        {"dtype": "float64", "shape": [-1], "data": b"x" * 8},
+        {"dtype": "float64", "shape": [2**30, 2**30], "data": b""},
+        {"dtype": "float64", "shape": "1", "data": b"x" * 8},
+        {"dtype": 3, "shape": [1], "data": b"x" * 8},
+    ],
+)
 def test_arrays_that_are_none_are_garbage(array):
     with pytest.raises(ValueError):
         wire.unpack(wire.pack({"type": "goals", "goals": array})[4:])

@@ -315,9 +315,14 @@ def test_out_and_in_again(tmp_path):
 
 
 REAL = {  # m2 of free space in the manifest, and the share of it we must keep
-    "willow_full.yaml": 1393, "willow_2010.yaml": 1092, "rail_lab.yaml": 34, "rail_ilab.yaml": 86,
-    "crob_lab_slam.yaml": 112, "jsk_eng8_6f.yaml": 298, "upo_big_lab.yaml": 393,
-}  # fmt: skip
+    "willow_full.yaml": 1393,
+    "willow_2010.yaml": 1092,
+    "rail_lab.yaml": 34,
+    "rail_ilab.yaml": 86,
+    "crob_lab_slam.yaml": 112,
+    "jsk_eng8_6f.yaml": 298,
+    "upo_big_lab.yaml": 393,
+}
 
 
 @pytest.mark.parametrize("name", REAL)

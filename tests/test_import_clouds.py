@@ -364,7 +364,7 @@ REAL = {  # file, scenario: free area the map must have [m2]
     ("indoor/asl_flying_arena.ply", "indoor_small"): (2.5, 8),
     ("outdoor/isprs_samp12.pcd", "auto"): (12_000, 30_000),
     ("outdoor/autzen_trim.laz", "auto"): (15_000, 35_000),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name, scenario", REAL)

@@ -82,9 +82,18 @@ def test_a_run_of_elsewhere_plays_by_the_protocol(tmp_path):
 def test_what_is_no_plan_is_refused(plan, tmp_path):
     with pytest.raises(UserError, match="scenario=ir2 needs a map: add scenario.path=FILE"):
         load_maps(compose().scenario)
-    load_maps(compose_config("evaluate", ["scenario=pointcloud", f"scenario.path={plan}", "policy=random",
-                                          "scenario.importing.pixel_size=0.2", "scenario.importing.free_threshold=0.3",
-                                          ]).scenario).held_out[0].save(tmp_path / "saved.npz")  # fmt: skip
+    load_maps(
+        compose_config(
+            "evaluate",
+            [
+                "scenario=pointcloud",
+                f"scenario.path={plan}",
+                "policy=random",
+                "scenario.importing.pixel_size=0.2",
+                "scenario.importing.free_threshold=0.3",
+            ],
+        ).scenario
+    ).held_out[0].save(tmp_path / "saved.npz")
     with pytest.raises(UserError, match="1 is a saved map of scenario=pointcloud: give its picture"):
         load_maps(compose(f"scenario.path={tmp_path / 'saved.npz'}").scenario)
     Image.fromarray(np.full((40, 40), WALL, dtype=np.uint8)).save(tmp_path / "dark.png")

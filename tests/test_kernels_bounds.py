@@ -48,10 +48,26 @@ def test_a_block_of_millions_of_frontier_cells_has_its_target_in_the_middle():
     corner, middle = 3 * side + 5, (side // 2 + 40) * side + side // 2 - 30
     reached[0, [corner, middle, side * side - 1]] = 7
     launch(
-        blocks._place_targets, (1, 1),
-        [grids, row, ints([side]), ints([1]), size, sums, ints(reached), changed, row, ints(np.zeros((1, 1, 2))),
-         1, 1, 1, target, kept],
-    )  # fmt: skip
+        blocks._place_targets,
+        (1, 1),
+        [
+            grids,
+            row,
+            ints([side]),
+            ints([1]),
+            size,
+            sums,
+            ints(reached),
+            changed,
+            row,
+            ints(np.zeros((1, 1, 2))),
+            1,
+            1,
+            1,
+            target,
+            kept,
+        ],
+    )
     assert target.numpy()[0, 0] == middle
 
 
@@ -67,10 +83,10 @@ def test_ways_of_the_last_env_of_a_large_batch():
     wanted[-1] = cells - 1
     found = ints(np.full((envs, 1, 1), -5))
     launch(
-        targets._first_cells, (envs, 1, 1),
-        [grids, ints(np.zeros(envs)), passable, ints(np.arange(envs)), ints(distance), ints(wanted), STRAIGHT,
-         found],
-    )  # fmt: skip
+        targets._first_cells,
+        (envs, 1, 1),
+        [grids, ints(np.zeros(envs)), passable, ints(np.arange(envs)), ints(distance), ints(wanted), STRAIGHT, found],
+    )
     assert found.numpy()[-1, 0, 0] == 1 and (found.numpy()[:-1] == -1).all()
 
 

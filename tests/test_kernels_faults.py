@@ -1,6 +1,5 @@
 """Robots that fail: when, what they do then, and that nobody knows before."""
 
-
 import numpy as np
 import pytest
 import torch
@@ -35,9 +34,12 @@ def test_who_has_failed_when(seconds):
     def compare(env):
         step = max(int(s["local_step"][0]) - 1, 0)  # the one just made; a reset looks at the first
         wanted = [
-            [faults.has_failed(3, int(s["env_id"][e]), int(s["episode"][e]), i, step, 0.6, 60, steps, at)
-             for i, at in enumerate((-1, 10, -1, -1))] for e in range(20)
-        ]  # fmt: skip
+            [
+                faults.has_failed(3, int(s["env_id"][e]), int(s["episode"][e]), i, step, 0.6, 60, steps, at)
+                for i, at in enumerate((-1, 10, -1, -1))
+            ]
+            for e in range(20)
+        ]
         assert s["failed"].bool().tolist() == wanted
         count.append(np.sum(wanted))
 
@@ -94,8 +96,11 @@ def test_nobody_foresees_a_failure(name):
         policy, td, played = POLICIES[name](env), env.reset(), []
         for _ in range(4):
             td = policy(td)
-            played.append(torch.cat([td["agents", "action", "region"].float().unsqueeze(-1),
-                                     td["agents", "action", "offset"]], -1))  # fmt: skip
+            played.append(
+                torch.cat(
+                    [td["agents", "action", "region"].float().unsqueeze(-1), td["agents", "action", "offset"]], -1
+                )
+            )
             td = step_mdp(env.step(td))
         found.append(torch.stack(played))
     assert torch.equal(found[0][:3], found[1][:3])

@@ -123,7 +123,11 @@ def test_walls_have_a_bit_for_every_obstacle():
 
 @wp.kernel(enable_backward=False)
 def _find_nearest(
-    passable: wp.array2d(dtype=wp.uint8), distance: wp.array2d(dtype=wp.int32), item: int, w: int, h: int,
+    passable: wp.array2d(dtype=wp.uint8),
+    distance: wp.array2d(dtype=wp.int32),
+    item: int,
+    w: int,
+    h: int,
     found: wp.array(dtype=wp.int32),
 ):
     cell = wp.tid()

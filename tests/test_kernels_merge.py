@@ -112,9 +112,15 @@ def test_walls_block_sight_between_robots(kind, reach):
     """A boundary point within half a diagonal of the spacing of the line; cells of any size, any direction."""
     world = room(26, 19, kind, 4)
     env = ExplorationEnv(
-        world, 3, 12, seed=5, robot=RobotConfig(length=0.4, width=0.3, collision_threshold=0.2),
-        radar=RadarConfig(range=reach), comm=CommConfig(line_of_sight=True), num_threads=1,
-    )  # fmt: skip
+        world,
+        3,
+        12,
+        seed=5,
+        robot=RobotConfig(length=0.4, width=0.3, collision_threshold=0.2),
+        radar=RadarConfig(range=reach),
+        comm=CommConfig(line_of_sight=True),
+        num_threads=1,
+    )
     env.reset()
     center, comm = (env.simulation.tensors[name].numpy() for name in ("center", "comm"))
     width, blocked, pairs = math.sqrt(0.5) * world.resolution, 0, 0

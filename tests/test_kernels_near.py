@@ -26,11 +26,18 @@ SIDE = 12.0
 def crowd(robots: int) -> ExplorationEnv:
     """Two teams at random places in a square, some of them as after a collision, driven by random controls."""
     env = ExplorationEnv(
-        [room(64, 60, "jittered", 1), room(61, 66, "mixed", 2)], 2, robots, seed=robots,
+        [room(64, 60, "jittered", 1), room(61, 66, "mixed", 2)],
+        2,
+        robots,
+        seed=robots,
         robot=[RobotConfig(max_accel=9.0, max_steer=1.2, **SHAPES[i % 4]) for i in range(robots)],
         radar=[RadarConfig(range=RANGES[i % 3], fov=2.0 * math.pi if i % 5 else 1.5) for i in range(robots)],
-        planner=PlannerConfig(name="direct"), local_steps=1, macro_steps=1000, success_coverage=1.0, num_threads=1,
-    )  # fmt: skip
+        planner=PlannerConfig(name="direct"),
+        local_steps=1,
+        macro_steps=1000,
+        success_coverage=1.0,
+        num_threads=1,
+    )
     env.reset()
     rng, s = np.random.default_rng(robots), env.simulation.tensors
     pose = rng.uniform(0.0, 1.0, (2, robots, 4)) * SIDE + 20.0
@@ -61,8 +68,9 @@ def matters(env: ExplorationEnv, now: dict[str, np.ndarray], i: int, j: int) -> 
     at, there = now["center"][i, :2], now["center"][j, :2]
     if np.linalg.norm(there - at) > 12.0:  # than which none of these reaches farther
         return False
-    mine, rear = (motion.rear_state(now["pose"][k], env.robot_configs[k].length, env.robot_configs[k].kind)
-                  for k in (i, j))  # fmt: skip
+    mine, rear = (
+        motion.rear_state(now["pose"][k], env.robot_configs[k].length, env.robot_configs[k].kind) for k in (i, j)
+    )
     if motion.point_to_body(at, rear, other.length, other.width) <= env.radar_configs[i].range:
         return True
     if np.linalg.norm(there - at) < me.collision_threshold:

@@ -95,8 +95,14 @@ def test_the_error_grows_with_the_root_of_the_way():
 @pytest.mark.parametrize("planner", ["dwa", "wavefront"])
 def test_goals_are_missed_by_the_error(planner):
     """The robot drives until it believes to be there; its pose is the one it believes to have."""
-    env = make(OdometryConfig(jump=1e-9, jump_rate=1e-9), robots=1, envs=1, planner=PlannerConfig(name=planner),
-               local_steps=10, macro_steps=30)  # fmt: skip
+    env = make(
+        OdometryConfig(jump=1e-9, jump_rate=1e-9),
+        robots=1,
+        envs=1,
+        planner=PlannerConfig(name=planner),
+        local_steps=10,
+        macro_steps=30,
+    )
     env.set_starts([[6.0, 10.0, 0.0]])
     td, s = env.reset(), env.simulation.tensors
     s["odometry_error"][0, 0] = torch.tensor([1.5, -1.0, 0.0])
@@ -150,8 +156,15 @@ def test_robots_aim_from_where_they_are(planner):
 def test_who_believes_a_wall_elsewhere_stops_before_it(kind):
     """A robot keeps clear of what it sees, though it believes to be three metres farther back."""
     for planner in ("dwa", "wavefront"):
-        env = make(OdometryConfig(jump=1e-9, jump_rate=1e-9), robots=1, envs=1, local_steps=10, macro_steps=40,
-                   robot=RobotConfig(kind=kind), planner=PlannerConfig(name=planner))  # fmt: skip
+        env = make(
+            OdometryConfig(jump=1e-9, jump_rate=1e-9),
+            robots=1,
+            envs=1,
+            local_steps=10,
+            macro_steps=40,
+            robot=RobotConfig(kind=kind),
+            planner=PlannerConfig(name=planner),
+        )
         env.set_starts([[14.0, 4.0, 0.0]])
         td, s = env.reset(), env.simulation.tensors
         s["odometry_error"][0, 0, 0] = -3.0

@@ -54,8 +54,9 @@ class World:
         self.slip = np.where(rng.random((3, ROBOTS)) < 0.5, 0.0, rng.uniform(-1, 1, (3, ROBOTS)))
         self.collided = (rng.random((3, ROBOTS)) < 0.3).astype(int)
         self.active = np.array([1, 1, 0])
-        self.accel, self.threshold, self.clearance = (rng.uniform(a, b, (3, ROBOTS)) for a, b in
-                                                      ((1, 3), (0.3, 0.8), (0.9, 2.0)))  # fmt: skip
+        self.accel, self.threshold, self.clearance = (
+            rng.uniform(a, b, (3, ROBOTS)) for a, b in ((1, 3), (0.3, 0.8), (0.9, 2.0))
+        )
 
     def walls(self) -> wp.array:
         """A bit for every obstacle cell, rows of cells padded to words of 32."""
@@ -82,9 +83,12 @@ class World:
     def constants(self, e: int, i: int) -> dict:
         names = ("creep", "headroom", "brake", "slack", "slack_gap", "slack_time", "samples", "ahead", "fit", "least")
         return {name: getattr(pace, name.upper()) for name in names} | {
-            "look": pace.LOOK_CELLS, "lead": LEAD,
-            "accel": self.accel[e, i], "threshold": self.threshold[e, i], "clearance": self.clearance[e, i],
-        }  # fmt: skip
+            "look": pace.LOOK_CELLS,
+            "lead": LEAD,
+            "accel": self.accel[e, i],
+            "threshold": self.threshold[e, i],
+            "clearance": self.clearance[e, i],
+        }
 
     def moves(self, e: int, i: int) -> bool:
         return bool(self.active[e] and not self.collided[e, i])
@@ -100,20 +104,39 @@ def test_waypoints_leave_room_to_brake():
         target = array(world.metres(world.target), wp.vec2)
         goal = np.where((world.goal == world.target)[..., :1], target.numpy()[..., :2], world.metres(world.goal))
         launch(
-            pace._hold_back, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.robots(), 1, LEAD,
-             active, collided, array(pose, wp.vec4), array(world.slip * world.cell, wp.float32), center,
-             array(goal, wp.vec2), world.walls()],
+            pace._hold_back,
+            (3, ROBOTS),
+            [
+                nav_grids(),
+                array(MAP_OF_ENV, wp.int32),
+                world.robots(),
+                1,
+                LEAD,
+                active,
+                collided,
+                array(pose, wp.vec4),
+                array(world.slip * world.cell, wp.float32),
+                center,
+                array(goal, wp.vec2),
+                world.walls(),
+            ],
             [target],
-        )  # fmt: skip
+        )
         c, s = np.cos(world.heading), np.sin(world.heading)
         vx, vy = world.speed * c - world.slip * s, world.speed * s + world.slip * c
         for e in range(3):
             team = [
-                {"x": world.at[e, i, 0], "y": world.at[e, i, 1], "vx": vx[e, i], "vy": vy[e, i],
-                 "stopped": world.collided[e, i], "target": world.target[e, i], "goal": world.goal[e, i]}
+                {
+                    "x": world.at[e, i, 0],
+                    "y": world.at[e, i, 1],
+                    "vx": vx[e, i],
+                    "vy": vy[e, i],
+                    "stopped": world.collided[e, i],
+                    "target": world.target[e, i],
+                    "goal": world.goal[e, i],
+                }
                 for i in range(ROBOTS)
-            ]  # fmt: skip
+            ]
             for i in range(ROBOTS):
                 want = world.target[e, i]
                 if world.moves(e, i):
@@ -141,24 +164,50 @@ def test_differential_drives_can_stop_on_the_way_that_they_drive():
         target = array(world.metres(world.target), wp.vec2)
         clearance = array(kept * world.cell, wp.float32)
         launch(
-            stopping._hold_turns, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), robots, 1, horizon, dt,
-             active, collided, array(pose, wp.vec4), center, world.walls()],
+            stopping._hold_turns,
+            (3, ROBOTS),
+            [
+                nav_grids(),
+                array(MAP_OF_ENV, wp.int32),
+                robots,
+                1,
+                horizon,
+                dt,
+                active,
+                collided,
+                array(pose, wp.vec4),
+                center,
+                world.walls(),
+            ],
             [target, clearance],
-        )  # fmt: skip
+        )
         for e, i in np.ndindex(3, ROBOTS):
             want = (*world.target[e, i], kept[e, i])
             if world.moves(e, i) and kind[e, i] == DIFFERENTIAL:
                 names = ("ease", "looks", "least_look", "straight_on", "nudge", "narrow")
-                p = {name: getattr(stopping, name.upper()) for name in names} | world.constants(e, i) | {
-                    "spare": stopping.SPARE_CELLS, "slowest": stopping.SLOWEST / world.cell[e, 0], "fine": 0.01,
-                    "horizon": horizon, "dt": dt, "top": top[e, i], "rate": rate[e, i], "radar": radar[e, i],
-                }  # fmt: skip
+                p = (
+                    {name: getattr(stopping, name.upper()) for name in names}
+                    | world.constants(e, i)
+                    | {
+                        "spare": stopping.SPARE_CELLS,
+                        "slowest": stopping.SLOWEST / world.cell[e, 0],
+                        "fine": 0.01,
+                        "horizon": horizon,
+                        "dt": dt,
+                        "top": top[e, i],
+                        "rate": rate[e, i],
+                        "radar": radar[e, i],
+                    }
+                )
                 back = np.pi if world.speed[e, i] < 0 else 0.0
                 me = {
-                    "x": world.at[e, i, 0], "y": world.at[e, i, 1], "speed": abs(world.speed[e, i]),
-                    "heading": world.heading[e, i] + back, "target": world.target[e, i], "keeps": kept[e, i],
-                }  # fmt: skip
+                    "x": world.at[e, i, 0],
+                    "y": world.at[e, i, 1],
+                    "speed": abs(world.speed[e, i]),
+                    "heading": world.heading[e, i] + back,
+                    "target": world.target[e, i],
+                    "keeps": kept[e, i],
+                }
                 mates = [(*world.at[e, j], world.collided[e, j]) for j in range(ROBOTS) if j != i]
                 want = oracle.held_turn(world.known[e], me, mates, p)
                 aside = np.linalg.det([np.subtract(want[:2], world.at[e, i]), world.target[e, i] - world.at[e, i]])
@@ -183,12 +232,23 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
         active, collided, center = world.state()
         clearance = array(np.full((3, ROBOTS), -1.0), wp.float32)
         launch(
-            pace._fit_clearance, (3, ROBOTS),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), world.robots(), 1,
-             active, collided, center, world.walls(),
-             array(path, wp.int32), array(total, wp.int32), array(used, wp.int32)],
+            pace._fit_clearance,
+            (3, ROBOTS),
+            [
+                nav_grids(),
+                array(MAP_OF_ENV, wp.int32),
+                world.robots(),
+                1,
+                active,
+                collided,
+                center,
+                world.walls(),
+                array(path, wp.int32),
+                array(total, wp.int32),
+                array(used, wp.int32),
+            ],
             [clearance],
-        )  # fmt: skip
+        )
         for e, i in np.ndindex(3, ROBOTS):
             item, width = e * ROBOTS + i, SIZES[MAP_OF_ENV[e]][1]
             # The path is stored from its end: cell j, counted from the robot, was the (total - 1 - j)-th written.
@@ -207,7 +267,7 @@ def test_clearance_fits_the_narrowest_place_of_the_path_nearby():
 @wp.kernel(enable_backward=False)
 def _measure(
     grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32), at: wp.array(dtype=wp.vec2), out: wp.array(dtype=float)
-):  # fmt: skip
+):
     k = wp.tid()
     out[k] = pace.nearest_obstacle(grids, m, walls, 0, at[k])
 
@@ -244,11 +304,18 @@ def test_what_is_to_be_seen_from_a_target_ends_at_walls():
         rays = [wp.zeros((RAYS, 14), dtype=kind) for kind in (wp.vec2i, wp.vec3)]
         launch(outlook._spread_rays, rays[0].shape, [], rays)
         launch(
-            outlook._look_around, (3, blocks),
-            [nav_grids(), array(MAP_OF_ENV, wp.int32), array(world.rows, wp.uint8), array(target, wp.int32), *rays,
-             radius],
+            outlook._look_around,
+            (3, blocks),
+            [
+                nav_grids(),
+                array(MAP_OF_ENV, wp.int32),
+                array(world.rows, wp.uint8),
+                array(target, wp.int32),
+                *rays,
+                radius,
+            ],
             [area, middle],
-        )  # fmt: skip
+        )
         for e, k in np.ndindex(3, blocks):
             cell, width = CELL[MAP_OF_ENV[e]], SIZES[MAP_OF_ENV[e]][1]
             want = (0.0, 0.0, 0.0)

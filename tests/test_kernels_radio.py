@@ -104,8 +104,11 @@ def test_messages_are_lost_by_their_key():
         s = env.simulation.tensors
         step = max(int(s["local_step"][0]) - 1, 0)
         for e, found in enumerate(links(env)):
-            draw = {(i, j): radio.uniform(5, e, int(s["episode"][e]), step, LOSS_KEY + 7 * i + j)
-                    for i in range(7) for j in range(i + 1, 7)}  # fmt: skip
+            draw = {
+                (i, j): radio.uniform(5, e, int(s["episode"][e]), step, LOSS_KEY + 7 * i + j)
+                for i in range(7)
+                for j in range(i + 1, 7)
+            }
             wanted = [[i == j or draw[min(i, j), max(i, j)] >= 0.3 for j in range(7)] for i in range(7)]
             assert found.tolist() == wanted
             lost.append(1.0 - (found.sum() - 7) / 42)
@@ -130,9 +133,7 @@ def test_what_radios_know_is_counted(robots):
 
     def note(env):
         known = unpack_flags(s["known_free"], robots + 1)
-        weight = torch.stack([
-            (known[e].long() * padded(env, e, known.shape[-1])).sum(-1) for e in range(2)
-        ])  # fmt: skip
+        weight = torch.stack([(known[e].long() * padded(env, e, known.shape[-1])).sum(-1) for e in range(2)])
         assert torch.equal(weight, s["known_weight"].long())
         if int(s["local_step"][0]):
             sums["base"] = sums.get("base", 0) + weight[:, robots]

@@ -1,6 +1,5 @@
 """Radars that miss returns: the kernel against its definition, and what robots make of it."""
 
-
 import numpy as np
 import pytest
 import torch
@@ -15,8 +14,11 @@ from maexp.kernels.types import VIEWER_NOW
 pytestmark = pytest.mark.kernels
 
 WORLDS = [room(24, 17), room(19, 22, "rotated", spacing=0.8)]
-RADARS = [RadarConfig(range=6.0, missed=0.3, noise=0.3, evidence=2), RadarConfig(range=7.0, missed=0.6),
-          RadarConfig(range=5.0, evidence=3)]  # fmt: skip
+RADARS = [
+    RadarConfig(range=6.0, missed=0.3, noise=0.3, evidence=2),
+    RadarConfig(range=7.0, missed=0.6),
+    RadarConfig(range=5.0, evidence=3),
+]
 PERFECT = [RadarConfig(range=one.range) for one in RADARS]
 
 
@@ -38,8 +40,20 @@ def drive(env: ExplorationEnv, steps: int, each=None) -> None:
 def scans(radars, steps: int = 4) -> list:
     """An env, and its tensors after every scan, controls given: robots drive alike whatever they know."""
     found = []
-    keep = ("visible", "visible_count", "seen_free", "seen_boundary", "viewers_free", "viewers_boundary", "center",
-            "covered", "map_id", "episode", "overlap", "discovered")  # fmt: skip
+    keep = (
+        "visible",
+        "visible_count",
+        "seen_free",
+        "seen_boundary",
+        "viewers_free",
+        "viewers_boundary",
+        "center",
+        "covered",
+        "map_id",
+        "episode",
+        "overlap",
+        "discovered",
+    )
     env = make(radars, planner=PlannerConfig(name="direct"))
     drive(env, steps, lambda env: found.append({name: env.simulation.tensors[name].clone() for name in keep}))
     return [env, *found]
@@ -62,10 +76,17 @@ def test_what_is_seen_is_that_of_the_definition():
         )
         spacing, points = env.maps[m].resolution, len(free) + len(boundary)
         lookers = [
-            sensing.Looker(4, e, int(true[0]["episode"][e]), i, points,
-                           sensing.chance(one.missed, one.noise, spacing), one.evidence)
+            sensing.Looker(
+                4,
+                e,
+                int(true[0]["episode"][e]),
+                i,
+                points,
+                sensing.chance(one.missed, one.noise, spacing),
+                one.evidence,
+            )
             for i, one in enumerate(RADARS)
-        ]  # fmt: skip
+        ]
         for step, (before, now) in enumerate(zip(true, found, strict=True)):
             assert torch.equal(before["center"], now["center"]), "robots drive alike"
             seen = []

@@ -26,9 +26,12 @@ def teams(seed: int, robots: int, targets: int, side: float) -> dict[str, np.nda
     hears = rng.random((ENVS, robots, robots)) < 0.6
     hears[: ENVS // 2] = True
     found = {
-        "preference": preference, "way": way, "point": np.broadcast_to(place, (*way.shape, 2)), "hears": hears,
+        "preference": preference,
+        "way": way,
+        "point": np.broadcast_to(place, (*way.shape, 2)),
+        "hears": hears,
         "body": rng.uniform(0.2, 1.0, (ENVS, robots)),
-    }  # fmt: skip
+    }
     return {name: value.astype(np.float32) if value.dtype != bool else value for name, value in found.items()}
 
 
@@ -90,7 +93,7 @@ NO = -math.inf
         # Nothing in reach.
         ([[NO, NO], [3.0, 1.0]], [[math.inf] * 2, [1.0, 1.0]], [-1, 0]),
     ],
-)  # fmt: skip
+)
 def test_who_gets_what(preference, way, wanted):
     assert line(preference, way) == wanted
 

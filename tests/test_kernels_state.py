@@ -28,11 +28,18 @@ PLANNERS = ("dwa", "wavefront", "direct")
 
 def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=None) -> ExplorationEnv:
     return ExplorationEnv(
-        worlds or [room(22, 19)], num_envs=envs, num_robots=robots, local_steps=3, num_threads=1,
-        planner=PlannerConfig(name=planner), comm=CommConfig(range=9.0, signal=True) if limited else None,
-        observation=ObservationConfig(map="known"), faults=FaultsConfig(probability=0.5) if limited else None,
-        radar=RadarConfig(evidence=2) if limited else None, odometry=OdometryConfig(drift=0.1) if limited else None,
-    )  # fmt: skip
+        worlds or [room(22, 19)],
+        num_envs=envs,
+        num_robots=robots,
+        local_steps=3,
+        num_threads=1,
+        planner=PlannerConfig(name=planner),
+        comm=CommConfig(range=9.0, signal=True) if limited else None,
+        observation=ObservationConfig(map="known"),
+        faults=FaultsConfig(probability=0.5) if limited else None,
+        radar=RadarConfig(evidence=2) if limited else None,
+        odometry=OdometryConfig(drift=0.1) if limited else None,
+    )
 
 
 def launches_of(env: ExplorationEnv) -> list[tuple]:
@@ -66,12 +73,23 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
     words = 1 + (robots > 32)
     free, boundary = max(len(m.free) for m in env.maps), max(len(m.boundary) for m in env.maps)
     lengths = {
-        "E": envs, "N": robots, "W": words, "F": free, "B": boundary, "H": words if limited else 1,
-        "P": free if limited else 1, "Q": boundary if limited else 1, "S": robots, "M": 3, "1": 1,
+        "E": envs,
+        "N": robots,
+        "W": words,
+        "F": free,
+        "B": boundary,
+        "H": words if limited else 1,
+        "P": free if limited else 1,
+        "Q": boundary if limited else 1,
+        "S": robots,
+        "M": 3,
+        "1": 1,
         "R": len(REWARD_TERMS),
-        "V": bank.free_in_range, "O": bank.boundary_in_range, "D": 384,
+        "V": bank.free_in_range,
+        "O": bank.boundary_in_range,
+        "D": 384,
         "T": min(3 * env.macro_steps + 1, TRACK_LENGTH),
-    }  # fmt: skip
+    }
     vectors = {"vec2f": (2,), "vec3f": (3,), "vec4f": (4,)}
     for name, field in FIELDS.items():
         axes = field.axes.split()

@@ -53,9 +53,17 @@ def episode(request):
     settings = {"planner": PlannerConfig(name="dwa", num_steering=7, clearance_factor=4.0), "radar": radars()}
     settings["reward"] = RewardConfig(overlap=0.01)
     env = ExplorationEnv(
-        maps, 3, 4, seed=5, robot=robots(), local_steps=1, macro_steps=1000, success_coverage=1.0,
-        num_threads=2, **settings | CASES[request.param],
-    )  # fmt: skip
+        maps,
+        3,
+        4,
+        seed=5,
+        robot=robots(),
+        local_steps=1,
+        macro_steps=1000,
+        success_coverage=1.0,
+        num_threads=2,
+        **settings | CASES[request.param],
+    )
     generator = torch.Generator().manual_seed(3)
     env.reset()
     moments = [[moment(env, e)] for e in range(3)]
@@ -155,11 +163,14 @@ def test_dwa_takes_the_best_candidate(episode):
             turn = turn_limit(config)
             controls = dwa.candidates(config.max_accel, turn, env.planner_config.num_steering)
             values = dwa.scores(
-                (before.pose[i], before.slip[i]), after.waypoint[i], controls,
+                (before.pose[i], before.slip[i]),
+                after.waypoint[i],
+                controls,
                 move=lambda s, u, config=config: move(config, *s, u, False),
                 middle=lambda s, i=i, config=config: motion.center(body(env, i, s[0])[0], config.length),
-                gap=gap, clearance=factor * config.collision_threshold,
-            )  # fmt: skip
+                gap=gap,
+                clearance=factor * config.collision_threshold,
+            )
             chosen = int(np.argmin(np.abs(controls - after.control[i]).sum(1)))
             np.testing.assert_allclose(controls[chosen], after.control[i], atol=1e-5)
             assert values[chosen] >= values.max() - 2e-3, (i, chosen, dwa.first_best(values))
@@ -223,16 +234,28 @@ def test_scan(episode):
             origin = np.append(after.center[i], 0.0)
             walls, radii = occluders(env, after, i)
             want, clear = radar.visible_points(
-                after.map.free, walls, origin, config.range, config.alpha1, config.alpha2, radii,
-                heading=float(after.pose[i][3]), fov=config.fov, tolerance=2e-5,
-            )  # fmt: skip
+                after.map.free,
+                walls,
+                origin,
+                config.range,
+                config.alpha1,
+                config.alpha2,
+                radii,
+                heading=float(after.pose[i][3]),
+                fov=config.fov,
+                tolerance=2e-5,
+            )
             np.testing.assert_array_equal(after.visible[i][clear], want[clear])
             total, unclear = total + want.sum(), unclear + (~clear).sum()
             np.testing.assert_array_equal(after.seen_free[i], before.seen_free[i] | after.visible[i])
             near, sure = radar.seen_boundary(
-                after.map.boundary, after.map.free, after.visible[i], origin, config.range,
+                after.map.boundary,
+                after.map.free,
+                after.visible[i],
+                origin,
+                config.range,
                 1.5 * np.maximum(after.map.resolution, after.map.boundary_spacing) * (1.0 + 1e-5),
-            )  # fmt: skip
+            )
             np.testing.assert_array_equal(after.seen_boundary[i][sure], (before.seen_boundary[i] | near)[sure])
     assert total > 300 and unclear < 0.05 * total
 
@@ -253,9 +276,15 @@ def test_counts_reward_and_end(episode):
         success = before.coverage < env.success_coverage <= after.coverage
         charged = team.steps_charged(after.collided, after.coverage, after.step, 1000, env.success_coverage)
         terms = team.reward_terms(
-            new, overlap, before.coverage, success, after.crashed != 0, area,
-            coverage_now=after.coverage, charged=charged,
-        )  # fmt: skip
+            new,
+            overlap,
+            before.coverage,
+            success,
+            after.crashed != 0,
+            area,
+            coverage_now=after.coverage,
+            charged=charged,
+        )
         for k, name in enumerate(("explore", "overlap", "time", "success", "collision")):
             np.testing.assert_allclose(after.terms[:, k], terms[name], rtol=1e-5, atol=1e-7, err_msg=name)
         over = team.terminated(after.coverage, after.collided, env.success_coverage)
@@ -265,9 +294,16 @@ def test_counts_reward_and_end(episode):
 def test_milestones():
     """Each share is noted in the local step that reaches it, with the overlap and the ways of that moment."""
     env = ExplorationEnv(
-        [room(17, 11, "mixed", 1), room(13, 14, "rotated", 2)], 4, 2, seed=5, radar=RadarConfig(range=8.0),
-        robot=RobotConfig(collision_threshold=0.2), local_steps=1, macro_steps=1000, success_coverage=1.0,
-    )  # fmt: skip
+        [room(17, 11, "mixed", 1), room(13, 14, "rotated", 2)],
+        4,
+        2,
+        seed=5,
+        radar=RadarConfig(range=8.0),
+        robot=RobotConfig(collision_threshold=0.2),
+        local_steps=1,
+        macro_steps=1000,
+        success_coverage=1.0,
+    )
     generator, lines = torch.Generator().manual_seed(3), [[] for _ in range(4)]
     env.reset()
     actions = [act(env, generator) for _ in range(20)]
@@ -313,9 +349,16 @@ def test_what_robots_know_travels_one_hop_a_step(episode):
 def test_pictures():
     """The picture of the design from the flags, the poses and the past."""
     env = ExplorationEnv(
-        [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)], 2, 4, seed=8, robot=robots(), radar=radars(),
-        planner=PlannerConfig(name="direct"), local_steps=1, macro_steps=100,
-    )  # fmt: skip
+        [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)],
+        2,
+        4,
+        seed=8,
+        robot=robots(),
+        radar=radars(),
+        planner=PlannerConfig(name="direct"),
+        local_steps=1,
+        macro_steps=100,
+    )
     td, generator = env.reset(), torch.Generator().manual_seed(3)
     past = [[moment(env, e).center for e in range(2)]]
     for _ in range(25):

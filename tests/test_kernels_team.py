@@ -23,12 +23,22 @@ def team_env(maps, envs: int, robots: int, order=None, **settings) -> Exploratio
     order = list(range(robots)) if order is None else order
     bodies = [RobotConfig(kind=kinds[i % 3], **BODY | {"length": 0.6 + 0.01 * i}) for i in order]
     sensors = [RadarConfig(range=3.0 + 0.05 * i, fov=2.0 if i % 5 == 4 else 2.0 * math.pi) for i in order]
-    defaults = {"planner": PlannerConfig(name="dwa", num_steering=5, clearance_factor=3.0), "local_steps": 3,
-                "macro_steps": 50, "num_threads": 1}  # fmt: skip
+    defaults = {
+        "planner": PlannerConfig(name="dwa", num_steering=5, clearance_factor=3.0),
+        "local_steps": 3,
+        "macro_steps": 50,
+        "num_threads": 1,
+    }
     return ExplorationEnv(
-        maps, envs, robots, seed=3, robot=bodies, radar=sensors, success_coverage=1.0,
+        maps,
+        envs,
+        robots,
+        seed=3,
+        robot=bodies,
+        radar=sensors,
+        success_coverage=1.0,
         **defaults | settings,
-    )  # fmt: skip
+    )
 
 
 def place(env: ExplorationEnv, pose: torch.Tensor, target: torch.Tensor) -> None:
@@ -39,15 +49,37 @@ def place(env: ExplorationEnv, pose: torch.Tensor, target: torch.Tensor) -> None
     offset = env.simulation.robot_tensors["center_offset"]
     s["center"][..., 0] = pose[..., 0] + offset * torch.cos(pose[..., 3])
     s["center"][..., 1] = pose[..., 1] + offset * torch.sin(pose[..., 3])
-    for name in ("seen_free", "seen_boundary", "known_free", "known_boundary", "covered", "covered_before",
-                 "shared", "viewers_free", "viewers_boundary"):
+    for name in (
+        "seen_free",
+        "seen_boundary",
+        "known_free",
+        "known_boundary",
+        "covered",
+        "covered_before",
+        "shared",
+        "viewers_free",
+        "viewers_boundary",
+    ):
         s[name].zero_()
     s["goal"].copy_(target)
     s["waypoint"].copy_(target)
 
 
-PER_ROBOT = ("pose", "control", "collided", "crashed", "discovered", "overlap", "terms", "seen_free", "seen_boundary",
-             "known_free", "known_boundary", "visible", "path_length")  # fmt: skip
+PER_ROBOT = (
+    "pose",
+    "control",
+    "collided",
+    "crashed",
+    "discovered",
+    "overlap",
+    "terms",
+    "seen_free",
+    "seen_boundary",
+    "known_free",
+    "known_boundary",
+    "visible",
+    "path_length",
+)
 
 
 @pytest.mark.parametrize("robots", [1, 3, 40])
@@ -80,9 +112,11 @@ def test_permuting_robots_permutes_results(robots, limited):
 def test_moving_the_world_changes_nothing_but_the_pose(angle, shift, collision):
     world = room(17, 13, "jittered", 6)
     moved = PointCloudMap(
-        turned(world.free, angle, shift), turned(world.obstacles, angle, shift), world.resolution,
+        turned(world.free, angle, shift),
+        turned(world.obstacles, angle, shift),
+        world.resolution,
         boundary=turned(world.boundary, angle, shift),
-    )  # fmt: skip
+    )
     here, there = (team_env(m, 5, 3, collision=collision) for m in (world, moved))
     here.reset()
     pose = here.simulation.tensors["pose"].clone()
@@ -227,9 +261,14 @@ def test_results_depend_on_neither_threads_nor_the_batch():
 def test_dwa_takes_the_first_of_equal_candidates():
     """At rest on its goal a car scores the same for every steering angle without throttle: the first wins."""
     env = ExplorationEnv(
-        room(21, 21, "lattice"), 1, 1, robot=RobotConfig(**BODY), radar=RadarConfig(range=2.0), local_steps=1,
+        room(21, 21, "lattice"),
+        1,
+        1,
+        robot=RobotConfig(**BODY),
+        radar=RadarConfig(range=2.0),
+        local_steps=1,
         planner=PlannerConfig(name="dwa", num_steering=5, clearance_factor=1.0),
-    )  # fmt: skip
+    )
     pose = torch.tensor([[[16.0, 11.0, 0.0, 0.0]]])
     place(env, pose, pose[..., :2] + torch.tensor([0.3, 0.0]))
     env.simulation.step(0, 1)

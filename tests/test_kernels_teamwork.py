@@ -29,11 +29,17 @@ def team(request) -> dict[str, np.ndarray]:
     ways = rng.uniform(0, 9, (ENVS, ROBOTS, TARGETS))
     ways[rng.random(ways.shape) < 0.2] = np.inf
     return {
-        "point": place[np.arange(ENVS)[:, None, None], best], "best": best, "hears": hears, "gain": gain,
-        "value": value, "ways": ways, "plan": rng.uniform(0, 30, (ENVS, ROBOTS, 2)),
-        "has_plan": rng.random((ENVS, ROBOTS)) < 0.8, "last": rng.uniform(0, 30, (ENVS, ROBOTS, 2)),
+        "point": place[np.arange(ENVS)[:, None, None], best],
+        "best": best,
+        "hears": hears,
+        "gain": gain,
+        "value": value,
+        "ways": ways,
+        "plan": rng.uniform(0, 30, (ENVS, ROBOTS, 2)),
+        "has_plan": rng.random((ENVS, ROBOTS)) < 0.8,
+        "last": rng.uniform(0, 30, (ENVS, ROBOTS, 2)),
         "has_last": rng.random((ENVS, ROBOTS)) < 0.6,
-    }  # fmt: skip
+    }
 
 
 def tensors(team: dict[str, np.ndarray], *names: str) -> list[torch.Tensor]:
@@ -76,8 +82,10 @@ def test_ways_plans_and_last_targets_of_those_that_are_heard(team):
 
         want = (
             min((team["ways"][e, j, team["best"][e, i, k]] for j in mates), default=np.inf),
-            nearest("plan", mates), nearest("last", [i]), nearest("last", mates),
-        )  # fmt: skip
+            nearest("plan", mates),
+            nearest("last", [i]),
+            nearest("last", mates),
+        )
         np.testing.assert_allclose([float(one[e, i, k]) for one in found], want, rtol=1e-5)
     assert all(one.isinf().any() and one.isfinite().any() for one in found)
 

@@ -23,7 +23,7 @@ def cloud(seed: int, kind: str, spacing: float = 1.0, dims: int = 2):
     wall = (np.abs(points[:, 0] - 3 * spacing) < 1e-9) & (np.abs(points[:, 1]) > 1.5 * spacing)
     wall |= (np.abs(points[:, 1] + 4 * spacing) < 1e-9) | (rng.random(len(points)) < 0.08)
     if kind == "jittered":
-        points[:, : dims] += rng.normal(0.0, 0.15 * spacing, (len(points), dims))
+        points[:, :dims] += rng.normal(0.0, 0.15 * spacing, (len(points), dims))
     if kind == "rotated":
         c, s = math.cos(0.37), math.sin(0.37)
         points[:, :2] = points[:, :2] @ np.array([[c, s], [-s, c]]) + [31.7, -12.3]

@@ -66,11 +66,14 @@ class Scene:
         self.boundary = [rng.random((robots, len(p.boundary))) < share for p in chosen]
         words = -(-robots // 32)
         self.known = KnownGrids(
-            maps_of(self.places), self.grids, array(self.map_id, wp.int32),
+            maps_of(self.places),
+            self.grids,
+            array(self.map_id, wp.int32),
             array(flag_words(self.free, words, max(len(p.free) for p in self.places)), wp.int32),
             array(flag_words(self.boundary, words, max(len(p.boundary) for p in self.places)), wp.int32),
-            rows_per_env, self.cells,
-        )  # fmt: skip
+            rows_per_env,
+            self.cells,
+        )
         self.known.paint(launch)
 
     def expected(self, e: int, robot: int | None) -> np.ndarray:
@@ -369,6 +372,14 @@ def test_robots_alike_share_a_mask():
 
 def test_nav_grids_struct_has_every_field():
     assert set(NavGrids.vars) == {
-        "origin", "cell", "width", "height", "free_cell", "boundary_cell", "cell_begin", "stand_in",
-        "void_begin", "voids",
-    }  # fmt: skip
+        "origin",
+        "cell",
+        "width",
+        "height",
+        "free_cell",
+        "boundary_cell",
+        "cell_begin",
+        "stand_in",
+        "void_begin",
+        "voids",
+    }

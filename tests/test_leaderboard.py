@@ -133,11 +133,14 @@ def edit_maps(run: Path) -> None:
     path.write_text(path.read_text().replace('"frozen_maps": true', '"frozen_maps": false'))
 
 
-@pytest.mark.parametrize(("edit", "words", "told"), [
-    (edit_score, [], "is not what it says (results.json: score.mean)"),
-    (edit_checksum, ["verify=false"], "was played with another version of small"),
-    (edit_maps, ["verify=false"], "was played on other maps (seed=0)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("edit", "words", "told"),
+    [
+        (edit_score, [], "is not what it says (results.json: score.mean)"),
+        (edit_checksum, ["verify=false"], "was played with another version of small"),
+        (edit_maps, ["verify=false"], "was played on other maps (seed=0)"),
+    ],
+)
 def test_a_run_that_is_not_what_it_says_is_no_row(edit, words, told, small, runs, tmp_path, capsys):
     edit(Path(shutil.copytree(runs[1], tmp_path / "run")))
     assert main(["leaderboard", str(tmp_path / "run"), f"out={tmp_path / 'site'}", f"suite={small}", *words]) == 2
@@ -145,17 +148,20 @@ def test_a_run_that_is_not_what_it_says_is_no_row(edit, words, told, small, runs
     assert not (tmp_path / "site").exists()
 
 
-@pytest.mark.parametrize(("change", "told"), [
-    (lambda row: row.pop("films"), "row.films is missing"),
-    (lambda row: row["score"].update(mean="0.9"), "row.score.mean is of another kind"),
-    (lambda row: row["score"].update(mean=0.9), "its score does not follow from its episodes"),
-    (lambda row: row["parts"]["maze_small"].pop("coverage_auc"), "a part has too few entries"),
-    (lambda row: row["parts"]["maze_small"]["episodes"].append("x"), "row.parts.maze_small.episodes is of another"),
-    (lambda row: row["films"].pop("maze_small"), "are not of the same parts"),
-    (lambda row: row.update(format="maexp-leaderboard-row-0"), "format maexp-leaderboard-row-0"),
-    (lambda row: row.update(verified=1), "row.verified is of another kind"),
-    (lambda row: row.clear(), "row has no entries"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda row: row.pop("films"), "row.films is missing"),
+        (lambda row: row["score"].update(mean="0.9"), "row.score.mean is of another kind"),
+        (lambda row: row["score"].update(mean=0.9), "its score does not follow from its episodes"),
+        (lambda row: row["parts"]["maze_small"].pop("coverage_auc"), "a part has too few entries"),
+        (lambda row: row["parts"]["maze_small"]["episodes"].append("x"), "row.parts.maze_small.episodes is of another"),
+        (lambda row: row["films"].pop("maze_small"), "are not of the same parts"),
+        (lambda row: row.update(format="maexp-leaderboard-row-0"), "format maexp-leaderboard-row-0"),
+        (lambda row: row.update(verified=1), "row.verified is of another kind"),
+        (lambda row: row.clear(), "row has no entries"),
+    ],
+)
 def test_a_damaged_row_is_named(change, told, board, tmp_path, capsys):
     out = Path(shutil.copytree(board, tmp_path / "site"))
     path = out / "small" / "random.json"
@@ -167,14 +173,17 @@ def test_a_damaged_row_is_named(change, told, board, tmp_path, capsys):
     assert "random.json is damaged or no row of a leaderboard" in error and told in error
 
 
-@pytest.mark.parametrize(("words", "told"), [
-    ([], "out is missing"),
-    (["nowhere", "out=site"], "nowhere is no finished run of maexp suite"),
-    (["out=site"], "No row is in out=site yet"),
-    (["out=full"], "holds something else than a leaderboard"),
-    (["out=full/note.txt"], "is a file: name a folder"),
-    (["verify=maybe", "out=site"], "verify"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "out is missing"),
+        (["nowhere", "out=site"], "nowhere is no finished run of maexp suite"),
+        (["out=site"], "No row is in out=site yet"),
+        (["out=full"], "holds something else than a leaderboard"),
+        (["out=full/note.txt"], "is a file: name a folder"),
+        (["verify=maybe", "out=site"], "verify"),
+    ],
+)
 def test_bad_words_get_a_sentence(words, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()

@@ -34,8 +34,9 @@ with lock(Path(sys.argv[1]), "maexp train"):
 @pytest.fixture
 def holder(tmp_path):
     """Another process that holds the folder, and a child of its."""
-    process = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True,
-                               start_new_session=True)  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, tmp_path], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     assert process.stdout.readline() == "held\n"
     yield process
     os.killpg(process.pid, signal.SIGKILL)

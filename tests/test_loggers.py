@@ -50,9 +50,11 @@ def test_what_came_of_a_run_goes_to_its_loggers(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", diary)
     whole = {name: {"mean": 0.5, "n": 4} for name in COLUMNS} | {"coverage_step_99": {"mean": None, "n": 0}}
     summary = {
-        "trained": whole | {"coverage_auc": {"mean": 0.75, "n": 4}}, "cost_utility": whole, "difference": {},
+        "trained": whole | {"coverage_auc": {"mean": 0.75, "n": 4}},
+        "cost_utility": whole,
+        "difference": {},
         "run": {"distinct_episodes": {"trained": 4, "cost_utility": 4}},
-    }  # fmt: skip
+    }
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     Image.new("RGB", (40, 30), "red").save(tmp_path / "coverage.png")
     frames = [Image.new("RGB", (20, 10), colour) for colour in ("red", "blue", "white")]
@@ -78,9 +80,17 @@ def test_what_came_of_a_run_goes_to_its_loggers(tmp_path, monkeypatch):
 
     log = MetricsLog(tmp_path, LoggerSettings(backends=["wandb"]), 0, 0, {})
     log.write({"iteration": 1, "frames": 8, "reward_time": 2.0, "validation_gain": 0.1, "kl": 3.0, "coverage": 0.5})
-    assert diary.told[-1] == ({
-        "progress/iteration": 1, "progress/frames": 8, "reward/time": 2.0, "validation/gain": 0.1, "learning/kl": 3.0,
-        "episodes/coverage": 0.5}, 8)  # fmt: skip
+    assert diary.told[-1] == (
+        {
+            "progress/iteration": 1,
+            "progress/frames": 8,
+            "reward/time": 2.0,
+            "validation/gain": 0.1,
+            "learning/kl": 3.0,
+            "episodes/coverage": 0.5,
+        },
+        8,
+    )
     log.close()
 
 

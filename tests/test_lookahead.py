@@ -45,9 +45,12 @@ def changed(world: PointCloudMap, far: tuple[float, float], radius: float = 4.0)
     near = np.linalg.norm(world.free[:, :2] - far, axis=1) < radius
     near &= (world.free[:, :2] > world.free[:, :2].min(0) + 2).all(1)
     return PointCloudMap(
-        world.free[~near], np.concatenate([world.obstacles, world.free[near]]), world.resolution, name="changed",
+        world.free[~near],
+        np.concatenate([world.obstacles, world.free[near]]),
+        world.resolution,
+        name="changed",
         scenario=world.scenario,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("config", [{"horizon": 1}, {"horizon": 2}, {"unknown": "nearest"}, {"unknown": "predicted"}])
@@ -121,12 +124,17 @@ def test_a_single_candidate_is_the_rollout_policy():
 @pytest.mark.parametrize("comm", [None, CommConfig(range=6.0)])
 def test_a_trained_policy_is_a_base_too(comm):
     """With a single candidate the search drives as the policy does; with more it departs."""
+
     def play(policy, targets, **lookahead):
         env = ExplorationEnv(
-            make_map("indoor_medium", 1), num_envs=2, num_robots=3, seed=0, comm=comm,
+            make_map("indoor_medium", 1),
+            num_envs=2,
+            num_robots=3,
+            seed=0,
+            comm=comm,
             lookahead=LookaheadConfig(**lookahead),
             observation=ObservationConfig(pictures=False, targets=targets),
-        )  # fmt: skip
+        )
         with torch.no_grad():
             return env.rollout(4, policy(env), break_when_any_done=False)["next", "agents", "observation", "pose"]
 
@@ -137,12 +145,19 @@ def test_a_trained_policy_is_a_base_too(comm):
     assert not torch.equal(searched, play(POLICIES["lookahead"], 0, candidates=4)), "its base changes nothing"
 
 
-@pytest.mark.parametrize("settings", [
-    {"num_robots": 1}, {"num_robots": 8}, {"comm": CommConfig(range=6.0)},
-    {"comm": CommConfig(range=20.0, line_of_sight=True), "num_robots": 4},
-    {"robot": [RobotConfig(kind="differential"), RobotConfig(), RobotConfig(length=1.0, width=0.8)]},
-    {"planner": PlannerConfig(name="dwa")}, {"collision": "footprint"}, {"targets": TargetsConfig(distinct=False)},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"num_robots": 1},
+        {"num_robots": 8},
+        {"comm": CommConfig(range=6.0)},
+        {"comm": CommConfig(range=20.0, line_of_sight=True), "num_robots": 4},
+        {"robot": [RobotConfig(kind="differential"), RobotConfig(), RobotConfig(length=1.0, width=0.8)]},
+        {"planner": PlannerConfig(name="dwa")},
+        {"collision": "footprint"},
+        {"targets": TargetsConfig(distinct=False)},
+    ],
+)
 @pytest.mark.parametrize("true_world", [False, True])
 def test_plays_every_kind_of_team(settings, true_world):
     env = ExplorationEnv(make_map("maze_small", 2), num_envs=2, seed=0, macro_steps=3, **settings)
@@ -206,10 +221,19 @@ def test_robots_go_to_different_targets():
         td = env.step(td)["next"].exclude("agents", "reward")
 
 
-@pytest.mark.parametrize("name, value", [
-    ("candidates", 0), ("candidates", 2.5), ("horizon", 101), ("margin", -1.0), ("rest", float("nan")),
-    ("unknown", "rooms"), ("loss", True), ("local_steps", 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("candidates", 0),
+        ("candidates", 2.5),
+        ("horizon", 101),
+        ("margin", -1.0),
+        ("rest", float("nan")),
+        ("unknown", "rooms"),
+        ("loss", True),
+        ("local_steps", 0),
+    ],
+)
 def test_bad_settings_are_named(name, value):
     with pytest.raises(ValueError, match=f"lookahead.{name}="):
         ExplorationEnv(make_map("maze_small", 0), lookahead=LookaheadConfig(**{name: value}))

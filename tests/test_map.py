@@ -159,9 +159,7 @@ def test_foreign_files(tmp_path):
 
 def test_a_header_that_promises_too_much(tmp_path):
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": (2**40, 3)}
-    )
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (2**40, 3)})
     write_zip(tmp_path / "x.npz", free=header.getvalue() + b"\0" * 12)
     with pytest.raises(MapError, match="promises"):
         PointCloudMap.load(tmp_path / "x.npz")

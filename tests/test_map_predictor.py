@@ -247,8 +247,16 @@ def test_the_eight_turns_differ_and_turn_together():
 
 
 def toy_config(folder, **others) -> PredictorConfig:
-    values = {"data": str(folder / "data"), "out": str(folder / "out"), "width": 4, "steps": 60, "batch": 4, "crop": 32,
-              "save_every": 20, "learning_rate": 0.05}  # fmt: skip
+    values = {
+        "data": str(folder / "data"),
+        "out": str(folder / "out"),
+        "width": 4,
+        "steps": 60,
+        "batch": 4,
+        "crop": 32,
+        "save_every": 20,
+        "learning_rate": 0.05,
+    }
     return PredictorConfig(**(values | others))
 
 

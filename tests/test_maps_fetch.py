@@ -220,11 +220,14 @@ def test_a_full_disk_is_one_sentence_and_nothing_half_written_stays(server, fetc
     assert any("hall_1.pgm" in name for name in there) and not any("hall_2.pgm" in name for name in there)
 
 
-@pytest.mark.parametrize(("words", "told"), [
-    (["fetch"], "maexp maps fetch needs a set (dungeons, floors) after it"),
-    (["fetch", "atlantis"], "atlantis is no set of maps: choose one of dungeons, floors"),
-    (["fetch", "floors", "mirror=ftp://x"], "mirror=ftp://x must begin with http:// or https://"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["fetch"], "maexp maps fetch needs a set (dungeons, floors) after it"),
+        (["fetch", "atlantis"], "atlantis is no set of maps: choose one of dungeons, floors"),
+        (["fetch", "floors", "mirror=ftp://x"], "mirror=ftp://x must begin with http:// or https://"),
+    ],
+)
 def test_bad_words_get_a_sentence(words, told, capsys):
     assert main(["maps", *words]) == 2
     assert told in capsys.readouterr().err

@@ -24,9 +24,13 @@ def test_memory_is_counted_before_it_is_taken(limited):
     """What `check_memory` counts is what state, scratch and the planner's grids take, within 2 %."""
     comm = CommConfig(range=20.0) if limited else CommConfig()
     env = ExplorationEnv(
-        make_map("maze_small", 0), num_envs=6, num_robots=3, planner=PlannerConfig("wavefront"), comm=comm,
+        make_map("maze_small", 0),
+        num_envs=6,
+        num_robots=3,
+        planner=PlannerConfig("wavefront"),
+        comm=comm,
         num_threads=2,
-    )  # fmt: skip
+    )
     taken = sum(tensor.nbytes for tensor in env.simulation.tensors.values())
     for block in env.simulation.blocks:
         taken += sum(grid.capacity for grid in arrays_of(block.wavefront))

@@ -28,8 +28,9 @@ def test_navigation_shows_what_the_team_knows():
         side = int(round(place.extent[1][0] - place.extent[0][0])) + 1
         known = np.zeros((side, side), np.uint8)
         for points, seen, kind in (
-            (place.free, shot["seen_free"], FREE), (place.boundary, shot["seen_boundary"], OBSTACLE)
-        ):  # fmt: skip
+            (place.free, shot["seen_free"], FREE),
+            (place.boundary, shot["seen_boundary"], OBSTACLE),
+        ):
             cells = np.round(points[seen.any(axis=0)][:, :2] - np.array(place.extent[0])).astype(int)
             known[cells[:, 1], cells[:, 0]] = kind
         got = nav.known[e, 0].numpy()[: side * side].reshape(side, side)
@@ -115,8 +116,10 @@ def test_what_needs_all_envs_is_an_error_where_only_some_are_looked_at():
     place, reach = nav.centers(), torch.ones(2, env.num_robots)
     nowhere = torch.full((2, env.num_robots), -1)
     for name, values in (
-        ("grow_trees", (5, 2.0)), ("waypoints", (nowhere, place, reach)), ("leads_through_open_ground", (place,)),
-    ):  # fmt: skip
+        ("grow_trees", (5, 2.0)),
+        ("waypoints", (nowhere, place, reach)),
+        ("leads_through_open_ground", (place,)),
+    ):
         getattr(nav, name)(*values)
         with nav.only(torch.tensor([1])), pytest.raises(RuntimeError, match=f"{name} is about all envs"):
             getattr(nav, name)(*values)

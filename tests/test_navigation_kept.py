@@ -27,9 +27,16 @@ def assert_up_to_date(nav: Navigation, env: ExplorationEnv) -> None:
 def test_what_is_kept_is_what_is_there(reach):
     """Over decisions, resets of some envs and other episodes."""
     env = ExplorationEnv(
-        MAPS, num_envs=4, num_robots=2, seed=3, macro_steps=5, num_threads=1, comm=CommConfig(range=reach),
-        planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(targets=12, pictures=False),
-    )  # fmt: skip
+        MAPS,
+        num_envs=4,
+        num_robots=2,
+        seed=3,
+        macro_steps=5,
+        num_threads=1,
+        comm=CommConfig(range=reach),
+        planner=PlannerConfig(name="wavefront"),
+        observation=ObservationConfig(targets=12, pictures=False),
+    )
     td, nav, kept = env.reset(), env.target_view.tracker.nav, 0
     for step in range(8):
         scores = td[TARGETS][..., FEATURES.index("score")]

@@ -135,8 +135,10 @@ def test_team_critic_sees_every_robot_and_local_only_its_own(env, model, name):
     team, local = (awake(build_critic(kind, env, model)) for kind in ("team", "local"))
     for robot in range(3):
         other = changed(td, robot, name)
-        moved = {k: critic(td.clone())[VALUE] != critic(other.clone())[VALUE] for k, critic in
-                 (("team", team), ("local", local))}  # fmt: skip
+        moved = {
+            k: critic(td.clone())[VALUE] != critic(other.clone())[VALUE]
+            for k, critic in (("team", team), ("local", local))
+        }
         assert moved["team"].all(), "a robot's value ignores what another one observes"
         alone = td.clone()
         alone["agents", "observation", "comm"][:] = True
@@ -255,8 +257,10 @@ def test_compact_pictures_serve_in_place_of_pictures(env, share):
         awake(network)
         plain, found = (network(one.clone())[head] for one in (td, pooled))
         torch.testing.assert_close(found, plain, rtol=5e-6, atol=1e-5)  # sums of hundreds, in another order
-        slopes = [torch.autograd.grad(value.square().mean(), [*network.parameters()], allow_unused=True)
-                  for value in (plain, found)]  # fmt: skip
+        slopes = [
+            torch.autograd.grad(value.square().mean(), [*network.parameters()], allow_unused=True)
+            for value in (plain, found)
+        ]
         for one, other in zip(*slopes, strict=True):
             assert (one is None) == (other is None)
             if one is not None:

@@ -121,9 +121,7 @@ def test_collision_agrees_with_the_recorded_rear_points(oracle_dir, maze, suffix
         # The original tests the rear point: a body of length 0 has its centre there.
         ours, margin = motion.collided(states, [0.0] * 3, [0.0] * 3, [threshold] * 3, near)
         assert (ours == hit)[margin > 1e-5].all()
-        outlined, _ = motion.collided(
-            states, [1.5] * 3, [1.0] * 3, [threshold + 1e-5] * 3, near, mode="footprint"
-        )
+        outlined, _ = motion.collided(states, [1.5] * 3, [1.0] * 3, [threshold + 1e-5] * 3, near, mode="footprint")
         assert (outlined | ~body).all()  # 25 points of the body cannot hit more than all of it
         hits += int(hit.sum())
     assert 50 < hits < 590

@@ -171,8 +171,10 @@ def test_every_mistake_is_a_sentence_that_names_the_policy(word, told):
 
 
 def test_a_plug_in_is_found_by_its_name(monkeypatch, capsys):
-    points = [metadata.EntryPoint(name, value, own.GROUP) for name, value in
-              (("swarm", "my_robots:Stay"), ("bent", "my_robots"), ("voronoi", "my_robots:Corner"))]  # fmt: skip
+    points = [
+        metadata.EntryPoint(name, value, own.GROUP)
+        for name, value in (("swarm", "my_robots:Stay"), ("bent", "my_robots"), ("voronoi", "my_robots:Corner"))
+    ]
     monkeypatch.setattr(own.metadata, "entry_points", lambda group: [one for one in points if one.group == group])
     found = find_player("swarm")
     assert (found.name, found.kind, found.pictures) == ("swarm", "own", False)

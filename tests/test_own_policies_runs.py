@@ -17,10 +17,17 @@ from maexp.agents.training.named import find_player
 pytestmark = pytest.mark.slow  # trainings
 
 TINY = [
-    "preset=smoke", "num_envs=2", "num_robots=2", "scenario.local_steps=5", "scenario.maps=[0]",
-    "scenario=maze_small", "scenario.held_out=[70]", "device=cpu", "evaluate_every=0",
-]  # fmt: skip
-TEACHER = '''
+    "preset=smoke",
+    "num_envs=2",
+    "num_robots=2",
+    "scenario.local_steps=5",
+    "scenario.maps=[0]",
+    "scenario=maze_small",
+    "scenario.held_out=[70]",
+    "device=cpu",
+    "evaluate_every=0",
+]
+TEACHER = """
 import torch
 
 class First:
@@ -32,7 +39,7 @@ class First:
 def regions(env):
     from maexp.agents.policies import POLICIES
     return POLICIES["voronoi"](env)
-'''
+"""
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +79,18 @@ def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
 
 
 def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
-    words = [*TINY[:4], "scenarios=maze_small", "algorithms=[]", "seeds=0", "episodes=2", "scenario.macro_steps=2",
-             "test_maps=1", "workers=1", "estimate=false", "device=cpu"]  # fmt: skip
+    words = [
+        *TINY[:4],
+        "scenarios=maze_small",
+        "algorithms=[]",
+        "seeds=0",
+        "episodes=2",
+        "scenario.macro_steps=2",
+        "test_maps=1",
+        "workers=1",
+        "estimate=false",
+        "device=cpu",
+    ]
     policies = "policies=[voronoi,universal,teachers:First,aims,./regions]"
     assert main(["benchmark", *words, policies, "hydra.run.dir=table"]) == 0
     names = ["voronoi", "universal", "teachers.First", "aims", "regions"]
@@ -112,8 +129,10 @@ def test_ones_own_policy_is_a_teacher_and_is_told_what_it_must_choose(capsys):
     assert main(["train", *words, "warm_start=teachers:regions", "hydra.run.dir=lost"]) == 2
     told = capsys.readouterr().err
     assert "warm_start=teachers:regions wrote region and offset, and the policy that is to imitate it chooses" in told
-    for word, sentence in (("regions", "chooses regions, which a policy with action=targets"),
-                           ("nobody", "warm_start=nobody is unknown")):  # fmt: skip
+    for word, sentence in (
+        ("regions", "chooses regions, which a policy with action=targets"),
+        ("nobody", "warm_start=nobody is unknown"),
+    ):
         assert main(["train", *words, f"warm_start={word}", "hydra.run.dir=no"]) == 2
         assert sentence in capsys.readouterr().err
 

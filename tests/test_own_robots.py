@@ -41,10 +41,13 @@ def test_an_episode_lasts_as_long_as_its_robots_need():
     assert ExplorationEnv(FLOOR, 1, 2, robot=slow, macro_steps=7).macro_steps == 7
 
 
-@pytest.mark.parametrize(("size", "told"), [
-    ({"length": 100.0}, r"robot\.length=100 m does not fit on map .* of 18\.25 x 16\.25 m"),
-    ({"width": 40.0}, r"robot\.width=40 m does not fit"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        ({"length": 100.0}, r"robot\.length=100 m does not fit on map .* of 18\.25 x 16\.25 m"),
+        ({"width": 40.0}, r"robot\.width=40 m does not fit"),
+    ],
+)
 def test_a_robot_larger_than_the_map_is_refused(size, told):
     with pytest.raises(ValueError, match=told):
         ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig(**size))
@@ -65,8 +68,9 @@ ROUND = {"length": 0.7, "width": 0.7, "collision_threshold": 0.35}
 
 
 def test_a_radius_stands_for_the_sizes_of_the_body():
-    round_one, by_hand = (ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig("differential", **body))
-                          for body in ({"radius": 0.35}, ROUND))  # fmt: skip
+    round_one, by_hand = (
+        ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig("differential", **body)) for body in ({"radius": 0.35}, ROUND)
+    )
     tensors = round_one.simulation.robot_tensors, by_hand.simulation.robot_tensors
     assert all(torch.equal(tensors[0][name], tensors[1][name]) for name in tensors[1])
     again = round_one.robot_configs[0].completed(ROW)
@@ -74,15 +78,21 @@ def test_a_radius_stands_for_the_sizes_of_the_body():
     assert RobotConfig(radius=0.35, **ROUND).completed(ROW).length == 0.7, "the same said twice"
 
 
-@pytest.mark.parametrize(("body", "told"), [
-    ({"radius": 0.3, "length": 1.0}, r"robot\.radius=0\.3 makes robot\.length 0\.6 m, and 1\.0 is given: leave one"),
-    ({"radius": 0.3, "collision_threshold": 0.4}, r"makes robot\.collision_threshold 0\.3 m, and 0\.4 is given"),
-    ({"radius": 0.0}, r"robot\.radius=0\.0 must be a finite number above 0 \[m\]"),
-    ({"radius": math.inf}, r"robot\.radius=inf must be"),
-    ({"radius": True}, r"robot\.radius=True must be"),
-    ({"radius": 50.0}, r"robot\.radius=50 m does not fit on map .* of 18\.25 x 16\.25 m: .* robot\.radius=0\.5"),
-    ({"radius": 4.0}, r"room for 0 of num_robots=2 robots with 12 m of clearance: .* a smaller robot\.radius"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (
+            {"radius": 0.3, "length": 1.0},
+            r"robot\.radius=0\.3 makes robot\.length 0\.6 m, and 1\.0 is given: leave one",
+        ),
+        ({"radius": 0.3, "collision_threshold": 0.4}, r"makes robot\.collision_threshold 0\.3 m, and 0\.4 is given"),
+        ({"radius": 0.0}, r"robot\.radius=0\.0 must be a finite number above 0 \[m\]"),
+        ({"radius": math.inf}, r"robot\.radius=inf must be"),
+        ({"radius": True}, r"robot\.radius=True must be"),
+        ({"radius": 50.0}, r"robot\.radius=50 m does not fit on map .* of 18\.25 x 16\.25 m: .* robot\.radius=0\.5"),
+        ({"radius": 4.0}, r"room for 0 of num_robots=2 robots with 12 m of clearance: .* a smaller robot\.radius"),
+    ],
+)
 def test_a_radius_that_cannot_be(body, told):
     with pytest.raises(ValueError, match=told):
         ExplorationEnv(FLOOR, 1, 2, robot=RobotConfig(**body))

@@ -54,9 +54,13 @@ def test_a_package_with_five_additions_plays(tmp_path):
     apart = os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path)}
     subprocess.run(["git", "apply", *patches], check=True, cwd=copy, env=apart)
     done = subprocess.run(
-        [sys.executable, "-c", PLAY], capture_output=True, text=True, cwd=tmp_path, timeout=1200,
+        [sys.executable, "-c", PLAY],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=1200,
         env=os.environ | {"PYTHONPATH": str(tmp_path)},
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "max_reverse: 0.5  # greatest speed backwards [m/s]" in done.stdout
     assert "robot.max_reverse=-1" in done.stderr

@@ -112,10 +112,17 @@ def test_settings_are_compared_in_colours_and_styles(tmp_path, figures):
 
 def test_gains_have_a_band_and_the_planner_is_zero(tmp_path, figures):
     rows = [
-        {"frames": 10 * k, "validation_gain": k - 2, "validation_gain_low": k - 3, "validation_gain_high": k,
-         "reward": 0.5, "validation_steps_95": 0.0, "coverage": 0.95 + 0.001 * k}
+        {
+            "frames": 10 * k,
+            "validation_gain": k - 2,
+            "validation_gain_low": k - 3,
+            "validation_gain_high": k,
+            "reward": 0.5,
+            "validation_steps_95": 0.0,
+            "coverage": 0.95 + 0.001 * k,
+        }
         for k in range(9)
-    ]  # fmt: skip
+    ]
     rows.insert(5, {"frames": 45, "reward": 0.5})
     coverage = np.array([[0.1, 0.9], [0.2, 0.8]])
     ends = {"trained": ([0.0, 1.0], coverage), "voronoi": ([0.0, 1.0], coverage[:1])}

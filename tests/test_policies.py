@@ -129,9 +129,12 @@ def test_the_oracle_is_told_what_is_truly_to_be_seen():
             point = guessed.points[e, 0, k].numpy()
             origin = np.append(point, 0.0).astype(np.float32)
             visible = visible_points(
-                torch.from_numpy(place.free), torch.from_numpy(place.obstacles), torch.from_numpy(origin), 10.0,
+                torch.from_numpy(place.free),
+                torch.from_numpy(place.obstacles),
+                torch.from_numpy(origin),
+                10.0,
                 obstacle_radius=0.5**0.5,
-            ).numpy()  # fmt: skip
+            ).numpy()
             want = (visible & ~seen).sum() / disc
             assert told.gain[e, 0, k] == pytest.approx(want, abs=0.25 * want + 0.03)
             compared += want > 0.1

@@ -140,8 +140,12 @@ def test_robots_without_a_target_leave_the_choices_of_the_others_as_they_are(nam
         ways = torch.tensor([[points]]) - at[:, kept].unsqueeze(2)
         alive, way = torch.ones(1, 3, dtype=torch.bool), travel.clone()
         alive[:, lost], way[:, lost] = False, INF
-        scene = scene_of(way[:, kept].tolist(), [[points] * len(kept)], alive=alive[:, kept].tolist(),
-                         nav=Places(at[:, kept].tolist(), ways))  # fmt: skip
+        scene = scene_of(
+            way[:, kept].tolist(),
+            [[points] * len(kept)],
+            alive=alive[:, kept].tolist(),
+            nav=Places(at[:, kept].tolist(), ways),
+        )
         return CLASSICAL[name](scene)[0].argmax(-1).tolist()
 
     whole, living = choose([0, 1, 2]), [i for i in range(3) if i not in lost]

@@ -24,29 +24,72 @@ from maexp.envs.fields import check_settings, kinds
 
 # What each setting may be and what it may not be, from what it means (not from the code).
 GOOD = {
-    "gamma": [0, 1.0], "lmbda": [0, 1], "final_lr_share": [0, 1], "accept_ratio": [0, 1],
-    "lr": [1e-9, 2], "critic_lr": [1e-9], "max_grad_norm": [1e-3], "kl_target": [1e-6], "max_kl": [1e-6],
-    "entropy_coeff": [0], "critic_coeff": [0], "clip_value": [0, 10], "kl_coeff": [0], "damping": [0],
+    "gamma": [0, 1.0],
+    "lmbda": [0, 1],
+    "final_lr_share": [0, 1],
+    "accept_ratio": [0, 1],
+    "lr": [1e-9, 2],
+    "critic_lr": [1e-9],
+    "max_grad_norm": [1e-3],
+    "kl_target": [1e-6],
+    "max_kl": [1e-6],
+    "entropy_coeff": [0],
+    "critic_coeff": [0],
+    "clip_value": [0, 10],
+    "kl_coeff": [0],
+    "damping": [0],
     "anchor_coeff": [0, 3],
-    "clip_epsilon": [0.01, 0.99], "backtrack_factor": [0.01, 0.99],
+    "clip_epsilon": [0.01, 0.99],
+    "backtrack_factor": [0.01, 0.99],
     **{name: [True, False] for name in ("value_norm", "normalize_advantage", "finite_horizon", "mask_collided")},
     "mixer": ["vdn", "qmix"],
-    **{name: [1, 7] for name in (
-        "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
-    )},
-}  # fmt: skip
+    **{
+        name: [1, 7]
+        for name in (
+            "minibatch_size",
+            "epochs",
+            "cg_steps",
+            "backtracks",
+            "policy_minibatch_size",
+            "fisher_size",
+            "critic_epochs",
+        )
+    },
+}
 BAD = {
-    "gamma": [-0.1, 1.1, 2], "lmbda": [-1, 2], "final_lr_share": [-0.5, 1.5], "accept_ratio": [-0.1, 1.1],
-    "clip_epsilon": [-1, 0, 1], "backtrack_factor": [0, 1], "mixer": ["sum", ""],
+    "gamma": [-0.1, 1.1, 2],
+    "lmbda": [-1, 2],
+    "final_lr_share": [-0.5, 1.5],
+    "accept_ratio": [-0.1, 1.1],
+    "clip_epsilon": [-1, 0, 1],
+    "backtrack_factor": [0, 1],
+    "mixer": ["sum", ""],
     **{name: [0, -1] for name in ("lr", "critic_lr", "max_grad_norm", "kl_target", "max_kl")},
-    **{name: [-1e-9] for name in (
-        "entropy_coeff", "critic_coeff", "clip_value", "kl_coeff", "damping", "anchor_coeff",
-    )},
-    **{name: [0, -3, 1.5, True] for name in (
-        "minibatch_size", "epochs", "cg_steps", "backtracks", "policy_minibatch_size", "fisher_size", "critic_epochs",
-    )},
+    **{
+        name: [-1e-9]
+        for name in (
+            "entropy_coeff",
+            "critic_coeff",
+            "clip_value",
+            "kl_coeff",
+            "damping",
+            "anchor_coeff",
+        )
+    },
+    **{
+        name: [0, -3, 1.5, True]
+        for name in (
+            "minibatch_size",
+            "epochs",
+            "cg_steps",
+            "backtracks",
+            "policy_minibatch_size",
+            "fisher_size",
+            "critic_epochs",
+        )
+    },
     **{name: [1, "yes"] for name in ("value_norm", "normalize_advantage", "finite_horizon", "mask_collided")},
-}  # fmt: skip
+}
 EVERYWHERE = [math.nan, math.inf, -math.inf, "much", None]
 
 

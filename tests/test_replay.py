@@ -24,9 +24,13 @@ def replay(recorded, **robot) -> tuple[np.ndarray, np.ndarray]:
     """Ways of the robots [m], and their rear points after every local step, [200, N, 2]."""
     episode, place, _ = recorded
     env = ExplorationEnv(
-        place, num_robots=3, num_threads=1, macro_steps=10, robot=RobotConfig(**robot),
+        place,
+        num_robots=3,
+        num_threads=1,
+        macro_steps=10,
+        robot=RobotConfig(**robot),
         planner=PlannerConfig(name="dwa", clearance_factor=4.0),
-    )  # fmt: skip
+    )
     x, y, speed, heading = episode["initial_state"].T
     assert not speed.any()
     ahead = 0.5 * LENGTH * np.stack([np.cos(heading), np.sin(heading)], axis=1)

@@ -26,9 +26,19 @@ def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge, unfin
     maps = [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)]
     reward = RewardConfig(overlap=0.01, charge_rest=charge, unfinished=unfinished)
     env = ExplorationEnv(
-        maps, 4, 2, seed=2, planner=DIRECT, reward=reward, radar=RadarConfig(range=4.0), num_threads=1,
-        robot=RobotConfig(collision_threshold=0.6), local_steps=1, macro_steps=90, success_coverage=1.0,
-    )  # fmt: skip
+        maps,
+        4,
+        2,
+        seed=2,
+        planner=DIRECT,
+        reward=reward,
+        radar=RadarConfig(range=4.0),
+        num_threads=1,
+        robot=RobotConfig(collision_threshold=0.6),
+        local_steps=1,
+        macro_steps=90,
+        success_coverage=1.0,
+    )
     control = torch.tensor([1.0, 0.0]).expand(4, 2, 2)
     td = env.reset()
     before, half, ends = [moment(env, e) for e in range(4)], 0, 0
@@ -43,9 +53,16 @@ def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge, unfin
             weights = team.area_weights(now.map.free_spacing)
             new, overlap = team.counts(old.seen_free, now.visible, weights)
             want = team.reward_terms(
-                new, overlap, old.coverage, False, now.crashed != 0, weights.sum(),
-                coverage_now=now.coverage, charged=left, unfinished=unfinished,
-            )  # fmt: skip
+                new,
+                overlap,
+                old.coverage,
+                False,
+                now.crashed != 0,
+                weights.sum(),
+                coverage_now=now.coverage,
+                charged=left,
+                unfinished=unfinished,
+            )
             for name, values in want.items():  # the terms that the oracle knows
                 term = now.terms[:, REWARD_TERMS.index(name)]
                 np.testing.assert_allclose(term, values, rtol=2e-5, atol=1e-6, err_msg=name)
@@ -74,10 +91,18 @@ def test_gains_pay_at_once_what_time_would_have_cost(unfinished):
     earned, starts, ends = {}, {}, {}
     for kind in ("uncovered", "gained"):
         env = ExplorationEnv(
-            [make_map("maze_small", 0), make_map("maze_small", 1)], 8, 2, planner=DIRECT, local_steps=10, macro_steps=9,
-            reward=RewardConfig(explore=0.0, unfinished=unfinished, time_on=kind), success_coverage=0.3, num_threads=1,
-            seed=5, robot=RobotConfig(collision_threshold=0.6),
-        )  # fmt: skip
+            [make_map("maze_small", 0), make_map("maze_small", 1)],
+            8,
+            2,
+            planner=DIRECT,
+            local_steps=10,
+            macro_steps=9,
+            reward=RewardConfig(explore=0.0, unfinished=unfinished, time_on=kind),
+            success_coverage=0.3,
+            num_threads=1,
+            seed=5,
+            robot=RobotConfig(collision_threshold=0.6),
+        )
         time = REWARD_TERMS.index("time")
         env.set_seed(3)
         td, total = env.reset(), torch.zeros(8, 2)
@@ -98,10 +123,18 @@ def test_gains_pay_at_once_what_time_would_have_cost(unfinished):
 
 def test_gains_by_the_oracle():
     env = ExplorationEnv(
-        [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)], 4, 2, seed=2, planner=DIRECT, num_threads=1,
-        reward=RewardConfig(explore=0.0, unfinished=0.4, time_on="gained"), radar=RadarConfig(range=4.0),
-        local_steps=1, macro_steps=60, success_coverage=0.9,
-    )  # fmt: skip
+        [room(17, 11, "rotated", 1), room(13, 14, "mixed", 2)],
+        4,
+        2,
+        seed=2,
+        planner=DIRECT,
+        num_threads=1,
+        reward=RewardConfig(explore=0.0, unfinished=0.4, time_on="gained"),
+        radar=RadarConfig(range=4.0),
+        local_steps=1,
+        macro_steps=60,
+        success_coverage=0.9,
+    )
     td, time, paid = env.reset(), REWARD_TERMS.index("time"), 0
     before = [moment(env, e) for e in range(4)]
     for _ in range(50):
@@ -111,9 +144,16 @@ def test_gains_by_the_oracle():
             if old.active:
                 done = old.coverage < 0.9 <= now.coverage
                 want = team.reward_terms(
-                    np.zeros(2), np.zeros(2), old.coverage, done, np.zeros(2), 1.0, coverage_now=now.coverage,
-                    unfinished=0.4, gained_for=60 - now.step,
-                )["time"]  # fmt: skip
+                    np.zeros(2),
+                    np.zeros(2),
+                    old.coverage,
+                    done,
+                    np.zeros(2),
+                    1.0,
+                    coverage_now=now.coverage,
+                    unfinished=0.4,
+                    gained_for=60 - now.step,
+                )["time"]
                 np.testing.assert_allclose(now.terms[:, time], want, rtol=2e-4, atol=1e-5)
                 paid += want[0] > 0
         before = after
@@ -148,8 +188,9 @@ def branch(env, state, plan, robot: int, crash: bool) -> torch.Tensor:
 def gains(reward: RewardConfig, robots: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return of crashing minus that of standing still, at every moment of random play: plain and discounted."""
     maps, steps = [make_map("maze_small", 0), make_map("maze_small", 1), room(17, 11, "rotated", 1)], 7
-    env = ExplorationEnv(maps, 10, robots, seed=1, planner=DIRECT, reward=reward, local_steps=8, macro_steps=steps,
-                         num_threads=1)  # fmt: skip
+    env = ExplorationEnv(
+        maps, 10, robots, seed=1, planner=DIRECT, reward=reward, local_steps=8, macro_steps=steps, num_threads=1
+    )
     plan = torch.rand(steps, 10, robots, 2, generator=torch.Generator().manual_seed(4)) * 2 - 1
     fall, td, found = GAMMA ** torch.arange(steps), env.reset(), []
     for step in range(steps):

@@ -209,9 +209,10 @@ class StandIn:
                 ros.sent.append((self.name, message))
                 ended = SimpleNamespace(add_done_callback=ros.waiting.append)
                 handle = SimpleNamespace(
-                    accepted=ros.accepts, get_result_async=lambda: ended,
+                    accepted=ros.accepts,
+                    get_result_async=lambda: ended,
                     cancel_goal_async=lambda: ros.cancelled.append(self.name),
-                )  # fmt: skip
+                )
                 return SimpleNamespace(add_done_callback=lambda call: call(SimpleNamespace(result=lambda: handle)))
 
         return ActionClient

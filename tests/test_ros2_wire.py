@@ -140,7 +140,10 @@ def test_domains_that_are_none(monkeypatch):
 
 
 def test_a_network_that_is_none(monkeypatch):
-    monkeypatch.setenv("CYCLONEDDS_URI", "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='none9'/>"
-                       "</Interfaces></General></Domain></CycloneDDS>")  # fmt: skip
+    monkeypatch.setenv(
+        "CYCLONEDDS_URI",
+        "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='none9'/>"
+        "</Interfaces></General></Domain></CycloneDDS>",
+    )
     with pytest.raises(ValueError, match="DDS does not start in domain 231.*CYCLONEDDS_URI"):
         Wire(231)

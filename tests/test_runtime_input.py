@@ -87,9 +87,7 @@ def test_what_is_strange_in_a_grid_is_unknown_and_said():
     clean[5, 5:8] = -1
     odd[5, 5:8] = np.nan, 101.0, -7.0
     plan, same = TeamPlanner(), TeamPlanner()
-    first, second = (
-        one.plan(grid, 0.1, (0, 0), POSES, now=0.0) for one, grid in ((plan, clean), (same, odd))
-    )
+    first, second = (one.plan(grid, 0.1, (0, 0), POSES, now=0.0) for one, grid in ((plan, clean), (same, odd)))
     assert np.array_equal(first.goals, second.goals) and first.notes == ()
     assert second.notes == ("grid: 3 cells hold neither -1 nor 0 to 100 and were taken as unknown",)
     wrapped = TeamPlanner().plan(clean.astype(np.uint8), 0.1, (0, 0), POSES, now=0.0)
@@ -241,9 +239,13 @@ def test_no_goal_in_a_wall_on_random_grids(seed):
     if rng.random() < 0.2:
         poses[0] = np.nan
     planner = TeamPlanner(
-        str(rng.choice(list(CHOICES))), radar_range=max(cell, rng.uniform(0.3, 12.0)), robot_radius=radius,
-        bounded=bool(rng.random() < 0.3), least_area=rng.choice([None, 0.0]), patience=1.5,
-    )  # fmt: skip
+        str(rng.choice(list(CHOICES))),
+        radar_range=max(cell, rng.uniform(0.3, 12.0)),
+        robot_radius=radius,
+        bounded=bool(rng.random() < 0.3),
+        least_area=rng.choice([None, 0.0]),
+        patience=1.5,
+    )
     for now in range(3):
         plan = planner.plan(grid, cell, origin, poses, now=now)
         check_goals(grid, cell, origin, radius, poses, plan)

@@ -23,9 +23,12 @@ def test_targets_are_shared_out_as_they_should():
         body = rng.uniform(0.2, 1.0, robots)
         got = share_targets(preference, way, points, body).tolist()
         one = {
-            "preference": preference.tolist(), "way": way.tolist(), "point": [points.tolist()] * robots,
-            "hears": [[True] * robots] * robots, "body": body.tolist(),
-        }  # fmt: skip
+            "preference": preference.tolist(),
+            "way": way.tolist(),
+            "point": [points.tolist()] * robots,
+            "hears": [[True] * robots] * robots,
+            "body": body.tolist(),
+        }
         assert got == ([-1 if k is None else k for k in share(one)] if targets else [-1] * robots)
         settled += sum(k >= 0 for k in got)
     assert settled > 500

@@ -94,15 +94,18 @@ def test_the_command(tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("--robots 0", "--robots=0 must be a whole number, 1 or more"), ("--runs 0", "--runs=0 must be"),
-        ("--radius -1", "--radius=-1.0 must be a finite number above 0 [m]"), ("--speed nan", "--speed=nan must be"),
-        ("--seed -1", "--seed=-1 must be a whole number, 0 or more"), ("--range 1,5", "invalid float value: '1,5'"),
+        ("--robots 0", "--robots=0 must be a whole number, 1 or more"),
+        ("--runs 0", "--runs=0 must be"),
+        ("--radius -1", "--radius=-1.0 must be a finite number above 0 [m]"),
+        ("--speed nan", "--speed=nan must be"),
+        ("--seed -1", "--seed=-1 must be a whole number, 0 or more"),
+        ("--range 1,5", "invalid float value: '1,5'"),
         ("--spare out", "spare='out' is unknown: choose wait or home"),
         ("--picture gone/x.png", "--picture=gone/x.png must be a .png file in a folder that is there"),
         ("--metres 8.1 --start 900 0", "start=900 0 is no place for a robot of 0.35 m, nor is any near it: the"),
         ("--metres 8.1 --start nan 0", "start=nan 0 is no place"),
     ],
-)  # fmt: skip
+)
 def test_the_command_refuses_in_a_sentence(words, told, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["runtime", "simulate", *words.split()])
     with pytest.raises(SystemExit) as end:

@@ -76,9 +76,10 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     cfg = compose_config("train", ["num_envs=2", "robot.team=[{kind: differential, radar: {range: 3}}, {}]"])
     maps = [make_map("maze_small", 0)]
     env, shown = make_env(cfg, maps, 2), resolve(cfg, maps)
-    assert [one | {"radar": asdict(radar)} for one, radar in zip(
-        map(asdict, env.robot_configs), env.radar_configs, strict=True)] == [
-            {"radius": None} | one for one in shown["robot"]["team"]]  # fmt: skip
+    assert [
+        one | {"radar": asdict(radar)}
+        for one, radar in zip(map(asdict, env.robot_configs), env.radar_configs, strict=True)
+    ] == [{"radius": None} | one for one in shown["robot"]["team"]]
     assert shown["planner"].items() <= asdict(env.planner_config).items()
     assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
@@ -89,9 +90,17 @@ def test_the_values_are_those_of_the_env_and_the_learner():
 
 def test_every_group_of_settings_reaches_the_env():
     changed = {
-        "robot.max_yaw_rate": 1.0, "radar.evidence": 2, "planner.replan_steps": 7, "reward.time": 0.25, "observation.pictures": False,
-        "comm.range": 5.0, "faults.probability": 0.5, "odometry.drift": 0.01, "targets.distinct": False, "lookahead.horizon": 3,
-    }  # fmt: skip
+        "robot.max_yaw_rate": 1.0,
+        "radar.evidence": 2,
+        "planner.replan_steps": 7,
+        "reward.time": 0.25,
+        "observation.pictures": False,
+        "comm.range": 5.0,
+        "faults.probability": 0.5,
+        "odometry.drift": 0.01,
+        "targets.distinct": False,
+        "lookahead.horizon": 3,
+    }
     assert {name.split(".")[0] for name in changed} == set(GROUPS)
     cfg = compose_config("evaluate", ["num_envs=1", *(f"{name}={value}" for name, value in changed.items())])
     env = make_env(cfg, [make_map("maze_small", 0)], 1)
@@ -174,8 +183,10 @@ def test_a_group_chosen_anew_is_todays():
 
 def test_what_a_scenario_supplies_can_be_set_there():
     saved = save(radar__range=99.0)
-    assert play(saved, "scenario.max_speed=3", "scenario.radar_range=5").items() >= {
-        "robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 0.15}.items()  # fmt: skip
+    assert (
+        play(saved, "scenario.max_speed=3", "scenario.radar_range=5").items()
+        >= {"robot.max_speed": 3.0, "radar.range": 5.0, "robot.length": 0.15}.items()
+    )
 
 
 def test_the_wheelbase_follows_the_body():
@@ -186,8 +197,10 @@ def test_the_wheelbase_follows_the_body():
 
 def test_a_run_takes_another_radius():
     saved = save("scenario=maze")
-    assert play(saved, "robot.radius=0.35").items() >= {
-        "robot.length": 0.7, "robot.wheelbase": 0.7, "robot.collision_threshold": 0.35}.items()  # fmt: skip
+    assert (
+        play(saved, "robot.radius=0.35").items()
+        >= {"robot.length": 0.7, "robot.wheelbase": 0.7, "robot.collision_threshold": 0.35}.items()
+    )
     saved = save("scenario=maze", "robot.radius=0.35")
     assert play(saved)["robot.width"] == 0.7 and play(saved, "robot.radius=0.5")["robot.width"] == 1.0
     assert play(saved, "scenario=indoor_small")["robot.width"] == 0.7

@@ -24,9 +24,14 @@ def build(name: str, critic_encoder: str = "shared"):
     """An env, a policy with some opinion, the loss, and a batch in which episodes end before its end."""
     torch.manual_seed(3)
     env = ExplorationEnv(
-        MAPS, num_envs=4, num_threads=1, macro_steps=2, seed=5,
-        observation=ObservationConfig(targets=24), planner=PlannerConfig(name="wavefront"),
-    )  # fmt: skip
+        MAPS,
+        num_envs=4,
+        num_threads=1,
+        macro_steps=2,
+        seed=5,
+        observation=ObservationConfig(targets=24),
+        planner=PlannerConfig(name="wavefront"),
+    )
     model, row = ModelConfig(action="targets", target_width=8, critic_encoder=critic_encoder), find_algorithm(name)
     policy = make_policy(env, model)
     torch.nn.init.normal_(policy.module[0].module.network.head.weight)

@@ -25,10 +25,16 @@ def test_one_is_shown(capsys):
     assert told.startswith("# universal") and f"Folder: {SHIPPED / 'universal'}" in told and "## Training" in told
 
 
-@pytest.mark.parametrize("words", [
-    ["policies", "show", "universl"], ["evaluate", "policy=universl"], ["view", "policy=universl"],
-    ["irsim", "floor.yaml", "policy=universl"], ["train", "warm_start=universl"],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["policies", "show", "universl"],
+        ["evaluate", "policy=universl"],
+        ["view", "policy=universl"],
+        ["irsim", "floor.yaml", "policy=universl"],
+        ["train", "warm_start=universl"],
+    ],
+)
 def test_a_name_that_is_none_is_a_sentence_with_the_near_ones(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(words) == 2
@@ -53,10 +59,19 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     write_floor(tmp_path / "hall.yaml", 60, 40)
     write_floor(tmp_path / "yard.yaml", 48, 56)
-    done = main([
-        "evaluate", "policy=universal,cost_utility", "scenario=pointcloud", "scenario.path=hall.yaml,yard.yaml",
-        "num_robots=2,3,6,8", "episodes=2", "scenario.macro_steps=2", "device=cpu", "hydra.run.dir=all",
-    ])  # fmt: skip
+    done = main(
+        [
+            "evaluate",
+            "policy=universal,cost_utility",
+            "scenario=pointcloud",
+            "scenario.path=hall.yaml,yard.yaml",
+            "num_robots=2,3,6,8",
+            "episodes=2",
+            "scenario.macro_steps=2",
+            "device=cpu",
+            "hydra.run.dir=all",
+        ]
+    )
     found = json.loads((tmp_path / "all" / "results.json").read_text())
     assert done == 0
     for size in (2, 3, 6, 8):
@@ -71,12 +86,19 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
     assert 0.05 < seen[0] < seen[1] <= 1.0
 
 
-@pytest.mark.parametrize(("file", "change", "part"), [
-    ("weights.safetensors", lambda data: data[:-1] + b"x", "is not the file that its contract names"),
-    ("weights.safetensors", None, "No such file"),
-    ("policy.onnx", lambda data: data[:100], "is not the file that its contract names"),
-    ("contract.json", lambda data: data.replace(b"maexp-policy-2", b"maexp-policy-9"), "of the kind maexp-policy-2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("file", "change", "part"),
+    [
+        ("weights.safetensors", lambda data: data[:-1] + b"x", "is not the file that its contract names"),
+        ("weights.safetensors", None, "No such file"),
+        ("policy.onnx", lambda data: data[:100], "is not the file that its contract names"),
+        (
+            "contract.json",
+            lambda data: data.replace(b"maexp-policy-2", b"maexp-policy-9"),
+            "of the kind maexp-policy-2",
+        ),
+    ],
+)
 @pytest.mark.parametrize("words", [["evaluate", "policy=mine"], ["view", "policy=mine"], ["train", "warm_start=mine"]])
 def test_a_damaged_folder_is_a_sentence(file, change, part, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -134,8 +156,14 @@ def test_a_team_is_viewed_and_imitated(tmp_path, monkeypatch, capsys):
     view = ("renderer=painter", "size=200", "num_envs=1", *SMALL[:2], "hydra.run.dir=seen")
     assert main(["view", "policy=universal", *view]) == 0
     assert "universal, 3 robots" in capsys.readouterr().out and (tmp_path / "seen" / "episodes").is_dir()
-    train = ("total_frames=8", "warm_start_frames=16", "episodes=0", "evaluate_every=0", "model.target_width=8",
-             "hydra.run.dir=pupil")  # fmt: skip
+    train = (
+        "total_frames=8",
+        "warm_start_frames=16",
+        "episodes=0",
+        "evaluate_every=0",
+        "model.target_width=8",
+        "hydra.run.dir=pupil",
+    )
     assert main(["train", "warm_start=universal", *SMALL, *train]) == 0
     log = (tmp_path / "pupil" / "warm_start.csv").read_text().splitlines()
     assert "nll_target" in log[0] and len(log) == 5

@@ -24,9 +24,15 @@ SHOWN = [("agents", "observation", name) for name in ("targets", "targets_mask",
 
 def make_env(scenario: str, num_robots: int, num_envs: int = 1, index: int = 70, **others) -> ExplorationEnv:
     return ExplorationEnv(
-        [make_map(scenario, index)], num_envs, num_robots, seed=5, num_threads=1,
-        planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(pictures=False, targets=24), **others,
-    )  # fmt: skip
+        [make_map(scenario, index)],
+        num_envs,
+        num_robots,
+        seed=5,
+        num_threads=1,
+        planner=PlannerConfig(name="wavefront"),
+        observation=ObservationConfig(pictures=False, targets=24),
+        **others,
+    )
 
 
 def record(policy, env: ExplorationEnv) -> list[torch.Tensor]:
@@ -110,9 +116,14 @@ def play_runtime(planner: TeamPlanner, env: ExplorationEnv) -> tuple[float, np.n
     return float(now["info", "coverage"]), np.stack(goals)
 
 
-@pytest.mark.parametrize(("scenario", "num_robots", "index"), [
-    ("maze_small", 1, 70), ("maze_small", 6, 72), ("indoor_small", 3, 70),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scenario", "num_robots", "index"),
+    [
+        ("maze_small", 1, 70),
+        ("maze_small", 6, 72),
+        ("indoor_small", 3, 70),
+    ],
+)
 def test_the_runtime_plays_the_episode_that_torch_plays(scenario, num_robots, index):
     """Whole episodes: the same goals at every moment, so the same coverage.
 

@@ -18,9 +18,16 @@ from maexp.agents.training.logs import read_metrics
 
 SECONDS = float(os.environ.get("MAEXP_SOAK_SECONDS", 30))
 WORDS = [
-    "scenario=maze_small", "num_envs=8", "num_robots=3", "collector.steps=5", "total_frames=1000000000", "episodes=0",
-    "checkpoint_every=5", "evaluate_every=20", "evaluate_episodes=8",
-]  # fmt: skip
+    "scenario=maze_small",
+    "num_envs=8",
+    "num_robots=3",
+    "collector.steps=5",
+    "total_frames=1000000000",
+    "episodes=0",
+    "checkpoint_every=5",
+    "evaluate_every=20",
+    "evaluate_episodes=8",
+]
 GROWTH_MIB, GROWTH = 16.0, 1.03  # memory may grow by so much after the first quarter: allocators keep some
 SLOWER = 1.15  # processor time of an iteration
 

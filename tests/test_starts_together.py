@@ -26,9 +26,7 @@ def starts_of(env: ExplorationEnv) -> np.ndarray:
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_robots_stand_beside_each_other_and_clear_of_walls(scenario, count):
-    env = ExplorationEnv(
-        [make_map(scenario, k) for k in (0, 1)], 6, count, seed=4, num_threads=1, starts="together"
-    )
+    env = ExplorationEnv([make_map(scenario, k) for k in (0, 1)], 6, count, seed=4, num_threads=1, starts="together")
     need = 3.0 * env.robot_configs[0].collision_threshold
     places = []
     for _ in range(2):

@@ -19,8 +19,9 @@ BASE = (2.0, 10.0)
 
 
 def make(strategy: str = "return_to_base", robots: int = 2, envs: int = 1, base=BASE, **settings) -> ExplorationEnv:
-    comm = CommConfig(range=settings.pop("range", 6.0), base_station=base, strategy=strategy,
-                      period=settings.pop("period", 3))  # fmt: skip
+    comm = CommConfig(
+        range=settings.pop("range", 6.0), base_station=base, strategy=strategy, period=settings.pop("period", 3)
+    )
     settings = {"local_steps": 10, "macro_steps": 40, "num_threads": 1, "seed": 2, "success_coverage": 1.0} | settings
     return ExplorationEnv(WORLD, envs, robots, comm=comm, **settings)
 

@@ -48,9 +48,14 @@ class Recorder:
 def test_steps_observations_and_plans_go_to_the_current_stream(planner, limited, monkeypatch):
     recorder = Recorder(monkeypatch)
     env = ExplorationEnv(
-        [room(22, 19)], num_envs=2, num_robots=2, local_steps=3, num_threads=1, planner=PlannerConfig(name=planner),
+        [room(22, 19)],
+        num_envs=2,
+        num_robots=2,
+        local_steps=3,
+        num_threads=1,
+        planner=PlannerConfig(name=planner),
         comm=CommConfig(range=9.0) if limited else None,
-    )  # fmt: skip
+    )
     chooser = {name: POLICIES[name](env) for name in ("potential_field", "rrt_frontiers", "hungarian")}
     recorder.met.clear()
     td = env.reset()

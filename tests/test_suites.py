@@ -78,10 +78,17 @@ def test_the_simulator_still_plays_the_frozen_episodes():
     assert np.abs(again.metrics["coverage_auc"] - frozen.episodes["coverage_auc"][:4]).max() < 0.02
 
 
-@pytest.mark.parametrize("change", [
-    ("range: 10.0", "range: 11.0"), ("version: 1", "version: 2"), ("decision_limit: 60.0", "decision_limit: 6.0"),
-    ("first: 1000", "first: 1001"), ("'1000': ", "'1000': 0"), ("random: {score: 0.", "random: {score: 0.0"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("range: 10.0", "range: 11.0"),
+        ("version: 1", "version: 2"),
+        ("decision_limit: 60.0", "decision_limit: 6.0"),
+        ("first: 1000", "first: 1001"),
+        ("'1000': ", "'1000': 0"),
+        ("random: {score: 0.", "random: {score: 0.0"),
+    ],
+)
 def test_an_edited_suite_is_refused(small, tmp_path, change):
     path = Path(shutil.copy(small, tmp_path))
     shutil.copy(small.with_suffix(".csv"), tmp_path)
@@ -102,16 +109,19 @@ def test_edited_episodes_and_a_suite_that_is_not_frozen_are_refused(small, tmp_p
         load_suite(str(path)).check()
 
 
-@pytest.mark.parametrize(("change", "told"), [
-    (("seed: 0 ", "seed: -1 "), "seed=-1 must be a whole number, 0 or more"),
-    (("    num_robots: 3\n", ""), "leaves parts.maze_small.num_robots open"),
-    (("length: 1.5, ", ""), "leaves parts.maze_small.robot.length open"),
-    (("length: 1.5,", "lenght: 1.5, length: 1.5,"), "parts.maze_small.robot.lenght is unknown"),
-    (("score: coverage_auc", "score: auc"), "score=auc must be one of the metrics"),
-    (("starts: drawn", "starts: anywhere"), "starts=anywhere is unknown"),
-    (("scenario: maze_small", "scenario: pointcloud"), "scenario=pointcloud builds no maps"),
-    (("parts:", "parts: ["), "cannot be read as YAML"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("seed: 0 ", "seed: -1 "), "seed=-1 must be a whole number, 0 or more"),
+        (("    num_robots: 3\n", ""), "leaves parts.maze_small.num_robots open"),
+        (("length: 1.5, ", ""), "leaves parts.maze_small.robot.length open"),
+        (("length: 1.5,", "lenght: 1.5, length: 1.5,"), "parts.maze_small.robot.lenght is unknown"),
+        (("score: coverage_auc", "score: auc"), "score=auc must be one of the metrics"),
+        (("starts: drawn", "starts: anywhere"), "starts=anywhere is unknown"),
+        (("scenario: maze_small", "scenario: pointcloud"), "scenario=pointcloud builds no maps"),
+        (("parts:", "parts: ["), "cannot be read as YAML"),
+    ],
+)
 def test_a_file_that_defines_no_suite_is_told_in_a_sentence(small, tmp_path, change, told):
     path = Path(shutil.copy(small, tmp_path))
     assert change[0] in path.read_text()
@@ -214,56 +224,70 @@ EDITS = {
     "an action": (edit_actions(other_action), "actions/maze_small-0003.npz", "episode 3: coverage_auc"),
     "an action, its file as it was told": (
         lambda where: edit_json(lambda one: one["files"].update({"actions/maze_small-0003.npz": "0" * 64}))(where),
-        "actions/maze_small-0003.npz", "SHA-256: the file was changed",
+        "actions/maze_small-0003.npz",
+        "SHA-256: the file was changed",
     ),
     "a metric in the file of actions": (
-        edit_actions(lambda arrays: arrays["metrics"].__iadd__(0.01)), "actions/maze_small-0003.npz",
+        edit_actions(lambda arrays: arrays["metrics"].__iadd__(0.01)),
+        "actions/maze_small-0003.npz",
         "episode 3: coverage_auc",
     ),
     "an episode that ends earlier": (
-        edit_actions(lambda arrays: arrays["decisions"].__isub__(1)), "actions/maze_small-0003.npz",
+        edit_actions(lambda arrays: arrays["decisions"].__isub__(1)),
+        "actions/maze_small-0003.npz",
         "episode 3: coverage_auc",
     ),
     "another map": (edit_json(set_map), "results.json", "maps.maze_small.1000"),
     "another map of an episode": (
-        edit_json(lambda one: one["episodes"]["maze_small"]["map"].reverse()), "results.json",
+        edit_json(lambda one: one["episodes"]["maze_small"]["map"].reverse()),
+        "results.json",
         "episodes.maze_small.map",
     ),
     "another version of the suite": (
-        edit_json(lambda one: one["suite"].update(version=2)), "results.json", "suite.version",
+        edit_json(lambda one: one["suite"].update(version=2)),
+        "results.json",
+        "suite.version",
     ),
     "another checksum": (
-        edit_json(lambda one: one["suite"].update(checksum="0" * 64)), "results.json", "suite.checksum",
+        edit_json(lambda one: one["suite"].update(checksum="0" * 64)),
+        "results.json",
+        "suite.checksum",
     ),
     "another seed": (edit_json(lambda one: one["suite"].update(seed=5)), "results.json", "suite.seed"),
     "a score": (edit_json(lambda one: one["score"].update(mean=0.99)), "results.json", "score.mean"),
     "an interval": (edit_json(lambda one: one["score"]["ci95"].reverse()), "results.json", "score.ci95[0]"),
     "a mean of a part": (
-        edit_json(lambda one: one["parts"]["maze_small"]["path_length"].update(mean=1.0)), "results.json",
+        edit_json(lambda one: one["parts"]["maze_small"]["path_length"].update(mean=1.0)),
+        "results.json",
         "parts.maze_small.path_length.mean",
     ),
     "a difference": (
-        edit_json(lambda one: one["reference"]["difference"]["coverage_auc"].update(mean=0.1)), "results.json",
+        edit_json(lambda one: one["reference"]["difference"]["coverage_auc"].update(mean=0.1)),
+        "results.json",
         "reference.difference.coverage_auc.mean",
     ),
     "a profile": (
-        edit_json(lambda one: one["profile"]["policy"].__setitem__(3, 0.5)), "results.json", "profile.policy[3]",
+        edit_json(lambda one: one["profile"]["policy"].__setitem__(3, 0.5)),
+        "results.json",
+        "profile.policy[3]",
     ),
     "a time": (edit_json(lambda one: one["decisions"].update(mean_seconds=1e-9)), "results.json", "decisions.mean_sec"),
     "a reference": (edit_json(lambda one: one["reference"].update(score=0.1)), "results.json", "reference.score"),
     "a part left out": (edit_json(lambda one: one["parts"].pop("maze_small")), "results.json", "parts.maze_small"),
     "a damaged file": (cut_off, "actions/indoor_small-0000.npz", "is damaged or holds something else"),
     "a missing file": (
-        lambda where: (where / "actions" / "maze_small-0000.npz").unlink(), "actions/maze_small-0000.npz",
+        lambda where: (where / "actions" / "maze_small-0000.npz").unlink(),
+        "actions/maze_small-0000.npz",
         "not in both",
     ),
     "a file more": (
         lambda where: shutil.copy(where / "actions" / "maze_small-0000.npz", where / "actions" / "x.npz"),
-        "actions/x.npz", "not in both",
+        "actions/x.npz",
+        "not in both",
     ),
     "no JSON": (lambda where: (where / "results.json").write_text("{"), "results.json", "is missing, damaged"),
     "an entry of another kind": (edit_json(lambda one: one.update(episodes=3)), "results.json", "episodes"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", EDITS)
@@ -293,8 +317,10 @@ def test_a_stopped_run_goes_on_to_the_same_results(small, played, tmp_path, monk
     assert f"maexp suite run resume={where}" in capsys.readouterr().err
     monkeypatch.undo()
     assert sorted(one.name for one in (where / "actions").iterdir()) == [
-        "indoor_small-0000.npz", "maze_small-0000.npz", "maze_small-0003.npz",
-    ]  # fmt: skip
+        "indoor_small-0000.npz",
+        "maze_small-0000.npz",
+        "maze_small-0003.npz",
+    ]
     kept = (where / "actions" / "indoor_small-0000.npz").stat().st_mtime_ns
     assert main(["suite", "run", f"resume={where}"]) == 0
     assert (where / "actions" / "indoor_small-0000.npz").stat().st_mtime_ns == kept
@@ -382,12 +408,20 @@ def test_a_profile_falls_from_all_to_none():
 # The command line
 
 
-@pytest.mark.parametrize(("words", "told"), [
-    (["show"], "needs a name: minival"), (["run", "minival"], "give policy=NAME"), (["verify"], "the folder of a run"),
-    (["show", "maxival"], "maxival is no suite: choose one of minival"), (["list", "minival"], "leave minival out"),
-    (["run", "minival", "policy=nobody"], "nobody"), (["run", "minival", "policy=random", "num_envs=0"], "num_envs=0"),
-    (["verify", "nowhere"], "nowhere is no folder"), (["run", "minival", "policy=random", "seed=-1"], "seed=-1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["show"], "needs a name: minival"),
+        (["run", "minival"], "give policy=NAME"),
+        (["verify"], "the folder of a run"),
+        (["show", "maxival"], "maxival is no suite: choose one of minival"),
+        (["list", "minival"], "leave minival out"),
+        (["run", "minival", "policy=nobody"], "nobody"),
+        (["run", "minival", "policy=random", "num_envs=0"], "num_envs=0"),
+        (["verify", "nowhere"], "nowhere is no folder"),
+        (["run", "minival", "policy=random", "seed=-1"], "seed=-1"),
+    ],
+)
 def test_bad_words_get_a_sentence(words, told, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["suite", *words]) == 2

@@ -22,10 +22,20 @@ from maexp.envs import ExplorationEnv, make_map
 pytestmark = pytest.mark.slow  # trainings
 
 SMALL = [
-    "scenario.maps=[0]", "scenario.validation=[1]", "scenario.held_out=[70]", "num_envs=3", "scenario.macro_steps=2",
-    "scenario.local_steps=3", "total_frames=6", "model.channels=4", "episodes=5", "evaluate_episodes=2", "device=cpu",
-    "classical=[cost_utility,nearest_frontier]", "hydra.sweep.dir=all",
-]  # fmt: skip
+    "scenario.maps=[0]",
+    "scenario.validation=[1]",
+    "scenario.held_out=[70]",
+    "num_envs=3",
+    "scenario.macro_steps=2",
+    "scenario.local_steps=3",
+    "total_frames=6",
+    "model.channels=4",
+    "episodes=5",
+    "evaluate_episodes=2",
+    "device=cpu",
+    "classical=[cost_utility,nearest_frontier]",
+    "hydra.sweep.dir=all",
+]
 
 
 @pytest.fixture
@@ -58,7 +68,12 @@ def test_a_sweep_ends_with_one_table_and_planners_play_once(tmp_path, monkeypatc
     rows = [line.split()[0] for line in table.splitlines() if line.startswith(" ") and line.split()[1:]]
     assert rows[0] == "policy"
     assert [row for row in rows if row in ("seed=3", "seed=4", "random", "cost_utility", "nearest_frontier")] == [
-        "seed=3", "seed=4", "random", "cost_utility", "nearest_frontier"]  # fmt: skip
+        "seed=3",
+        "seed=4",
+        "random",
+        "cost_utility",
+        "nearest_frontier",
+    ]
     with open("all/runs.csv", newline="") as file:
         means = {row["run"]: row for row in csv.DictReader(file)}
     assert [*means] == ["seed=3", "seed=4", "random", "cost_utility", "nearest_frontier"]
@@ -90,10 +105,22 @@ def test_only_what_would_be_the_same_is_not_played_again():
 
 
 SWEEP = [
-    "train", "-m", "seed=0,1,2", "scenario.maps=[0]", "scenario.held_out=[70]", "scenario.macro_steps=2",
-    "scenario.local_steps=2", "num_envs=2", "num_robots=2", "collector.steps=2", "total_frames=16", "episodes=0",
-    "model.channels=4", "evaluate_every=0", "checkpoint_every=1",
-]  # fmt: skip
+    "train",
+    "-m",
+    "seed=0,1,2",
+    "scenario.maps=[0]",
+    "scenario.held_out=[70]",
+    "scenario.macro_steps=2",
+    "scenario.local_steps=2",
+    "num_envs=2",
+    "num_robots=2",
+    "collector.steps=2",
+    "total_frames=16",
+    "episodes=0",
+    "model.channels=4",
+    "evaluate_every=0",
+    "checkpoint_every=1",
+]
 
 
 def numbers(run: str) -> list[dict]:
@@ -129,11 +156,17 @@ def test_stopped_and_resumed_is_unbroken(tmp_path, monkeypatch, capsys):
         assert numbers(f"my sweep/{run}") == numbers(f"whole/{run}") and len(numbers(f"whole/{run}")) == 4
 
 
-@pytest.mark.parametrize("words, told", [
-    (["resume=sweep", "seed=3"], "resume=sweep with -m keeps all settings of a sweep: leave seed out."),
-    (["resume=gone"], "resume=gone with -m: there is no sweep.json of a sweep that could be read (FileNotFoundError)"),
-    (["resume=sweep"], "that could be read (JSONDecodeError). For a single run leave out -m."),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (["resume=sweep", "seed=3"], "resume=sweep with -m keeps all settings of a sweep: leave seed out."),
+        (
+            ["resume=gone"],
+            "resume=gone with -m: there is no sweep.json of a sweep that could be read (FileNotFoundError)",
+        ),
+        (["resume=sweep"], "that could be read (JSONDecodeError). For a single run leave out -m."),
+    ],
+)
 def test_what_cannot_go_on_is_a_sentence(words, told, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("sweep").mkdir()

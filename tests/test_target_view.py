@@ -189,12 +189,23 @@ def test_features_agree_with_their_definitions(reach):
     first = nav.points_on_way(torch.where(state["mask"], state["cell"], -1), 3.0)
     limit = sim.robot_tensors["max_speed"]
     arrays = {
-        "point": state["point"], "some": state["mask"], "ways": ways, "gain": gain, "toward": state["toward"],
-        "travel": ways.diagonal(dim1=1, dim2=3).permute(0, 2, 1), "first": first, "center": nav.centers(),
-        "heading": sim.tensors["pose"][..., 3], "speed": speed, "limit": limit,
-        "drive": torch.minimum(2.0 * speed + 0.5 * 2.0 * 4.0, 2.0 * limit), "alive": nav.alive(), "last": state["last"],
-        "has_last": state["has_last"], "comm": sim.tensors["comm"],
-    }  # fmt: skip
+        "point": state["point"],
+        "some": state["mask"],
+        "ways": ways,
+        "gain": gain,
+        "toward": state["toward"],
+        "travel": ways.diagonal(dim1=1, dim2=3).permute(0, 2, 1),
+        "first": first,
+        "center": nav.centers(),
+        "heading": sim.tensors["pose"][..., 3],
+        "speed": speed,
+        "limit": limit,
+        "drive": torch.minimum(2.0 * speed + 0.5 * 2.0 * 4.0, 2.0 * limit),
+        "alive": nav.alive(),
+        "last": state["last"],
+        "has_last": state["has_last"],
+        "comm": sim.tensors["comm"],
+    }
     scene = {name: value.double().numpy() for name, value in arrays.items()} | {"reach": 10.0, "least_gain": 0.3}
     checked = 0
     for e, i, k in state["mask"].nonzero().tolist():

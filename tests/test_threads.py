@@ -64,9 +64,14 @@ def learner(name: str):
     """An updater of targets and a batch."""
     torch.manual_seed(3)
     env = ExplorationEnv(
-        make_map("maze_small", 0), num_envs=4, num_threads=1, macro_steps=3, seed=5,
-        observation=ObservationConfig(targets=24), planner=PlannerConfig(name="wavefront"),
-    )  # fmt: skip
+        make_map("maze_small", 0),
+        num_envs=4,
+        num_threads=1,
+        macro_steps=3,
+        seed=5,
+        observation=ObservationConfig(targets=24),
+        planner=PlannerConfig(name="wavefront"),
+    )
     model, row = ModelConfig(action="targets", target_width=8), find_algorithm(name)
     policy = make_policy(env, model)
     settings = row.configure(minibatch_size=3)

@@ -26,15 +26,31 @@ from maexp.envs import make_map
 pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands
 
 TINY = [
-    "scenario=maze_small", "action=regions", "scenario.maps=[0,1]", "scenario.held_out=[70]", "scenario.macro_steps=3",
-    "scenario.local_steps=5", "num_envs=3", "num_robots=2", "collector.steps=2", "checkpoint_every=2", "episodes=0",
-    "evaluate_every=0", "evaluate_episodes=4",
-]  # fmt: skip
+    "scenario=maze_small",
+    "action=regions",
+    "scenario.maps=[0,1]",
+    "scenario.held_out=[70]",
+    "scenario.macro_steps=3",
+    "scenario.local_steps=5",
+    "num_envs=3",
+    "num_robots=2",
+    "collector.steps=2",
+    "checkpoint_every=2",
+    "episodes=0",
+    "evaluate_every=0",
+    "evaluate_episodes=4",
+]
 BATCH = 6
 CLOCKS = (
-    "seconds", "frames_per_second", "time_wait", "time_simulate", "time_policy", "time_advantage", "time_update",
+    "seconds",
+    "frames_per_second",
+    "time_wait",
+    "time_simulate",
+    "time_policy",
+    "time_advantage",
+    "time_update",
     "time_validation",
-)  # fmt: skip
+)
 
 
 @pytest.fixture(autouse=True)
@@ -215,9 +231,17 @@ def test_teams_of_several_sizes_in_one_batch(capsys):
 def test_several_scenarios_in_one_batch(tmp_path, capsys):
     """Each with its own robots and episodes; resumed it goes on with all of them."""
     words = [
-        "scenario=maze_small", "scenario.also=[indoor_small]", "scenario.maps=[0]", "scenario.held_out=[70]",
-        "scenario.macro_steps=2", "num_envs=4", "episodes=0", "evaluate_every=0", "action=targets", "algorithm=mappo",
-    ]  # fmt: skip
+        "scenario=maze_small",
+        "scenario.also=[indoor_small]",
+        "scenario.maps=[0]",
+        "scenario.held_out=[70]",
+        "scenario.macro_steps=2",
+        "num_envs=4",
+        "episodes=0",
+        "evaluate_every=0",
+        "action=targets",
+        "algorithm=mappo",
+    ]
     batch = 2 * 2 + 2 * 15
     assert main(["train", *words, "hydra.run.dir=whole", f"total_frames={2 * batch}"]) == 0
     assert main(["train", *words, "hydra.run.dir=halves", f"total_frames={batch}"]) == 0
@@ -244,10 +268,15 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
 def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
     """The same places with shorter decisions, beside a map of the user's."""
     make_map("maze_small", 3).save(tmp_path / "mine.npz")
-    cfg = compose_config("train", [
-        "scenario=maze_small", "num_robots=2", "action=targets",
-        f"scenario.also=[{{name:maze_small,local_steps:5,maps:[1]}},{{name:pointcloud,path:{tmp_path}/mine.npz}}]",
-    ])  # fmt: skip
+    cfg = compose_config(
+        "train",
+        [
+            "scenario=maze_small",
+            "num_robots=2",
+            "action=targets",
+            f"scenario.also=[{{name:maze_small,local_steps:5,maps:[1]}},{{name:pointcloud,path:{tmp_path}/mine.npz}}]",
+        ],
+    )
     short, mine = other_scenarios(cfg, cfg)
     env = make_env(short, load_maps(short.scenario).train, 2, 1)
     assert (env.local_steps, env.macro_steps) == (5, 15)
@@ -255,8 +284,9 @@ def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
     assert [one.name for one in load_maps(mine.scenario).train] == ["maze_small_3"]
     assert cfg.scenario.local_steps is None or cfg.scenario.local_steps == 20
     assert [title_scenario(one) for one in cfg.scenario.also] == [
-        "maze_small local_steps=5 maps=[1]", "pointcloud path=1 file"
-    ]  # fmt: skip
+        "maze_small local_steps=5 maps=[1]",
+        "pointcloud path=1 file",
+    ]
 
 
 def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
@@ -290,9 +320,7 @@ def test_the_gain_is_the_paired_difference_to_the_best_planner(monkeypatch):
         best = max(planners, key=lambda one: told[one]["coverage_auc"]["mean"])
         assert row["validation_coverage_auc"] == pytest.approx(told["trained"]["coverage_auc"]["mean"], abs=1e-6)
         found = told["difference"]["trained"][best]
-        for column, metric, factor in (
-            ("gain", "coverage_auc", 100), ("steps_95", "coverage_step_95_censored", 1)
-        ):  # fmt: skip
+        for column, metric, factor in (("gain", "coverage_auc", 100), ("steps_95", "coverage_step_95_censored", 1)):
             values = [found[metric]["mean"], *found[metric]["ci95"]]
             columns = [row[f"validation_{column}{end}"] for end in ("", "_low", "_high")]
             assert columns == pytest.approx([factor * value for value in values], abs=1e-4)

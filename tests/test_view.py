@@ -117,8 +117,10 @@ def test_film_shows_the_teams_at_the_same_time():
     env = make_env(2)
     episodes = play_teams(env, POLICIES["random"](env), "random", every=2)
     short = episodes[1]
-    cut = {name: getattr(short, name)[:4] for name in ("step", "pose", "center", "goal", "waypoint", "collided",
-                                                       "coverage", "visible")}  # fmt: skip
+    cut = {
+        name: getattr(short, name)[:4]
+        for name in ("step", "pose", "center", "goal", "waypoint", "collided", "coverage", "visible")
+    }
     episodes[1] = Episode(**{**short.__dict__, **cut})  # a team that was done early
     frames = draw_film(episodes)
     assert len(frames) == 10

@@ -41,11 +41,20 @@ def team(place: PointCloudMap, **changes) -> dict:
     center = np.array([[3.0, 3.0], [16.0, 12.0]])
     none = {"free": np.zeros((2, len(place.free)), bool), "boundary": np.zeros((2, len(place.boundary)), bool)}
     snapshot = {
-        "map": place, "pose": np.column_stack([center, np.zeros((2, 2))]), "center": center, "trail": center[None],
-        "body": np.full((2, 2), [1.2, 0.8]), "goal": np.full((2, 2), np.nan), "radar_range": np.full(2, 0.1),
-        "seen_free": none["free"], "seen_boundary": none["boundary"], "visible": none["free"], "coverage": 0.0,
-        "local_step": 0, "collided": np.zeros(2, bool),
-    }  # fmt: skip
+        "map": place,
+        "pose": np.column_stack([center, np.zeros((2, 2))]),
+        "center": center,
+        "trail": center[None],
+        "body": np.full((2, 2), [1.2, 0.8]),
+        "goal": np.full((2, 2), np.nan),
+        "radar_range": np.full(2, 0.1),
+        "seen_free": none["free"],
+        "seen_boundary": none["boundary"],
+        "visible": none["free"],
+        "coverage": 0.0,
+        "local_step": 0,
+        "collided": np.zeros(2, bool),
+    }
     return snapshot | changes
 
 
@@ -216,8 +225,11 @@ def test_the_picture_shows_the_episode_that_is_asked_for(tmp_path, capsys, monke
     assert np.array_equal(picture("e", "episode=10"), alone["random_10"])
     assert np.array_equal(picture("e", "episode=11", "policy=voronoi"), alone["voronoi_11"])
     assert not np.array_equal(alone["random_10"], alone["random_9"])
-    for words, wanted in ((["episode=12"], "give 9 to 11"), (["policy=frontier"], "those of random, voronoi"),
-                          (["policy=nearest_frontier"], "those of random, voronoi")):  # fmt: skip
+    for words, wanted in (
+        (["episode=12"], "give 9 to 11"),
+        (["policy=frontier"], "those of random, voronoi"),
+        (["policy=nearest_frontier"], "those of random, voronoi"),
+    ):
         assert main(["view", "e", *words, "out=b.png"]) == 2 and not Path("b.png").exists()
         err = capsys.readouterr().err
         assert wanted in err and err.count("\n") == 1, err

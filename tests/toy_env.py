@@ -41,17 +41,15 @@ class ToyEnv(EnvBase):
             shape=lead,
         )
         region = Categorical(side * side, shape=team, dtype=torch.int64)
-        action = {"control": Bounded(-1, 1, (*team, 2))} if control else {
-            "region": region, "offset": Bounded(-1, 1, (*team, 2))
-        }  # fmt: skip
-        self.action_spec = Composite(
-            agents=Composite(action=Composite(**action, shape=team), shape=team), shape=lead
+        action = (
+            {"control": Bounded(-1, 1, (*team, 2))}
+            if control
+            else {"region": region, "offset": Bounded(-1, 1, (*team, 2))}
         )
+        self.action_spec = Composite(agents=Composite(action=Composite(**action, shape=team), shape=team), shape=lead)
         self.reward_spec = Composite(agents=Composite(reward=Unbounded((*team, 1)), shape=team), shape=lead)
         flag = Binary(shape=(*lead, 1), dtype=torch.bool)
-        self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=lead
-        )
+        self.done_spec = Composite(done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=lead)
         self.target = torch.zeros(team, dtype=torch.int64)
         self.step_count = torch.zeros(lead, dtype=torch.int64)
         self.terminal = torch.zeros(lead, dtype=torch.bool)

@@ -50,11 +50,31 @@ def turned(points, angle: float, shift=(0.0, 0.0)) -> np.ndarray:
 def moment(env: ExplorationEnv, index: int) -> SimpleNamespace:
     """Everything env `index` holds now, copied; flags in the order of its map."""
     state = env.simulation.tensors
-    fields = {name: state[name][index].cpu().numpy().copy() for name in (
-        "pose", "slip", "control", "waypoint", "collided", "crashed", "discovered", "overlap", "terms", "unscaled",
-        "covered", "shared", "local_step", "active", "terminated", "milestone_step", "milestone_overlap",
-        "milestone_path", "path_length", "map_id",
-    )}  # fmt: skip
+    fields = {
+        name: state[name][index].cpu().numpy().copy()
+        for name in (
+            "pose",
+            "slip",
+            "control",
+            "waypoint",
+            "collided",
+            "crashed",
+            "discovered",
+            "overlap",
+            "terms",
+            "unscaled",
+            "covered",
+            "shared",
+            "local_step",
+            "active",
+            "terminated",
+            "milestone_step",
+            "milestone_overlap",
+            "milestone_path",
+            "path_length",
+            "map_id",
+        )
+    }
     now = SimpleNamespace(**env.snapshot(index) | fields | {"step": int(fields["local_step"])})
     m = int(fields["map_id"])
     for what, order in (("free", env.bank.order_free[m]), ("boundary", env.bank.order_boundary[m])):

@@ -65,11 +65,14 @@ class ExpertUpdater(Updater):
         found = flat[(flat[TRIED][..., 1:] >= 0).flatten(1).any(1)]
         found = TensorDict(
             {
-                "features": found[TARGETS].half(), "mask": found[TARGETS_MASK], "comm": found[COMM],
-                "tried": found[TRIED], "advantage": found[ADVANTAGE],
+                "features": found[TARGETS].half(),
+                "mask": found[TARGETS_MASK],
+                "comm": found[COMM],
+                "tried": found[TRIED],
+                "advantage": found[ADVANTAGE],
             },
             batch_size=len(found),
-        ).to(self.policy_params[0].device)  # fmt: skip
+        ).to(self.policy_params[0].device)
         robots = found["mask"].shape[1]
         known = torch.cat([self.memory[robots], found]) if robots in self.memory else found
         if len(known):

@@ -115,10 +115,20 @@ class TeamLoss(LossModule):
         sample_log_prob: list = field(default_factory=list)
 
     def __init__(
-        self, actor, critic, *, gamma: float, lmbda: float, finite_horizon: bool, entropy_coeff: float,
-        critic_coeff: float, normalize_advantage: bool, mask_collided: bool, clip_value: float | None = None,
+        self,
+        actor,
+        critic,
+        *,
+        gamma: float,
+        lmbda: float,
+        finite_horizon: bool,
+        entropy_coeff: float,
+        critic_coeff: float,
+        normalize_advantage: bool,
+        mask_collided: bool,
+        clip_value: float | None = None,
         value_norm=None,
-    ):  # fmt: skip
+    ):
         super().__init__()
         self.convert_to_functional(actor, "actor_network", create_target_params=False)
         self.convert_to_functional(critic, "critic_network", create_target_params=False)
@@ -259,14 +269,17 @@ class ClippedLoss(TeamLoss):
         entropy = select_living(dist.entropy().unsqueeze(-1), alive)
         then = log_ratio.detach().squeeze(-1)
         sample_size = (2 * then.logsumexp(0) - (2 * then).logsumexp(0)).exp() / len(then)
-        return TensorDict({
-            "loss_objective": (-gain).mean(),
-            "clip_fraction": (clipped != log_ratio).to(log_ratio.dtype).mean(),
-            "kl": (-log_ratio).detach().mean(),
-            "entropy": entropy.detach().mean(),
-            "loss_entropy": (-self.entropy_coeff * entropy).mean(),
-            "ESS": sample_size,
-        } | near)  # fmt: skip
+        return TensorDict(
+            {
+                "loss_objective": (-gain).mean(),
+                "clip_fraction": (clipped != log_ratio).to(log_ratio.dtype).mean(),
+                "kl": (-log_ratio).detach().mean(),
+                "entropy": entropy.detach().mean(),
+                "loss_entropy": (-self.entropy_coeff * entropy).mean(),
+                "ESS": sample_size,
+            }
+            | near
+        )
 
     def adapt_penalty(self, divergence: float) -> None:
         """Raise the coefficient by half above twice the target, halve it below half the target (Schulman 2017)."""

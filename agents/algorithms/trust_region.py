@@ -70,9 +70,13 @@ class TRPO(torch.optim.Optimizer):
         if max_kl <= 0:
             raise ValueError(f"max_kl={max_kl} must be positive.")
         settings = dict(
-            max_kl=max_kl, accept_ratio=accept_ratio, damping=damping, cg_steps=cg_steps,
-            backtracks=backtracks, backtrack_factor=backtrack_factor,
-        )  # fmt: skip
+            max_kl=max_kl,
+            accept_ratio=accept_ratio,
+            damping=damping,
+            cg_steps=cg_steps,
+            backtracks=backtracks,
+            backtrack_factor=backtrack_factor,
+        )
         super().__init__(params, settings)
         if len(self.param_groups) != 1:
             raise ValueError("TRPO takes one group of parameters: the trust region binds them together.")

@@ -278,6 +278,4 @@ class TrustRegionUpdater(Updater):
 
 def summary(outputs: list[TensorDict]) -> dict[str, float]:
     """What a loss reports, averaged over the batches."""
-    return {
-        name: sum(out[name].float().mean().item() for out in outputs) / len(outputs) for name in outputs[0].keys()
-    }
+    return {name: sum(out[name].float().mean().item() for out in outputs) / len(outputs) for name in outputs[0].keys()}

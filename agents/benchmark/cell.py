@@ -202,6 +202,15 @@ def read_result(where: Path, cell: Cell, suite: str) -> EvaluationResult:
             f"{command('benchmark', f'resume={short(where)}')} plays {cell.name} again."
         ) from error
     return EvaluationResult(
-        cell.policy, team, episodes, wall, maps, learned=is_learned(cell.policy), times=times, coverage=coverage,
-        success_coverage=goal, trainings=np.full(len(maps), cell.seed) if cell.trains else None, run=run,
-    )  # fmt: skip
+        cell.policy,
+        team,
+        episodes,
+        wall,
+        maps,
+        learned=is_learned(cell.policy),
+        times=times,
+        coverage=coverage,
+        success_coverage=goal,
+        trainings=np.full(len(maps), cell.seed) if cell.trains else None,
+        run=run,
+    )

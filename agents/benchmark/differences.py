@@ -6,8 +6,12 @@ from maexp.agents.evaluation.evidence import brackets
 from maexp.envs.metrics import in_reach
 
 Played = list[tuple[Cell, EvaluationResult]]
-SHOWN = (("coverage_auc", "AUC, points", 100, 1), ("coverage_step_95_censored", "to 95, steps", 1, 0),
-         ("coverage_step_99_censored", "to 99, steps", 1, 0), ("collisions", "robots lost", 1, 2))  # fmt: skip
+SHOWN = (
+    ("coverage_auc", "AUC, points", 100, 1),
+    ("coverage_step_95_censored", "to 95, steps", 1, 0),
+    ("coverage_step_99_censored", "to 99, steps", 1, 0),
+    ("collisions", "robots lost", 1, 2),
+)
 """Metric, title, scale and digits of what is shown of a difference."""
 
 

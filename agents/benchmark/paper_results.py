@@ -4,8 +4,14 @@ Mean and standard deviation over 300 episodes (3 seeds x 100), on the maps train
 got there. ER and MO in %, CS in local steps.
 """
 
-COLUMNS = ("exploration_ratio", "coverage_step_85", "coverage_step_95", "mutual_overlap_85", "mutual_overlap_95",
-           "reward_variance")  # fmt: skip
+COLUMNS = (
+    "exploration_ratio",
+    "coverage_step_85",
+    "coverage_step_95",
+    "mutual_overlap_85",
+    "mutual_overlap_95",
+    "reward_variance",
+)
 
 PAPER: dict[str, dict[str, tuple]] = {
     "random_obstacles": {

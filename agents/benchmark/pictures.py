@@ -91,10 +91,19 @@ def _kinds(figure: Figure, coverage: dict[str, list]) -> list:
     have |= {"paper"} if any(row[3] is not None for rows in coverage.values() for row in rows) else set()
     labels = {"paper": "paper (same map trained and tested)", "trained": "networks and policies of your own"}
     return [
-        Line2D([], [], linestyle="none", marker=marker, color=colour, markersize=5, label=labels.get(kind, kind),
-               mfc="none" if kind == "paper" else colour)
-        for kind, (colour, marker) in KINDS.items() if kind in have
-    ]  # fmt: skip
+        Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker=marker,
+            color=colour,
+            markersize=5,
+            label=labels.get(kind, kind),
+            mfc="none" if kind == "paper" else colour,
+        )
+        for kind, (colour, marker) in KINDS.items()
+        if kind in have
+    ]
 
 
 def draw_improvement(pairs: dict[tuple[str, str], dict], listed: list[str], path) -> Path:
@@ -133,9 +142,16 @@ def _draw_matrix(figure: Figure, ax, pairs: dict, names: list[str]) -> None:
     for (one, other), found in pairs.items():
         mean, (low, high) = found["mean"], found["ci95"]
         if mean == mean:
-            ax.text(names.index(other), names.index(one), f"{100 * mean:.0f}", ha="center", va="center", fontsize=8,
-                    color="white" if abs(mean - 0.5) > 0.38 else "black",
-                    fontweight="bold" if low > 0.5 or high < 0.5 else "normal")  # fmt: skip
+            ax.text(
+                names.index(other),
+                names.index(one),
+                f"{100 * mean:.0f}",
+                ha="center",
+                va="center",
+                fontsize=8,
+                color="white" if abs(mean - 0.5) > 0.38 else "black",
+                fontweight="bold" if low > 0.5 or high < 0.5 else "normal",
+            )
     ax.set_xticks(range(size), names, rotation=90)
     ax.set_yticks(range(size), names)
     ax.grid(False)

@@ -28,19 +28,56 @@ SOURCES = "sources"
 TOGETHER = "together"
 """In place of a scenario's name: all of them at once."""
 SUITES = {
-    "held_out": "held-out maps", "trained": "training maps", "held_out_together": "held-out maps, starts together"
-}  # fmt: skip
+    "held_out": "held-out maps",
+    "trained": "training maps",
+    "held_out_together": "held-out maps, starts together",
+}
 SECTIONS = (
-    "scenario", "robot", "radar", "planner", "reward", "observation", "comm", "faults", "odometry", "targets",
-    "lookahead", "model", "collector", "algorithm", "action", "tuning", "num_envs", "num_robots", "device",
-    "total_frames", "checkpoint_every", "checkpoint_keep", "num_threads",
-)  # fmt: skip
+    "scenario",
+    "robot",
+    "radar",
+    "planner",
+    "reward",
+    "observation",
+    "comm",
+    "faults",
+    "odometry",
+    "targets",
+    "lookahead",
+    "model",
+    "collector",
+    "algorithm",
+    "action",
+    "tuning",
+    "num_envs",
+    "num_robots",
+    "device",
+    "total_frames",
+    "checkpoint_every",
+    "checkpoint_keep",
+    "num_threads",
+)
 """Settings that a cell takes over from the benchmark where they differ from those of maexp train."""
 OWN = ("scenario.name", "algorithm.name")  # each cell has its own
 FREE = (
-    "preset", "scenarios", "algorithms", "policies", "seeds", "seed", "maps", "workers", "device", "confirm", "report",
-    "estimate", "resume", "checkpoint_every", "checkpoint_keep", "num_threads", *OWN,
-)  # fmt: skip
+    "preset",
+    "scenarios",
+    "algorithms",
+    "policies",
+    "seeds",
+    "seed",
+    "maps",
+    "workers",
+    "device",
+    "confirm",
+    "report",
+    "estimate",
+    "resume",
+    "checkpoint_every",
+    "checkpoint_keep",
+    "num_threads",
+    *OWN,
+)
 """Settings that may change when a benchmark goes on: finished cells stay comparable."""
 
 

@@ -106,9 +106,13 @@ class WorkerPool:
             env["CUDA_VISIBLE_DEVICES"] = shown.split(",")[gpu] if shown else str(gpu)
         process = subprocess.Popen(
             [sys.executable, "-m", "maexp.agents.benchmark.worker", str(self.where)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=env,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=env,
             start_new_session=True,  # Ctrl-C reaches this process alone, which tells the workers
-        )  # fmt: skip
+        )
         worker = Worker(process, gpu)
         self.workers.append(worker)
         self.selector.register(process.stdout, selectors.EVENT_READ, worker)

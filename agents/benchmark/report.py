@@ -123,8 +123,9 @@ class Report:
             apart = {scenario: self.differences(scenario, columns) for scenario, columns in tables.items()}
             below = {
                 scenario: differences_markdown(rivals[scenario], rows, goal)
-                for scenario in tables if (rows := against(apart[scenario], rivals[scenario]))
-            }  # fmt: skip
+                for scenario in tables
+                if (rows := against(apart[scenario], rivals[scenario]))
+            }
             write_text(self.where / "table.md", table_markdown(tables, self.heading(), below, goal))
             write_text(self.where / "table.tex", table_latex(tables, self.heading(), goal))
             content = {}

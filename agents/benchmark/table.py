@@ -188,8 +188,14 @@ def print_tables(tables: dict[str, list[Column]], console: Console | None = None
 
 def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
     """The table of one scenario."""
-    table = Table(title=f"{scenario}: {columns[0].total} episodes a policy", title_justify="left", box=box.SIMPLE_HEAD,
-                  pad_edge=False, collapse_padding=True, padding=(0, 1))  # fmt: skip
+    table = Table(
+        title=f"{scenario}: {columns[0].total} episodes a policy",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1),
+    )
     table.add_column("policy", no_wrap=True)
     for row in rows:
         table.add_column(row.title.replace(" steps", ""), justify="right", no_wrap=True)
@@ -209,8 +215,14 @@ def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
 def draw_overview(tables: dict[str, list[Column]]) -> Table:
     """Exploration ratio of every policy in every scenario."""
     row = ROWS[0]
-    table = Table(title=f"all scenarios: {row.title}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False,
-                  collapse_padding=True, padding=(0, 1))  # fmt: skip
+    table = Table(
+        title=f"all scenarios: {row.title}",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1),
+    )
     table.add_column("policy", no_wrap=True)
     for scenario in tables:
         table.add_column(scenario.replace("_", "\n", 1), justify="right", no_wrap=True)
@@ -239,8 +251,24 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
     """A line per scenario, policy, set of maps and metric, all metrics; empty where there is no value."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["scenario", "policy", "maps", "metric", "mean", "std", "ci95_low", "ci95_high", "reached",
-                     "episodes", "best", "paper_mean", "paper_std", "seed_means"])  # fmt: skip
+    writer.writerow(
+        [
+            "scenario",
+            "policy",
+            "maps",
+            "metric",
+            "mean",
+            "std",
+            "ci95_low",
+            "ci95_high",
+            "reached",
+            "episodes",
+            "best",
+            "paper_mean",
+            "paper_std",
+            "seed_means",
+        ]
+    )
     rows = {row.metric: row for row in ROWS}
     for scenario, columns in tables.items():
         bold = {row.metric: best_columns(columns, row) for row in ROWS}
@@ -253,8 +281,20 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
                 numbers = [one["mean"], one["std"], *one["ci95"]]
                 seeds = " ".join(f"{seed}:{means[metric]:.6g}" for seed, means in column.seeds.items())
                 is_best = int(column.name in bold[metric]) if row else ""
-                writer.writerow([scenario, column.policy, column.suite, metric, *map(_csv_number, numbers), one["n"],
-                                 column.total, is_best, *map(_csv_number, published), seeds])  # fmt: skip
+                writer.writerow(
+                    [
+                        scenario,
+                        column.policy,
+                        column.suite,
+                        metric,
+                        *map(_csv_number, numbers),
+                        one["n"],
+                        column.total,
+                        is_best,
+                        *map(_csv_number, published),
+                        seeds,
+                    ]
+                )
     return text.getvalue()
 
 

@@ -118,9 +118,11 @@ def count_gpus(device: str) -> int:
 def announce(cfg: BenchmarkSettings, cells: list[Cell], todo: list[Cell], workers: int) -> None:
     """Say what is about to happen."""
     done = len(cells) - len(todo)
-    print(f"preset {cfg.preset}: {len(cells)} cells ({len(set(c.policy for c in cells))} policies, "
-          f"{len(as_list(cfg.scenarios))} scenarios, seeds {', '.join(map(str, as_list(cfg.seeds)))}, {cfg.episodes} "
-          f"episodes each){f', {done} of them done before' if done else ''}; {workers} at once")  # fmt: skip
+    print(
+        f"preset {cfg.preset}: {len(cells)} cells ({len(set(c.policy for c in cells))} policies, "
+        f"{len(as_list(cfg.scenarios))} scenarios, seeds {', '.join(map(str, as_list(cfg.seeds)))}, {cfg.episodes} "
+        f"episodes each){f', {done} of them done before' if done else ''}; {workers} at once"
+    )
     if cfg.preset == "smoke":
         print(SMOKE)
     if cfg.estimate:

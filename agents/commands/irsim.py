@@ -69,8 +69,11 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
         curves["ours"] = curve
         rows["ours"] = measure(curve, config.seconds) | {"collisions": int(collided.sum())}
     rows["ir-sim"] |= {
-        "path_length": trial.path.tolist(), "map_errors": trial.errors, "drift": trial.drift, "done_at": trial.done_at,
-    }  # fmt: skip
+        "path_length": trial.path.tolist(),
+        "map_errors": trial.errors,
+        "drift": trial.drift,
+        "done_at": trial.done_at,
+    }
     print_rows(rows)
     for note in trial.notes:
         print(f"planner: {note}")
@@ -129,5 +132,7 @@ def print_rows(rows: dict[str, dict]) -> None:
     print(f"{'simulator':<11}{'seen':>8}{'mean':>8}{'85 % at':>10}{'95 % at':>10}{'collisions':>12}")
     for name, row in rows.items():
         marks = ["never" if row[f"seconds_{mark}"] is None else f"{row[f'seconds_{mark}']:.1f} s" for mark in (85, 95)]
-        print(f"{name:<11}{row['coverage']:>8.1%}{row['coverage_auc']:>8.1%}{marks[0]:>10}{marks[1]:>10}"
-              f"{row['collisions']:>12}")  # fmt: skip
+        print(
+            f"{name:<11}{row['coverage']:>8.1%}{row['coverage_auc']:>8.1%}{marks[0]:>10}{marks[1]:>10}"
+            f"{row['collisions']:>12}"
+        )

@@ -48,7 +48,7 @@ def _places(cfg: LeaderboardSettings) -> list[Path]:
 
 
 def find_kind(place: Path) -> str:
-    """"run", "row" (its file) or "rows" (a leaderboard).
+    """ "run", "row" (its file) or "rows" (a leaderboard).
 
     Raises:
         UserError: it is none of them.

@@ -156,6 +156,8 @@ def print_scenarios() -> None:
     for name, one in SCENARIOS.items():
         size = "yours" if one.size is None else f"{one.size:g}"
         steps = f"{one.local_steps} x {one.macro_steps or 'from the free area'}"
-        print(f"{name:<26}{one.count or 'yours':>6}{one.resolution:>11g}{size:>8}{one.radar_range:>9g}"
-              f"{one.max_speed:>11g}  {steps}")  # fmt: skip
+        print(
+            f"{name:<26}{one.count or 'yours':>6}{one.resolution:>11g}{size:>8}{one.radar_range:>9g}"
+            f"{one.max_speed:>11g}  {steps}"
+        )
     print(f"\nFiles that can be imported: {FORMATS}")

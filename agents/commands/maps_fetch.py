@@ -142,8 +142,9 @@ def _fetch(found: MapSet, where: Path, address: str) -> None:
     with Progress(f"fetching {found.name}", sum(one.bytes for one in entries)) as progress:
         for one in entries:
             with _blame_source():
-                download(f"{address.rstrip('/')}/{one.address}", where / one.place, one.bytes, one.sha256,
-                         progress.advance)  # fmt: skip
+                download(
+                    f"{address.rstrip('/')}/{one.address}", where / one.place, one.bytes, one.sha256, progress.advance
+                )
             if one.split != LICENCES:
                 _write_yaml(where / one.place, one)
 
@@ -162,9 +163,13 @@ def _blame_source() -> Iterator[None]:
 def _write_yaml(image: Path, entry: Entry) -> None:
     """How map_server reads the image."""
     content = {
-        "image": image.name, "resolution": entry.resolution, "origin": [0.0, 0.0, 0.0], "negate": 0,
-        "occupied_thresh": 0.65, "free_thresh": entry.free_thresh,
-    }  # fmt: skip
+        "image": image.name,
+        "resolution": entry.resolution,
+        "origin": [0.0, 0.0, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": entry.free_thresh,
+    }
     write_text(image.with_suffix(".yaml"), yaml.safe_dump(content, sort_keys=False))
 
 

@@ -172,8 +172,11 @@ def _verify(cfg: SuiteSettings, where: None) -> int:
         print(f"maexp: every number of {cfg.place} follows from its actions.", file=sys.stderr)
         return 0
     first = found["differences"][0]
-    print(f"maexp: {cfg.place} is not what it says: {first['file']}, {first['where']}; "
-          f"{found['number_of_differences']} differences.", file=sys.stderr)  # fmt: skip
+    print(
+        f"maexp: {cfg.place} is not what it says: {first['file']}, {first['where']}; "
+        f"{found['number_of_differences']} differences.",
+        file=sys.stderr,
+    )
     return DIFFERENT
 
 

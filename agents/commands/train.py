@@ -102,8 +102,11 @@ def run_locked(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
     saved = _resumable(cfg.resume)[1] if cfg.resume else None
     training = TrainingRun.build(cfg, where, overrides, saved)
     write_config(training.settings, where, "train", overrides, map_checksums=training.checksums)
-    print(f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
-          f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}", flush=True)  # fmt: skip
+    print(
+        f"{cfg.algorithm.name} on {cfg.scenario.name} ({len(training.suite.train)} maps), {cfg.num_envs} teams of "
+        f"{_list(training.sizes)} robots{_describe(cfg)}; everything goes to {short(where)}",
+        flush=True,
+    )
     if cfg.warm_start and saved is None:
         warm_start(training)
     train(training)

@@ -20,11 +20,19 @@ def make_team(world: PointCloudMap, num_robots: int, config: TrialConfig, target
         kind="differential", max_speed=config.max_speed, max_accel=config.max_accel, max_yaw_rate=config.max_yaw_rate
     )
     return ExplorationEnv(
-        world, 1, num_robots, seed=config.seed, robot=robot, radar=RadarConfig(range=config.radar_range),
-        planner=PlannerConfig(name="wavefront"), local_steps=local, success_coverage=1.0, num_threads=1,
+        world,
+        1,
+        num_robots,
+        seed=config.seed,
+        robot=robot,
+        radar=RadarConfig(range=config.radar_range),
+        planner=PlannerConfig(name="wavefront"),
+        local_steps=local,
+        success_coverage=1.0,
+        num_threads=1,
         macro_steps=math.ceil(config.seconds / (local * DT)),
         observation=ObservationConfig(pictures=False, targets=targets),
-    )  # fmt: skip
+    )
 
 
 def draw_starts(env: ExplorationEnv, episode: int) -> np.ndarray:

@@ -51,9 +51,14 @@ def make_planner(word: str, player: Player, config: TrialConfig, env: Exploratio
         export_policy(player.make(env), env, where / "policy", player.name, f"# {player.name}\n", trained)
         word = str(where / "policy")
     return TeamPlanner(
-        word, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed,
-        max_speed=config.max_speed, max_accel=config.max_accel, seconds=config.decide,
-    )  # fmt: skip
+        word,
+        radar_range=config.radar_range,
+        robot_radius=config.clearance,
+        seed=config.seed,
+        max_speed=config.max_speed,
+        max_accel=config.max_accel,
+        seconds=config.decide,
+    )
 
 
 class ForeignTeam:
@@ -63,11 +68,19 @@ class ForeignTeam:
         self.config, self.calls = config, ForeignCalls(player.name)
         self.agent = self.calls.make(player.found)
         self.poses = np.full((num_robots, 3), np.nan)
-        self.calls.reset(self.agent, {
-            "num_robots": num_robots, "radar_range": config.radar_range, "robot_radius": config.clearance,
-            "max_speed": config.max_speed, "max_accel": config.max_accel, "seconds": config.seconds,
-            "decision_seconds": config.decide, "seed": config.seed,
-        })  # fmt: skip
+        self.calls.reset(
+            self.agent,
+            {
+                "num_robots": num_robots,
+                "radar_range": config.radar_range,
+                "robot_radius": config.clearance,
+                "max_speed": config.max_speed,
+                "max_accel": config.max_accel,
+                "seconds": config.seconds,
+                "decision_seconds": config.decide,
+                "seed": config.seed,
+            },
+        )
 
     def plan(self, grid, resolution, origin, poses, *, velocities, time_left: float, now: float) -> Plan:
         """Goals and ways of all robots; the arguments of `TeamPlanner.plan`. Who is None in `poses` has collided."""

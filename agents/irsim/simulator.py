@@ -57,29 +57,49 @@ class Simulator:
     def _describe(self, floor: Floor, image: Path, starts: np.ndarray) -> dict:
         c, size = self.config, np.array(floor.free.shape) * floor.cell
         lidar = {
-            "name": "lidar2d", "range_min": 0.0, "range_max": c.radar_range, "number": c.beams,
-            "angle_range": 2 * math.pi * (1 - 1 / c.beams), "noise": c.range_noise > 0, "std": c.range_noise,
-        }  # fmt: skip
+            "name": "lidar2d",
+            "range_min": 0.0,
+            "range_max": c.radar_range,
+            "number": c.beams,
+            "angle_range": 2 * math.pi * (1 - 1 / c.beams),
+            "noise": c.range_noise > 0,
+            "std": c.range_noise,
+        }
         robot = {
-            "number": len(starts), "distribution": {"name": "manual"}, "kinematics": {"name": "diff"},
-            "shape": {"name": "circle", "radius": c.body_radius}, "state": np.asarray(starts, float).tolist(),
-            "vel_min": [-c.max_speed, -c.max_yaw_rate], "vel_max": [c.max_speed, c.max_yaw_rate],
-            "acce": [c.max_accel, 4 * c.max_yaw_rate], "sensors": [lidar],
-        }  # fmt: skip
+            "number": len(starts),
+            "distribution": {"name": "manual"},
+            "kinematics": {"name": "diff"},
+            "shape": {"name": "circle", "radius": c.body_radius},
+            "state": np.asarray(starts, float).tolist(),
+            "vel_min": [-c.max_speed, -c.max_yaw_rate],
+            "vel_max": [c.max_speed, c.max_yaw_rate],
+            "acce": [c.max_accel, 4 * c.max_yaw_rate],
+            "sensors": [lidar],
+        }
         described = {
             "world": {
-                "width": float(size[0]), "height": float(size[1]), "offset": floor.low.tolist(), "step_time": DT,
-                "sample_time": DT, "collision_mode": "stop", "obstacle_map": str(image),
+                "width": float(size[0]),
+                "height": float(size[1]),
+                "offset": floor.low.tolist(),
+                "step_time": DT,
+                "sample_time": DT,
+                "collision_mode": "stop",
+                "obstacle_map": str(image),
             },
             "robot": [robot],
-        }  # fmt: skip
+        }
         if len(self.walkers.places):
-            described["obstacle"] = [{
-                "number": len(self.walkers.places), "distribution": {"name": "manual"}, "kinematics": {"name": "omni"},
-                "shape": {"name": "circle", "radius": PERSON_RADIUS},
-                "state": [[*place, 0.0] for place in self.walkers.places.tolist()],
-                "vel_min": [-PERSON_SPEED] * 2, "vel_max": [PERSON_SPEED] * 2,
-            }]  # fmt: skip
+            described["obstacle"] = [
+                {
+                    "number": len(self.walkers.places),
+                    "distribution": {"name": "manual"},
+                    "kinematics": {"name": "omni"},
+                    "shape": {"name": "circle", "radius": PERSON_RADIUS},
+                    "state": [[*place, 0.0] for place in self.walkers.places.tolist()],
+                    "vel_min": [-PERSON_SPEED] * 2,
+                    "vel_max": [PERSON_SPEED] * 2,
+                }
+            ]
         return described
 
     @property

@@ -77,10 +77,19 @@ def run_trial(
     """
     floor = make_floor(world)
     simulator = Simulator(floor, starts, config)
-    planner = policy if not isinstance(policy, str) else TeamPlanner(
-        policy, radar_range=config.radar_range, robot_radius=config.clearance, seed=config.seed,
-        max_speed=config.max_speed, max_accel=config.max_accel, seconds=config.decide,
-    )  # fmt: skip
+    planner = (
+        policy
+        if not isinstance(policy, str)
+        else TeamPlanner(
+            policy,
+            radar_range=config.radar_range,
+            robot_radius=config.clearance,
+            seed=config.seed,
+            max_speed=config.max_speed,
+            max_accel=config.max_accel,
+            seconds=config.decide,
+        )
+    )
     rng = np.random.default_rng([config.seed, 11])
     alive = np.ones(len(starts), bool)  # a bumper tells who has collided: the others take it for an obstacle
     odometry = Odometry(simulator.poses, config.pose_noise, config.pose_drift, rng)
@@ -103,10 +112,14 @@ def run_trial(
         if step % every == 0:
             time = step * DT
             plan = planner.plan(
-                grid.values(), grid.cell, grid.low,
+                grid.values(),
+                grid.cell,
+                grid.low,
                 {i: pose if alive[i] else None for i, pose in enumerate(believed)},
-                velocities=speeds, time_left=1 - time / config.seconds, now=time,
-            )  # fmt: skip
+                velocities=speeds,
+                time_left=1 - time / config.seconds,
+                now=time,
+            )
             for driver, way in zip(drivers, plan.ways, strict=True):
                 driver.set_way(way)
             trial.notes += [note for note in plan.notes if note not in trial.notes]
@@ -118,10 +131,12 @@ def run_trial(
                 break
         if trial.collided.all():
             break
-        commands = np.array([
-            driver.drive(believed[i], speeds[i], scans[i], believed[_others(alive, i), :2])
-            for i, driver in enumerate(drivers)
-        ])  # fmt: skip
+        commands = np.array(
+            [
+                driver.drive(believed[i], speeds[i], scans[i], believed[_others(alive, i), :2])
+                for i, driver in enumerate(drivers)
+            ]
+        )
         commands[~alive] = 0.0
         commands[:, 0] = commands[:, 0].clip(speeds - config.max_accel * DT, speeds + config.max_accel * DT)
         simulator.step(commands)

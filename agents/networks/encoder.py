@@ -125,14 +125,18 @@ class CellEncoder(nn.Module):
         self.stem = None
         if config.stem == "conv":
             self.stem = nn.Sequential(
-                nn.Conv2d(channels, width // 2, 3, stride=2, padding=1), nn.ReLU(),
-                nn.Conv2d(width // 2, width, 3, stride=2, padding=1), nn.ReLU(),
-            )  # fmt: skip
+                nn.Conv2d(channels, width // 2, 3, stride=2, padding=1),
+                nn.ReLU(),
+                nn.Conv2d(width // 2, width, 3, stride=2, padding=1),
+                nn.ReLU(),
+            )
         inputs = (channels if self.stem is None else width) + (MERGED if merge else 0)
         self.cnn = nn.Sequential(  # kernels of 4: with 3, a region would see its neighbours on one side only
-            nn.Conv2d(inputs, width, 4, stride=2, padding=1), nn.ReLU(),
-            nn.Conv2d(width, width, 4, stride=2, padding=1), nn.ReLU(),
-        )  # fmt: skip
+            nn.Conv2d(inputs, width, 4, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(width, width, 4, stride=2, padding=1),
+            nn.ReLU(),
+        )
         self.grid = nn.Sequential(nn.Linear(13 + 2 * config.sees_time, config.grid_features), nn.ReLU())
 
     def forward(self, picture: Tensor, pose: Tensor, grid: Tensor, comm: Tensor) -> Tensor:

@@ -1,6 +1,5 @@
 """Weights of a policy: loaded only into the network they belong to."""
 
-
 from torch import nn
 
 from maexp.agents.errors import UserError

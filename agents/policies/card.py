@@ -31,25 +31,32 @@ def write_card(name: str, trained: dict[str, Any], files: list[Path], note: str 
     places = ", ".join(f"`{one}`" for one in trained["scenarios"])
     teams = ", ".join(map(str, trained["num_robots"]))
     lines = [
-        f"# {name}", "",
+        f"# {name}",
+        "",
         "Chooses which frontier target each robot of a team goes to next. It starts from what the classical planner "
-        "`cost_utility` thinks of a target, and has learned where to differ.", "",
-        "## Training", "",
+        "`cost_utility` thinks of a target, and has learned where to differ.",
+        "",
+        "## Training",
+        "",
         f"`{trained['algorithm']}` on {places}, teams of {teams}, {trained['frames']:,} macro steps of teams, seed "
-        f"{trained['seed']}, commit {trained['commit']}.", "",
+        f"{trained['seed']}, commit {trained['commit']}.",
+        "",
         *([note, ""] if note else []),
-        "## Results", "",
-    ]  # fmt: skip
+        "## Results",
+        "",
+    ]
     for file in files:
         lines += describe_results(file)
     if not files:
         lines += ["It has not been evaluated.", ""]
     lines += [
-        "## Not good for", "",
+        "## Not good for",
+        "",
         "- maps without a common frame, and robots that do not hear each other: it has seen neither;",
         "- places where people walk: it knows nothing of what moves;",
-        "- robots that see less than all around.", "",
-    ]  # fmt: skip
+        "- robots that see less than all around.",
+        "",
+    ]
     return "\n".join(lines)
 
 
@@ -81,7 +88,7 @@ def describe_results(file: Path) -> list[str]:
             "",
             f"| policy | {' | '.join(SHOWN.values())} |",
             "| --- " * (len(SHOWN) + 1) + "|",
-        ]  # fmt: skip
+        ]
         for name, values in rows.items():
             lines.append(f"| {name} | {' | '.join(_cell(values.get(one)) for one in SHOWN)} |")
         return [*lines, "", *_differences(content)]
@@ -108,8 +115,9 @@ def _differences(content: dict[str, Any]) -> list[str]:
                 interval = _interval(found, lambda end: f"{100 * end:+.2f}")
                 sentences += [
                     f"{name} less {label}, the best classical planner on the validation maps, on the same episodes: "
-                    f"{100 * found['mean']:+.2f} points of coverage over time{interval}.", "",
-                ]  # fmt: skip
+                    f"{100 * found['mean']:+.2f} points of coverage over time{interval}.",
+                    "",
+                ]
     return sentences
 
 

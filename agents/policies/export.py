@@ -154,9 +154,15 @@ def to_onnx(chooser: TargetChooser, robots: int) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about names of axes that are the same axis
         program = torch.onnx.export(
-            chooser, example, dynamo=True, verbose=False, opset_version=OPSET, input_names=["features", "mask", "comm"],
-            output_names=["logits"], dynamic_shapes=shapes | {"comm": {0: batch, 1: team, 2: team}},
-        )  # fmt: skip
+            chooser,
+            example,
+            dynamo=True,
+            verbose=False,
+            opset_version=OPSET,
+            input_names=["features", "mask", "comm"],
+            output_names=["logits"],
+            dynamic_shapes=shapes | {"comm": {0: batch, 1: team, 2: team}},
+        )
     out = io.BytesIO()
     program.save(out)
     return without_traces(out.getvalue())
@@ -168,8 +174,17 @@ def without_traces(network: bytes) -> bytes:
 
     model = onnx.load_from_string(network)
     graph = model.graph
-    for part in (model, graph, *model.functions, *graph.node, *graph.value_info, *graph.input, *graph.output,
-                 *graph.initializer, *(node for one in model.functions for node in one.node)):  # fmt: skip
+    for part in (
+        model,
+        graph,
+        *model.functions,
+        *graph.node,
+        *graph.value_info,
+        *graph.input,
+        *graph.output,
+        *graph.initializer,
+        *(node for one in model.functions for node in one.node),
+    ):
         part.ClearField("metadata_props")
         part.ClearField("doc_string")
     return model.SerializeToString(deterministic=True)

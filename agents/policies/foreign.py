@@ -126,8 +126,10 @@ class TeamSight:
     def episode(self, team: int) -> dict[str, Any]:
         """What a foreign policy is told of the episode that env `team` begins."""
         env, robots = self.env, self.env.simulation.robot_tensors
-        keys = [int(env.simulation.tensors[name].reshape(-1)[row]) for name, row in
-                (("seed", 0), ("env_id", team), ("episode", team))]  # fmt: skip
+        keys = [
+            int(env.simulation.tensors[name].reshape(-1)[row])
+            for name, row in (("seed", 0), ("env_id", team), ("episode", team))
+        ]
         return {
             "num_robots": env.num_robots,
             "radar_range": float(max(one.range for one in env.radar_configs)),

@@ -19,9 +19,7 @@ from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
 
-def open_policy(
-    word: str, setting: str = "policy", others: Iterable[str] = tuple(POLICIES)
-) -> tuple[Path, Contract]:
+def open_policy(word: str, setting: str = "policy", others: Iterable[str] = tuple(POLICIES)) -> tuple[Path, Contract]:
     """Folder and contract of a trained policy, its files checked.
 
     Raises:

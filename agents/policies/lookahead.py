@@ -83,9 +83,16 @@ class LookaheadPlanner(FrontierPlanner):
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & (own >= 0).unsqueeze(-1)
         return {
-            "index": place, "block": block, "region": region, "offset": offset, "point": point, "value": value,
-            "wanted": there, "body": self.tracker.body, "hears": self.tracker.nav.state["comm"],
-        }  # fmt: skip
+            "index": place,
+            "block": block,
+            "region": region,
+            "offset": offset,
+            "point": point,
+            "value": value,
+            "wanted": there,
+            "body": self.tracker.body,
+            "hears": self.tracker.nav.state["comm"],
+        }
 
     def _search(self, teams: torch.Tensor, mine: dict[str, torch.Tensor]) -> torch.Tensor:
         """Which candidate each robot of some teams takes, int64 [T, N]."""

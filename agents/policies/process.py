@@ -150,9 +150,13 @@ class Process(Guest):
     def __init__(self, command: list[str]):
         try:
             self.process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0,
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                bufsize=0,
                 start_new_session=True,
-            )  # fmt: skip
+            )
         except (OSError, ValueError) as error:
             raise Lost(f"{command[0]} cannot be started ({getattr(error, 'strerror', None) or error})") from error
         self.spoken, self.said, self.spent = self.process.stderr, bytearray(), 0.0

@@ -45,9 +45,10 @@ class Rollouts:
         self.config, self.tracker = config, tracker
         self.teams = max(1, min(env.num_envs, BRANCHES // config.candidates))
         self.branches = (
-            Branches(env, self.teams, config.candidates, config.local_steps) if true_world
+            Branches(env, self.teams, config.candidates, config.local_steps)
+            if true_world
             else Beliefs(env, self.teams, config.candidates, tracker.nav, GUESSES[config.unknown], config.local_steps)
-        )  # fmt: skip
+        )
         self.follower = None
         if config.horizon > 1:
             self.follower = FrontierPlanner(self.branches.env, CLASSICAL.get(config.rollout_policy, rank_by_utility))

@@ -43,9 +43,13 @@ def unpack(body: bytes) -> dict[str, Any]:
     """
     try:
         message = msgpack.unpackb(
-            body, object_hook=_unpack_array, max_array_len=MOST_NUMBERS, max_map_len=64, strict_map_key=True,
+            body,
+            object_hook=_unpack_array,
+            max_array_len=MOST_NUMBERS,
+            max_map_len=64,
+            strict_map_key=True,
             max_ext_len=0,
-        )  # fmt: skip
+        )
     except (ValueError, TypeError, msgpack.UnpackException, RecursionError) as error:
         raise ValueError(f"is no msgpack ({type(error).__name__}: {' '.join(str(error).split())[:120]})") from error
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):

@@ -56,11 +56,15 @@ TOPICS = {
     "tf": Kind(*_TF, 100),
     "tf_static": Kind(*_TF, 100, latched=True),
     "map": Kind(
-        "nav_msgs/msg/OccupancyGrid", "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7", 1,
+        "nav_msgs/msg/OccupancyGrid",
+        "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+        1,
         latched=True,
     ),
     "scan": Kind(
-        "sensor_msgs/msg/LaserScan", "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828", 5,
+        "sensor_msgs/msg/LaserScan",
+        "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
+        5,
         reliable=False,
     ),
     "odom": Kind("nav_msgs/msg/Odometry", "3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"),
@@ -70,7 +74,7 @@ TOPICS = {
     "episode": Kind(
         "std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18", 1, latched=True
     ),
-}  # fmt: skip
+}
 """By the last part of the topic's name. `episode` is ours: what an arena tells of an episode, as JSON."""
 EPISODE = "/maexp/episode"
 

@@ -40,9 +40,13 @@ TABLE = {
 }
 """Message -> its fields, each message after those that it is made of."""
 PLAIN = {
-    "int8": types.int8, "int32": types.int32, "uint32": types.uint32, "float32": types.float32,
-    "float64": types.float64, "string": str,
-}  # fmt: skip
+    "int8": types.int8,
+    "int32": types.int32,
+    "uint32": types.uint32,
+    "float32": types.float32,
+    "float64": types.float64,
+    "string": str,
+}
 FIRST = {"string": "", "float32": 0.0, "float64": 0.0}
 ONE = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
 
@@ -65,9 +69,12 @@ def _make_classes() -> dict[str, type]:
             kind, name = one.split()
             hints[name], defaults[name] = _read_field(found, kind, ONE.get((message, name)))
         words = {"typename": wire_name(message).replace("::", ".")}
-        made = new_class(message.rpartition("/")[2], (IdlStruct,), words, lambda body, h=hints, d=defaults: body.update(
-            __annotations__=h, __module__=__name__, **d
-        ))  # fmt: skip
+        made = new_class(
+            message.rpartition("/")[2],
+            (IdlStruct,),
+            words,
+            lambda body, h=hints, d=defaults: body.update(__annotations__=h, __module__=__name__, **d),
+        )
         found[message] = dataclass(made)
     return found
 

@@ -133,8 +133,10 @@ class Robot:
         self.frames = {one: before + one for one in ("map", "odom", "base_link", "base_scan")}
         root = [] if own_tf else [("map", self.frames["map"])]
         self.still = [
-            *root, (self.frames["map"], self.frames["odom"]), (self.frames["base_link"], self.frames["base_scan"])
-        ]  # fmt: skip
+            *root,
+            (self.frames["map"], self.frames["odom"]),
+            (self.frames["base_link"], self.frames["base_scan"]),
+        ]
         self.begin()
 
     def begin(self) -> None:
@@ -290,8 +292,10 @@ class Ros2Policy:
 
     def _publish_robots(self, now: int) -> None:
         """Poses, odometry and scans of those that have not collided."""
-        held = {name: self.env.simulation.tensors[name][0].cpu().numpy().astype(np.float64)
-                for name in ("center", "pose", "slip", "collided", "map_id")}  # fmt: skip
+        held = {
+            name: self.env.simulation.tensors[name][0].cpu().numpy().astype(np.float64)
+            for name in ("center", "pose", "slip", "collided", "map_id")
+        }
         places: dict[str, Pose] = {}
         for k, robot in enumerate(self.robots):
             if held["collided"][k]:
@@ -305,9 +309,13 @@ class Ros2Policy:
             robot.odom.write(message)
             if now // TICK % LOOKS == 0 and robot.scan.matched:
                 self._publish_scan(robot, now, pose, int(held["map_id"]))
-        self._publish_frames(self.tf, now, lambda robot: [
-            (robot.frames["odom"], robot.frames["base_link"], places[robot.name])
-        ] if robot.name in places else [])  # fmt: skip
+        self._publish_frames(
+            self.tf,
+            now,
+            lambda robot: (
+                [(robot.frames["odom"], robot.frames["base_link"], places[robot.name])] if robot.name in places else []
+            ),
+        )
 
     def _publish_scan(self, robot: Robot, now: int, pose: Pose, number: int) -> None:
         message, reach = robot.scan.make(), float(max(one.range for one in self.env.radar_configs))

@@ -49,8 +49,9 @@ class Ros2Team:
         self.maps = {topic: wire.reader(topic, "map") for topic in driver.topics}
         self.frames = {
             (place, still): wire.reader(f"{'' if place is None else f'/{place}'}/{'tf_static' if still else 'tf'}")
-            for place in (None, *robots) for still in (True, False)
-        }  # fmt: skip
+            for place in (None, *robots)
+            for still in (True, False)
+        }
         self.odometry = {name: wire.reader(f"/{name}/odom") for name in robots}
         self.clock, self.episode = wire.reader("/clock"), wire.reader(EPISODE)
         self.goals = {name: wire.writer(f"/{name}/goal_pose") for name in robots}

@@ -106,9 +106,16 @@ def run(given: SimulateSettings, grid: np.ndarray, cell: float, policy: str, see
     places = place_team(grid, cell, given.radius, given.robots, first)
     floor = Floor(grid, cell, places, given.radius, given.range, given.speed)
     planner = TeamPlanner(
-        policy, radar_range=given.range, robot_radius=given.radius, max_speed=given.speed, seconds=1.0,
-        bounded=True, distinct=distinct, spare=given.spare, seed=seed,
-    )  # fmt: skip
+        policy,
+        radar_range=given.range,
+        robot_radius=given.radius,
+        max_speed=given.speed,
+        seconds=1.0,
+        bounded=True,
+        distinct=distinct,
+        spare=given.spare,
+        seed=seed,
+    )
     course = explore(floor, planner, given.seconds)
     print(describe(policy if distinct else f"{policy}, shared", seed, course), flush=True)
     if given.notes:
@@ -120,8 +127,10 @@ def run(given: SimulateSettings, grid: np.ndarray, cell: float, policy: str, see
 
 def describe(policy: str, seed: int, course: Course) -> str:
     """A course in a line."""
-    marks = ", ".join(f"{100 * mark:g} % " + (f"{when:.0f} s" if np.isfinite(when) else "never")
-                      for mark, when in zip(MARKS, course.reached, strict=True))  # fmt: skip
+    marks = ", ".join(
+        f"{100 * mark:g} % " + (f"{when:.0f} s" if np.isfinite(when) else "never")
+        for mark, when in zip(MARKS, course.reached, strict=True)
+    )
     end = f"done after {course.seconds:.0f} s" if course.done else f"broken off after {course.seconds:.0f} s"
     return (
         f"{policy:<20} seed {seed}: {marks}; {end}, {100 * course.share:.1f} % seen; {course.driven:.0f} m driven; "

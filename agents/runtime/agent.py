@@ -46,10 +46,14 @@ class TeamAgent:
         """The goals of all as one robot sees it."""
         poses = np.where(observation["alive"][:, None], observation["poses"][robot], np.nan)
         plan = self.planners[robot].plan(
-            observation["grid"][robot], observation["resolution"], observation["origin"], poses,
-            velocities=np.nan_to_num(observation["velocities"][robot]), time_left=observation["time_left"],
+            observation["grid"][robot],
+            observation["resolution"],
+            observation["origin"],
+            poses,
+            velocities=np.nan_to_num(observation["velocities"][robot]),
+            time_left=observation["time_left"],
             now=observation["time"],
-        )  # fmt: skip
+        )
         grid = observation["grid"][robot], observation["resolution"], observation["origin"]
         at, speed = observation["poses"][robot, :, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
         return np.where(plan.active[:, None], go_beyond(plan, grid, at, speed, self.episode), np.nan)
@@ -82,9 +86,9 @@ def go_beyond(plan: Plan, grid: tuple, at: np.ndarray, speed: np.ndarray, episod
     goals, rows, seconds = plan.goals.copy(), np.flatnonzero(plan.active), episode["decision_seconds"]
     if len(rows):
         known = read_grid(*grid, 50.0, [])
-        drive = np.minimum(
-            speed * seconds + 0.5 * episode["max_accel"] * seconds**2, episode["max_speed"] * seconds
-        )[rows]
+        drive = np.minimum(speed * seconds + 0.5 * episode["max_accel"] * seconds**2, episode["max_speed"] * seconds)[
+            rows
+        ]
         _, middle = look_around(known, known.cells(known.from_map(goals[rows])), episode["radar_range"], True)
         left = np.maximum(drive - np.linalg.norm(goals[rows] - at[rows], axis=-1), 0.0)
         goals[rows] += middle * (left / np.maximum(np.linalg.norm(middle, axis=-1), 1e-6))[:, None]

@@ -182,9 +182,12 @@ class TeamDriver:
         self.places |= {name: np.array(pose[:2]) for name, pose in poses.items() if pose is not None}
         what = grid.values, grid.resolution, grid.origin
         plan = self.planner.plan(
-            *what, poses, velocities=[self.speeds.get(name, 0.0) for name in self.robots],
-            time_left=self._time_left(now), now=round(now - self.begun, 6),
-        )  # fmt: skip
+            *what,
+            poses,
+            velocities=[self.speeds.get(name, 0.0) for name in self.robots],
+            time_left=self._time_left(now),
+            now=round(now - self.begun, 6),
+        )
         goals = plan.goals if self.episode is None else self._go_beyond(plan, what, poses)
         return Decision(self._give_orders(plan, goals, now), plan, [*notes, *plan.notes])
 

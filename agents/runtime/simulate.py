@@ -153,9 +153,7 @@ def explore(floor: Floor, planner: TeamPlanner, seconds: float) -> Course:
     for tick in range(round(seconds / TICK)):
         now = tick * TICK
         if tick % round(1.0 / TICK) == 0:
-            plan = planner.plan(
-                floor.known(), floor.cell, (0.0, 0.0), floor.at, now=now, time_left=1.0 - now / seconds
-            )
+            plan = planner.plan(floor.known(), floor.cell, (0.0, 0.0), floor.at, now=now, time_left=1.0 - now / seconds)
             _note(course, plan, floor, now)
             if plan.done:
                 course.done = True

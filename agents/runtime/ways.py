@@ -144,9 +144,7 @@ def trace(passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     return way[np.concatenate([[True], turn[1:] != turn[:-1], [True]])] if len(way) > 1 else way
 
 
-def trace_from(
-    start: np.ndarray, grid: KnownGrid, passable: np.ndarray, distance: np.ndarray, end: int
-) -> np.ndarray:
+def trace_from(start: np.ndarray, grid: KnownGrid, passable: np.ndarray, distance: np.ndarray, end: int) -> np.ndarray:
     """Corners of a way from where a robot stands to a reached cell, float64 [k, 2] [m], in the map's frame.
 
     The middle of the robot's own cell is left out: on cells longer than what it drives between two calls it would turn

@@ -127,9 +127,17 @@ class ExpertSettings(Settings):
     )
 
     unused: ClassVar[tuple[str, ...]] = (
-        "gamma", "lmbda", "finite_horizon", "critic_lr", "entropy_coeff", "critic_coeff", "value_norm",
-        "normalize_advantage", "mask_collided", "anchor_coeff",
-    )  # fmt: skip
+        "gamma",
+        "lmbda",
+        "finite_horizon",
+        "critic_lr",
+        "entropy_coeff",
+        "critic_coeff",
+        "value_norm",
+        "normalize_advantage",
+        "mask_collided",
+        "anchor_coeff",
+    )
 
 
 def _reference(settings: Settings, **others) -> Settings:
@@ -181,22 +189,33 @@ def _tunings(name: str, summary: str, settings: Settings, **reference) -> Tuning
 TUNINGS = {
     one.name: one
     for one in (
-        _tunings("ippo", "independent PPO: each robot's critic sees its own observation",
-                 ClippedSettings(), **_CLIPPED),
-        _tunings("mappo", "PPO with a critic that sees the whole team",
-                 ClippedSettings(), **_CLIPPED),
-        _tunings("itrpo", "independent trust region: each robot's critic sees its own observation",
-                 TrustRegionSettings(), **_TRUST),
-        _tunings("matrpo", "trust region with a critic that sees the whole team",
-                 TrustRegionSettings(), **_TRUST),
-        _tunings("vdppo", "PPO with a team value mixed from the robots' values",
-                 MixedClippedSettings(), **_CLIPPED),
-        _tunings("vda2c", "advantage actor-critic with a team value mixed from the robots' values",
-                 ActorCriticSettings(), lr=1e-4, critic_lr=1e-4),
-        Tunings("expert_iteration", ExpertSettings(), ExpertSettings(),  # the original has none
-                "learns what targets are worth from branches of its episodes in the true simulator; no critic"),
+        _tunings(
+            "ippo", "independent PPO: each robot's critic sees its own observation", ClippedSettings(), **_CLIPPED
+        ),
+        _tunings("mappo", "PPO with a critic that sees the whole team", ClippedSettings(), **_CLIPPED),
+        _tunings(
+            "itrpo",
+            "independent trust region: each robot's critic sees its own observation",
+            TrustRegionSettings(),
+            **_TRUST,
+        ),
+        _tunings("matrpo", "trust region with a critic that sees the whole team", TrustRegionSettings(), **_TRUST),
+        _tunings("vdppo", "PPO with a team value mixed from the robots' values", MixedClippedSettings(), **_CLIPPED),
+        _tunings(
+            "vda2c",
+            "advantage actor-critic with a team value mixed from the robots' values",
+            ActorCriticSettings(),
+            lr=1e-4,
+            critic_lr=1e-4,
+        ),
+        Tunings(
+            "expert_iteration",
+            ExpertSettings(),
+            ExpertSettings(),  # the original has none
+            "learns what targets are worth from branches of its episodes in the true simulator; no critic",
+        ),
     )
-}  # fmt: skip
+}
 
 
 def find_tunings(algorithm: str) -> Tunings:

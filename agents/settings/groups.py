@@ -73,9 +73,7 @@ class CollectorSettings:
     )
     sample_device: str | None = setting(None, "where teams play; default: device")
     train_device: str | None = setting(None, "where the networks learn; default: device")
-    ray_address: str | None = setting(
-        None, "of a cluster's head, or auto; default: a cluster of this machine alone"
-    )
+    ray_address: str | None = setting(None, "of a cluster's head, or auto; default: a cluster of this machine alone")
 
 
 @dataclass
@@ -88,13 +86,16 @@ class LoggerSettings:
 
 
 TEAM = {"robot": {"team": Any}}  # a list of settings, one per robot
-Groups = make_dataclass("Groups", [
-    (name, kind, field(default_factory=kind))
-    for name, kind in {
-        "scenario": ScenarioSettings,
-        **{name: storable(kind, **TEAM.get(name, {})) for name, kind in GROUPS.items()},
-    }.items()
-])  # fmt: skip
+Groups = make_dataclass(
+    "Groups",
+    [
+        (name, kind, field(default_factory=kind))
+        for name, kind in {
+            "scenario": ScenarioSettings,
+            **{name: storable(kind, **TEAM.get(name, {})) for name, kind in GROUPS.items()},
+        }.items()
+    ],
+)
 
 
 @dataclass

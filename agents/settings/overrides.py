@@ -12,9 +12,19 @@ from maexp.agents.settings.schema import schema
 from maexp.envs.config import STARTS
 
 PATHS = (
-    "scenario.path", "scenario.starts", "checkpoint", "resume", "file", "place", "out", "baseline", "results", "suite",
-    "hydra.run.dir", "hydra.sweep.dir",
-)  # fmt: skip
+    "scenario.path",
+    "scenario.starts",
+    "checkpoint",
+    "resume",
+    "file",
+    "place",
+    "out",
+    "baseline",
+    "results",
+    "suite",
+    "hydra.run.dir",
+    "hydra.sweep.dir",
+)
 WORDS = (("suite", "policy"), ("ros2", "policy"))
 """Commands of other programs, taken as they stand."""
 POLICIES = {"evaluate": ("policy",), "benchmark": ("policies",), "train": ("classical",)}

@@ -21,9 +21,17 @@ PAPER_SECONDS_PER_STEP = {
     "MAexp 2024, GPU (paper)": {2: 0.0144, 4: 0.0254, 6: 0.0373, 8: 0.0477},
 }
 COLUMNS = [
-    "scenario", "planner", "range [m]", "envs", "N", "robot-local-steps/s", "per thread", "macro/s", "MB/env",
+    "scenario",
+    "planner",
+    "range [m]",
+    "envs",
+    "N",
+    "robot-local-steps/s",
+    "per thread",
+    "macro/s",
+    "MB/env",
     "start [s]",
-]  # fmt: skip
+]
 WARM_LAPS = 4
 """Macro steps before the clock starts: the first few fill memory that the later ones use again (300 robots: twice the
 time a step)."""

@@ -50,9 +50,23 @@ STAGES = ("goal", "plan path", "local step", "observe", "reset")
 COPY_BYTES = 2**28
 MATRIX = 1536
 MODULES = (
-    "collision", "dwa", "dynamics", "geodesic", "known_grid", "merge", "neighbours", "observe", "pace", "passable",
-    "planner", "reset", "reward", "stopping", "visibility", "wavefront",
-)  # fmt: skip
+    "collision",
+    "dwa",
+    "dynamics",
+    "geodesic",
+    "known_grid",
+    "merge",
+    "neighbours",
+    "observe",
+    "pace",
+    "passable",
+    "planner",
+    "reset",
+    "reward",
+    "stopping",
+    "visibility",
+    "wavefront",
+)
 KEY = ("scenario", "planner", "num_envs", "num_robots", "radar_range", "stage", "kernel")
 
 
@@ -261,9 +275,7 @@ def compare(rows: list[dict], before: dict) -> None:
             apart = now["p10"] > old["p90"] or now["p90"] < old["p10"]
             row["changed"] = apart and not 1 / NOISE < row["ratio"] < NOISE
     if not shared:
-        raise UserError(
-            "The baseline has no row in common with this run: measure the same scenario, team and batch."
-        )
+        raise UserError("The baseline has no row in common with this run: measure the same scenario, team and batch.")
 
 
 def print_ceilings(ceilings: dict[str, float], loading: dict[str, float], before: dict | None) -> None:

@@ -48,22 +48,34 @@ class Axis:
 # A large team soon covers 95 %: without full coverage asked for, its episodes would be mostly reset and observation.
 AXES = {
     "envs": Axis(
-        "teams in the batch", (1, 8, 64, 512, 2048), lambda v: f"num_envs={v}",
-        {"num_robots": "3"}, "num_envs",
+        "teams in the batch",
+        (1, 8, 64, 512, 2048),
+        lambda v: f"num_envs={v}",
+        {"num_robots": "3"},
+        "num_envs",
     ),
     "robots": Axis(
-        "robots in a team", (2, 4, 8, 16, 32, 64, 128, 300), lambda v: f"num_robots={v}",
-        {"num_envs": "4", "scenario.success_coverage": "1.0"}, "num_robots",
+        "robots in a team",
+        (2, 4, 8, 16, 32, 64, 128, 300),
+        lambda v: f"num_robots={v}",
+        {"num_envs": "4", "scenario.success_coverage": "1.0"},
+        "num_robots",
     ),
     "map": Axis(
-        "free points of the map", (6, 12, 24, 48, 96), lambda v: "scenario=maze_small",
-        {"num_envs": "32", "num_robots": "3"}, "free_points",
+        "free points of the map",
+        (6, 12, 24, 48, 96),
+        lambda v: "scenario=maze_small",
+        {"num_envs": "32", "num_robots": "3"},
+        "free_points",
     ),
     "radar": Axis(
-        "radar range [m]", (5, 10, 20, 40, 80), lambda v: f"radar.range={v}",
-        {"num_envs": "32", "num_robots": "3"}, "radar_range",
+        "radar range [m]",
+        (5, 10, 20, 40, 80),
+        lambda v: f"radar.range={v}",
+        {"num_envs": "32", "num_robots": "3"},
+        "radar_range",
     ),
-}  # fmt: skip
+}
 COLUMNS = ["ms / local step", "x smallest", "size x", "robot-local-steps/s", "MB/env", "build [s]", "start [s]"]
 
 
@@ -182,8 +194,10 @@ def describe_growth(axis: Axis, measured: dict) -> str:
     rows, worst = measured["rows"], measured["worst_over_linear"]
     cost, size = ratio(rows[-1], rows[0], "seconds_per_local_step"), ratio(rows[-1], rows[0], axis.size)
     verdict = "linear at most" if worst <= TOLERANCE else f"FASTER THAN LINEAR from {measured['worst_from']} on"
-    return (f"{axis.title}: {size:,.{size < 10:d}f} times the size costs {cost:,.{cost < 10:d}f} times as much; "
-            f"{verdict} (at worst {worst:.2f} times its share of a smaller one)")  # fmt: skip
+    return (
+        f"{axis.title}: {size:,.{size < 10:d}f} times the size costs {cost:,.{cost < 10:d}f} times as much; "
+        f"{verdict} (at worst {worst:.2f} times its share of a smaller one)"
+    )
 
 
 def draw_axis(axis: Axis, rows: list[dict], path: Path) -> None:

@@ -58,9 +58,13 @@ def read_batch(where: Path, suite: Suite, part: str, first: int) -> Batch:
 def _check_shapes(arrays: dict[str, np.ndarray], robots: int, metrics: np.ndarray, count: int) -> None:
     episodes, most = arrays["region"].shape[:2]
     wanted = {
-        "decisions": (episodes,), "region": (episodes, most, robots), "offset": (episodes, most, robots, 2),
-        "seconds": (episodes, most), "maps": (episodes,), "reasons": (episodes,),
-    }  # fmt: skip
+        "decisions": (episodes,),
+        "region": (episodes, most, robots),
+        "offset": (episodes, most, robots, 2),
+        "seconds": (episodes, most),
+        "maps": (episodes,),
+        "reasons": (episodes,),
+    }
     for name, shape in wanted.items():
         if arrays[name].shape != shape or not episodes or not most:
             raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")

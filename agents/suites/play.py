@@ -70,11 +70,22 @@ def build_env(
         ValueError: the file of the suite has a value out of range; MapError: no room for the team.
     """
     return ExplorationEnv(
-        maps, num_envs, part.num_robots, seed=seed, robot=RobotConfig(**part.robot), radar=RadarConfig(**part.radar),
-        planner=PlannerConfig(**part.planner), comm=CommConfig(**part.comm), observation=observation,
-        local_steps=part.local_steps, macro_steps=part.macro_steps, collision=part.collision,
-        success_coverage=part.success_coverage, starts=part.starts, **others,
-    )  # fmt: skip
+        maps,
+        num_envs,
+        part.num_robots,
+        seed=seed,
+        robot=RobotConfig(**part.robot),
+        radar=RadarConfig(**part.radar),
+        planner=PlannerConfig(**part.planner),
+        comm=CommConfig(**part.comm),
+        observation=observation,
+        local_steps=part.local_steps,
+        macro_steps=part.macro_steps,
+        collision=part.collision,
+        success_coverage=part.success_coverage,
+        starts=part.starts,
+        **others,
+    )
 
 
 class Recorder:
@@ -111,11 +122,15 @@ class Recorder:
         made = np.arange(most) < decisions[:, None]
         reasons = getattr(self.policy, "reasons", [""] * self.env.num_envs)
         return Batch(
-            first, decisions,
+            first,
+            decisions,
             np.where(made[..., None], region, 0).astype(np.uint8),
             np.where(made[..., None, None], offset, 0.0).astype(np.float32),
-            np.where(made, seconds, 0.0).astype(np.float32), maps, metrics, np.array(list(reasons)[:count], dtype=str),
-        )  # fmt: skip
+            np.where(made, seconds, 0.0).astype(np.float32),
+            maps,
+            metrics,
+            np.array(list(reasons)[:count], dtype=str),
+        )
 
 
 class Replay:

@@ -29,8 +29,10 @@ def describe_suite(suite: Suite) -> list[str]:
         f"{suite.name}, version {suite.version}, checksum {suite.checksum[:16]}",
         f"score: mean {suite.score} of {suite.episodes} episodes of each of {len(suite.parts)} parts",
         f"frozen scores: {told or 'none yet'} (0 and 1 of the normalised score)",
-        "", "| part | maps | robots | radar [m] | starts | episode [s] |", "| --- | --- | --- | --- | --- | --- |",
-    ]  # fmt: skip
+        "",
+        "| part | maps | robots | radar [m] | starts | episode [s] |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for name, part in suite.parts.items():
         maps = f"{part.scenario} {part.first} to {part.first + part.count - 1}"
         robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"

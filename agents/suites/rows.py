@@ -29,16 +29,21 @@ EACH = "*"  # in SHAPE: every entry
 NUMBER = int | float
 MEAN = {"mean": NUMBER | None, "ci95": [NUMBER | None], "n": int}
 SHAPE = {
-    "format": str, "verified": bool, "metric": str, "policy": str, "decisions": dict,
+    "format": str,
+    "verified": bool,
+    "metric": str,
+    "policy": str,
+    "decisions": dict,
     "run": {"commit": str | None, "versions": dict},
     "suite": {"name": str, "version": int, "checksum": str},
     "score": MEAN | {"mean": NUMBER, "normalised": NUMBER | None},
     "random": {"score": NUMBER},
     "reference": {"policy": str, "score": NUMBER, "parts": {EACH: NUMBER}, "difference": MEAN, "improvement": MEAN},
     "parts": {EACH: {"normalised": NUMBER | None, "episodes": [NUMBER], "copies": [int], "lost": int}},
-    "films": {EACH: {"map": str, "cells": [int], "seconds": [NUMBER], "coverage": [int], "tracks": [[int]],
-                     "picture": str}},
-}  # fmt: skip
+    "films": {
+        EACH: {"map": str, "cells": [int], "seconds": [NUMBER], "coverage": [int], "tracks": [[int]], "picture": str}
+    },
+}
 """Of a row: what the page and the tables read."""
 UNSEEN, WALL, NOTHING = 253, 254, 255  # in the picture; below: the frame in which a cell was first seen
 

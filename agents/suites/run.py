@@ -55,10 +55,13 @@ class SuiteRun:
             "maps": points,
             "files": folder.list_files(self.where),
             "run": {
-                "policy": self.player.word, **code, "machine": folder.describe_machine(), "device": str(self.device),
+                "policy": self.player.word,
+                **code,
+                "machine": folder.describe_machine(),
+                "device": str(self.device),
                 "seconds": round(time.perf_counter() - begin, 1),
             },
-        }  # fmt: skip
+        }
         folder.write_results(self.where, content)
         return content
 
@@ -78,8 +81,9 @@ class SuiteRun:
                 else:
                     if env is None:
                         with blame_input():
-                            env = build_env(part, maps, size, suite.key(self.seed), self.player.observation(),
-                                            device=self.device)  # fmt: skip
+                            env = build_env(
+                                part, maps, size, suite.key(self.seed), self.player.observation(), device=self.device
+                            )
                             policy = stack.enter_context(self.player.open(env))
                     played.append(play_batch(suite, env, policy, first))
                     folder.write_batch(self.where, suite, name, played[-1])

@@ -47,9 +47,11 @@ def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> 
         },
         "profile": {
             name: np.linspace(0.0, 1.0, LEVELS).round(3).tolist(),
-            "policy": profile(own), RANDOM: profile(zero), "reference": profile(one),
+            "policy": profile(own),
+            RANDOM: profile(zero),
+            "reference": profile(one),
         },
-    }  # fmt: skip
+    }
 
 
 def mean_of(values: dict[str, np.ndarray]) -> float:

@@ -66,8 +66,15 @@ def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """A suite's rows as a table in Markdown."""
     suite, reference = rows[0]["suite"], rows[0]["reference"]["policy"]
-    columns = ("", "policy", "score", "95 % interval", f"between `random` and `{reference}`",
-               f"less `{reference}`, points", "verified")  # fmt: skip
+    columns = (
+        "",
+        "policy",
+        "score",
+        "95 % interval",
+        f"between `random` and `{reference}`",
+        f"less `{reference}`, points",
+        "verified",
+    )
     lines = [f"## {suite['name']}, version {suite['version']}", "", _line(columns), _line(["---"] * len(columns))]
     for number, row in enumerate(rows, 1):
         score, less = row["score"], row["reference"]["difference"]

@@ -23,9 +23,20 @@ from maexp.envs.scenarios import SCENARIOS
 FOLDER = Path(maexp.conf.__path__[0]) / "_suite"
 KEYS = ("name", "version", "score", "metrics", "reference", "seed", "episodes", "decision_limit", "parts")
 PART_KEYS = (
-    "scenario", "first", "count", "num_robots", "starts", "local_steps", "macro_steps", "success_coverage", "collision",
-    "robot", "radar", "planner", "comm",
-)  # fmt: skip
+    "scenario",
+    "first",
+    "count",
+    "num_robots",
+    "starts",
+    "local_steps",
+    "macro_steps",
+    "success_coverage",
+    "collision",
+    "robot",
+    "radar",
+    "planner",
+    "comm",
+)
 OTHER_MAPS = 10_000, 2**31
 """Between these lie the numbers of the maps of another seed."""
 

@@ -26,9 +26,7 @@ class Findings(list):
         self.append({"file": file, "where": where, "stated": stated, "found": found})
 
 
-def verify(
-    where: Path, file: str | None = None, advance: Callable[[int], None] = lambda count: None
-) -> dict[str, Any]:
+def verify(where: Path, file: str | None = None, advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
     """The report on a folder: {verified, suite, policy, same_platform, differences, ...}.
 
     Args:

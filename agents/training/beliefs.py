@@ -139,9 +139,16 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
     row = find_scenario(maps[0].scenario)
     steps = int(LONGER * row.macro_steps) if row.macro_steps else default_macro_steps(maps, row)
     env = ExplorationEnv(
-        maps, num_envs=len(maps), num_robots=robots, seed=seed, macro_steps=min(steps, NEVER), success_coverage=1.0,
-        num_threads=1, planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(pictures=False),
-    )  # fmt: skip
+        maps,
+        num_envs=len(maps),
+        num_robots=robots,
+        seed=seed,
+        macro_steps=min(steps, NEVER),
+        success_coverage=1.0,
+        num_threads=1,
+        planner=PlannerConfig(name="wavefront"),
+        observation=ObservationConfig(pictures=False),
+    )
     planner = depart_at_random(env, departures)
     nav, policy = planner.tracker.nav, as_module(lambda _: planner, env)
     td = env.reset()
@@ -167,8 +174,9 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
 
 def save_episodes(path: Path, episodes: list[Episode]) -> None:
     """One compressed file, whole or not there."""
-    arrays = {f"{k}/{one.name}": getattr(episode, one.name)
-              for k, episode in enumerate(episodes) for one in fields(Episode)}  # fmt: skip
+    arrays = {
+        f"{k}/{one.name}": getattr(episode, one.name) for k, episode in enumerate(episodes) for one in fields(Episode)
+    }
     write_file(path, lambda file: np.savez_compressed(file, **arrays))
 
 
@@ -178,8 +186,10 @@ def load_episodes(path: Path) -> list[Episode]:
         count = 1 + max(int(name.split("/")[0]) for name in file.files)
         names = [one.name for one in fields(Episode)]
         values = [{name: file[f"{k}/{name}"] for name in names} for k in range(count)]
-    return [until_covered(Episode(**{name: one[name] if one[name].ndim else one[name].item() for name in names}))
-            for one in values]  # fmt: skip
+    return [
+        until_covered(Episode(**{name: one[name] if one[name].ndim else one[name].item() for name in names}))
+        for one in values
+    ]
 
 
 def until_covered(episode: Episode, share: float = COVERED) -> Episode:

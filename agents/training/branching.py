@@ -191,18 +191,26 @@ def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfi
 
 
 def describe(
-    env: ExplorationEnv, step: int, features: torch.Tensor, mask: torch.Tensor, index: torch.Tensor,
+    env: ExplorationEnv,
+    step: int,
+    features: torch.Tensor,
+    mask: torch.Tensor,
+    index: torch.Tensor,
     advantage: torch.Tensor,
-) -> dict[str, np.ndarray]:  # fmt: skip
+) -> dict[str, np.ndarray]:
     """The teams that had anything to choose at a decision, as `play_round` returns them."""
     teams = (index[..., 1:] >= 0).flatten(1).any(1).nonzero().squeeze(-1)
     columns = {
-        "features": features.half(), "mask": mask, "index": index.to(torch.int8), "advantage": advantage,
+        "features": features.half(),
+        "mask": mask,
+        "index": index.to(torch.int8),
+        "advantage": advantage,
         "map": env.simulation.tensors["map_id"].to(torch.int16),
-    }  # fmt: skip
+    }
     return {name: one[teams].numpy() for name, one in columns.items()} | {
-        "team": teams.to(torch.int16).numpy(), "decision": np.full(len(teams), step, np.int16)
-    }  # fmt: skip
+        "team": teams.to(torch.int16).numpy(),
+        "decision": np.full(len(teams), step, np.int16),
+    }
 
 
 def training_maps(scenario: str) -> list[int]:
@@ -226,9 +234,14 @@ def _write_round(config: BranchingConfig, scenario: str, turn: int, place: Path)
     indices = training_maps(scenario)
     maps = [make_map(scenario, int(k)) for k in rng.choice(indices, min(config.teams, len(indices)), replace=False)]
     env = ExplorationEnv(
-        maps, config.teams, config.robots, seed=seed, num_threads=1,
-        planner=PlannerConfig(name="wavefront"), observation=ObservationConfig(pictures=False, targets=SHOWN),
-    )  # fmt: skip
+        maps,
+        config.teams,
+        config.robots,
+        seed=seed,
+        num_threads=1,
+        planner=PlannerConfig(name="wavefront"),
+        observation=ObservationConfig(pictures=False, targets=SHOWN),
+    )
     found = play_round(env, BranchPlayer(env, config.candidates, config.horizon, seed), config)
     write_file(place, lambda file: np.savez_compressed(file, names=np.array([one.name for one in maps]), **found))
     tried, seconds = int(np.isfinite(found["advantage"]).sum()), time.perf_counter() - begin

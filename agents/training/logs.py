@@ -205,10 +205,15 @@ class WeightsAndBiases:
             identity.write_text(uuid.uuid4().hex)
         try:
             self.run = wandb.init(
-                project=settings.project, name=f"{folder.parent.name}/{folder.name}", id=identity.read_text(),
-                resume="allow", dir=str(folder), mode=settings.mode, config=config,
+                project=settings.project,
+                name=f"{folder.parent.name}/{folder.name}",
+                id=identity.read_text(),
+                resume="allow",
+                dir=str(folder),
+                mode=settings.mode,
+                config=config,
                 settings=wandb.Settings(silent=settings.mode == "offline"),
-            )  # fmt: skip
+            )
         except wandb.Error as error:
             why = str(error).splitlines()[0]
             advice = "run wandb login, or add logger.mode=offline"

@@ -38,7 +38,7 @@ class PredictorConfig:
 
     data: str = setting("beliefs", "folder of beliefs")
     out: str = setting("map_predictor", "folder of the checkpoint and the log")
-    start: str = setting("", "folder of an earlier training whose weights are the first ones; \"\": none")
+    start: str = setting("", 'folder of an earlier training whose weights are the first ones; "": none')
     width: int = setting(16, "channels of the network's finest level", low=1, high=256)
     steps: int = setting(4000, "gradient steps of the whole training", low=1)
     batch: int = setting(16, "beliefs in a step", low=1, high=4096)
@@ -190,8 +190,13 @@ def trained_with(config: PredictorConfig) -> dict:
 
 def save(config: PredictorConfig, net: MapPredictor, optimizer: torch.optim.Optimizer, step: int, rows: list) -> None:
     """Checkpoint and log."""
-    content = {"config": trained_with(config), "net": net.state_dict(), "optimizer": optimizer.state_dict(),
-               "step": step, "rows": rows}  # fmt: skip
+    content = {
+        "config": trained_with(config),
+        "net": net.state_dict(),
+        "optimizer": optimizer.state_dict(),
+        "step": step,
+        "rows": rows,
+    }
     write_file(Path(config.out) / CHECKPOINT, lambda file: torch.save(content, file))
     lines = ["step,log_loss", *(f"{one},{loss:.6f}" for one, loss in rows)]
     write_text(Path(config.out) / LOG, "\n".join(lines) + "\n")

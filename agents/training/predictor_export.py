@@ -79,9 +79,15 @@ def predictor_to_onnx(net: MapPredictor) -> bytes:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            Guess(net).eval(), example, dynamo=True, verbose=False, opset_version=OPSET, input_names=["known"],
-            output_names=["free"], dynamic_shapes={"known": sizes},
-        )  # fmt: skip
+            Guess(net).eval(),
+            example,
+            dynamo=True,
+            verbose=False,
+            opset_version=OPSET,
+            input_names=["known"],
+            output_names=["free"],
+            dynamic_shapes={"known": sizes},
+        )
     out = io.BytesIO()
     program.save(out)
     return without_traces(out.getvalue())
@@ -103,8 +109,10 @@ def export_predictor(config: ExportConfig) -> None:
     saved = torch.load(path, weights_only=True)
     net = MapPredictor(saved["config"]["width"])
     net.load_state_dict(saved["net"])
-    files = {WEIGHTS: save({key: value.contiguous() for key, value in net.state_dict().items()}),
-             NETWORK: predictor_to_onnx(net)}  # fmt: skip
+    files = {
+        WEIGHTS: save({key: value.contiguous() for key, value in net.state_dict().items()}),
+        NETWORK: predictor_to_onnx(net),
+    }
     for name, content in files.items():
         write_file(out / name, lambda file, content=content: file.write(content))
     write_text(out / CARD, Path(config.card).read_text() if config.card else f"# {out.name}\n")

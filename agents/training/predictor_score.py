@@ -43,7 +43,7 @@ class ScoreConfig:
     train: str = setting("beliefs/train", "folder of beliefs that the histograms are counted in")
     predictor: str = setting("general", "name or folder")
     moments: int = setting(4, "beliefs looked at in each episode", low=1)
-    out: str = setting("", "JSON file with the figures; \"\": none")
+    out: str = setting("", 'JSON file with the figures; "": none')
 
 
 @dataclass(frozen=True)
@@ -207,8 +207,9 @@ def mean_figures(scores: list[dict]) -> dict:
 def print_scores(found: dict) -> None:
     """Tables in Markdown: of guesses, and of samples."""
     scores = {name: one for name, one in found.items() if name != "tables"}
-    guesses = {name: {way: row for way, row in one.items() if way not in ("cells", "samples")}
-               for name, one in scores.items()}  # fmt: skip
+    guesses = {
+        name: {way: row for way, row in one.items() if way not in ("cells", "samples")} for name, one in scores.items()
+    }
     print_table("guess", guesses)
     print()
     print_table("length", {name: one["samples"] for name, one in scores.items()})

@@ -344,10 +344,15 @@ def make_both(
     teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
     whole = words.collector.steps is None  # episodes, which differ in length from scenario to scenario
     envs = [
-        make_env(*places[k // len(sizes)], one.num_robots, one.num_envs if alone else 1,
-                 device=here if alone else there, first_env=one.first_env)
+        make_env(
+            *places[k // len(sizes)],
+            one.num_robots,
+            one.num_envs if alone else 1,
+            device=here if alone else there,
+            first_env=one.first_env,
+        )
         for k, one in enumerate(teams)
-    ]  # fmt: skip
+    ]
     set_steps(cfg, envs[0])
     steps = [env.macro_steps if whole else cfg.collector.steps for env in envs]
     for env, one, length in zip(envs, teams, steps, strict=True):

@@ -67,9 +67,15 @@ class WorkerEnv:
         key = np.random.SeedSequence([cfg.seed % 2**32, self.teams.first_env]).generate_state(1)
         torch.manual_seed(int(key[0]))
         return make_env(
-            cfg, maps, self.teams.num_robots, self.teams.num_envs, device=self.device,
-            first_env=self.teams.first_env, num_threads=self.num_threads, starts=self.starts,
-        )  # fmt: skip
+            cfg,
+            maps,
+            self.teams.num_robots,
+            self.teams.num_envs,
+            device=self.device,
+            first_env=self.teams.first_env,
+            num_threads=self.num_threads,
+            starts=self.starts,
+        )
 
 
 class WorkerCollector(TeamCollector):

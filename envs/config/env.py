@@ -55,9 +55,11 @@ class EnvSettings:
         "centre", "of centres with walls and centres, or footprint: of oriented rectangles"
     )
     success_coverage: float = setting(
-        0.95, "share of the free points that ends an episode, up to 1; 0.99 with more macro_steps: to the end",
-        above=0, high=1,
-    )  # fmt: skip
+        0.95,
+        "share of the free points that ends an episode, up to 1; 0.99 with more macro_steps: to the end",
+        above=0,
+        high=1,
+    )
     done: Literal["union", "base", "everyone"] = setting(
         "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
     )

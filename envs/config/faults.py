@@ -21,9 +21,7 @@ class FaultsConfig(Group):
     at: tuple[tuple[int, float], ...] = setting(
         (), "failures at given moments: pairs of a robot and seconds, as [[0, 30], [2, 12.5]]"
     )
-    duration: float = setting(
-        math.inf, "how long a failure lasts; inf: for good", unit="s", low=0.1, infinite=True
-    )
+    duration: float = setting(math.inf, "how long a failure lasts; inf: for good", unit="s", low=0.1, infinite=True)
 
     @property
     def some(self) -> bool:

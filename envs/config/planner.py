@@ -26,9 +26,7 @@ class PlannerConfig(Group):
         "wavefront", "dwa: straight to the goal; wavefront: on a way through the known map; direct: the policy steers"
     )
     num_accel: int = setting(3, "DWA's candidates of the acceleration", low=1)
-    num_steering: int | None = setting(
-        None, "DWA's candidates of the steering angle", low=1, scenario="num_steering"
-    )
+    num_steering: int | None = setting(None, "DWA's candidates of the steering angle", low=1, scenario="num_steering")
     horizon: int = setting(3, "local steps that DWA looks ahead", low=1)
     clearance_factor: float | None = setting(
         None, "nearer than so many collision thresholds costs DWA; wavefront's paths keep as clear of walls", above=0

@@ -64,12 +64,14 @@ def to_points(path: Path, message) -> np.ndarray:
     if last > step or width * step > row or height * row > len(data):
         told = f"promises {width} x {height} points and holds {len(data)} bytes"
         raise MapError(f"{path}: a cloud {told}; record it again")
-    layout = np.dtype({
-        "names": list("xyz"),
-        "formats": [order + REALS[fields[axis].datatype] for axis in "xyz"],
-        "offsets": [int(fields[axis].offset) for axis in "xyz"],
-        "itemsize": step,
-    })  # fmt: skip
+    layout = np.dtype(
+        {
+            "names": list("xyz"),
+            "formats": [order + REALS[fields[axis].datatype] for axis in "xyz"],
+            "offsets": [int(fields[axis].offset) for axis in "xyz"],
+            "itemsize": step,
+        }
+    )
     rows = data[: height * row].reshape(height, row)[:, : width * step]
     table = np.frombuffer(rows.tobytes(), dtype=layout)
     return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)

@@ -18,7 +18,7 @@ class ImportOptions:
     """How a file becomes a planar map. None or "auto": chosen from the file, and the report says what."""
 
     scenario: str = setting(
-        "auto", 'whose robot and radar fit the map; auto: outdoor for a scan from the air, else pointcloud'
+        "auto", "whose robot and radar fit the map; auto: outdoor for a scan from the air, else pointcloud"
     )
     name: str | None = setting(None, "of the map; default: the stem of the file")
     resolution: float | None = setting(
@@ -46,9 +46,7 @@ class ImportOptions:
     place: Literal["auto", "indoor", "outdoor"] = setting(
         "auto", "indoor: one flat floor; outdoor: terrain seen from above"
     )
-    floor: float | None = setting(
-        None, "height of the floor after levelling, when no floor was scanned", unit="m"
-    )
+    floor: float | None = setting(None, "height of the floor after levelling, when no floor was scanned", unit="m")
     step_height: float | None = setting(None, "a robot drives over anything lower", unit="m", low=0)
     robot_height: float | None = setting(None, "a robot passes under anything higher", unit="m", above=0)
     voxel: float | None = setting(None, "points are thinned to one a voxel of this size", unit="m", above=0)

@@ -50,9 +50,7 @@ class Furnisher:
         """Fill `room` with what its kind calls for, as far as it fits."""
         _PROGRAMS[room.kind](self, room)
 
-    def at_wall(
-        self, room: Room, stamp: Stamp, sides: Sequence[int] = (0, 1, 2, 3), corner: float = 0.5
-    ) -> int | None:
+    def at_wall(self, room: Room, stamp: Stamp, sides: Sequence[int] = (0, 1, 2, 3), corner: float = 0.5) -> int | None:
         """Put `stamp` against a wall; returns the side (0 low y, 1 high y, 2 low x, 3 high x) or None.
 
         `corner` is the chance that a try goes into a corner of the room.

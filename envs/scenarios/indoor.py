@@ -37,9 +37,7 @@ def build_indoor(index: int, *, scenario: str, longest: tuple[float, float]) -> 
     )
 
 
-def _draw_plan(
-    longest: tuple[float, float], rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _draw_plan(longest: tuple[float, float], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One furnished plan: cells that are free, wall, and inside the outer walls, bool (nx, ny) each."""
     width = cells(rng.uniform(*longest))
     depth = cells(width * CELL * rng.uniform(0.68, 0.95))
@@ -221,9 +219,7 @@ def _spanning_doors(rooms: list[Room], rng: np.random.Generator) -> list[tuple[i
     return tree
 
 
-def _open_doors(
-    rooms: list[Room], blocked: np.ndarray, is_office: bool, rng: np.random.Generator
-) -> np.ndarray:
+def _open_doors(rooms: list[Room], blocked: np.ndarray, is_office: bool, rng: np.random.Generator) -> np.ndarray:
     """Cut doors into `blocked`; returns the cells before and behind them that furniture must leave free."""
     reserved = np.zeros_like(blocked)
     tree = _spanning_doors(rooms, rng)
@@ -270,9 +266,7 @@ def _carve(blocked: np.ndarray, reserved: np.ndarray, axis: int, position: int, 
     reserved[(ahead, along) if axis == 0 else (along, ahead)] = True
 
 
-def _hang_leaf(
-    blocked: np.ndarray, axis: int, position: int, hinge: int, length: int, towards_high: bool
-) -> None:
+def _hang_leaf(blocked: np.ndarray, axis: int, position: int, hinge: int, length: int, towards_high: bool) -> None:
     """Draw a door standing open at right angles to its wall."""
     span = slice(position + 1, position + 1 + length) if towards_high else slice(position - length, position)
     blocked[(span, hinge) if axis == 0 else (hinge, span)] = True

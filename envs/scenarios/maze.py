@@ -29,9 +29,7 @@ def spanning_tree(cells: int, rng: np.random.Generator) -> list[tuple[tuple[int,
     return tree
 
 
-def build_maze(
-    index: int, *, scenario: str, cells: int, corridor: int, wall: int, resolution: float
-) -> PointCloudMap:
+def build_maze(index: int, *, scenario: str, cells: int, corridor: int, wall: int, resolution: float) -> PointCloudMap:
     """Maze of `cells` x `cells` cells, corridors `corridor` lattice points wide, walls `wall` points thick.
 
     The lattice has cells * (corridor + wall) + wall points a side and starts at (0, 0).

@@ -315,8 +315,12 @@ def _field(scene: Scene, rect: Rect) -> None:
     u0, v0, u1, v1 = _shrink(rect, 2)
     for side in np.argsort(rng.random(4))[: int(rng.integers(1, 3))]:
         cut = rng.uniform(8, 14)
-        hedge = [(u0 + cut, v0, u1, v0 + 2), (u0, v1 - 2, u1 - cut, v1),
-                 (u0, v0 + cut, u0 + 2, v1), (u1 - 2, v0, u1, v1 - cut)][side]  # fmt: skip
+        hedge = [
+            (u0 + cut, v0, u1, v0 + 2),
+            (u0, v1 - 2, u1 - cut, v1),
+            (u0, v0 + cut, u0 + 2, v1),
+            (u1 - 2, v0, u1, v1 - cut),
+        ][side]
         scene.box(hedge, 2.0)
     _trees(scene, rect, 0.0012)
 
@@ -362,19 +366,27 @@ def _shrink(rect: Rect, margin: float) -> Rect:
 _Block = Callable[[Scene, Rect], None]
 _THEMES: dict[str, dict] = {
     "centre": {
-        "spacing": (58, 88), "cars": 0.25, "river": 0.3,
+        "spacing": (58, 88),
+        "cars": 0.25,
+        "river": 0.3,
         "blocks": {_perimeter: 5, _slabs: 1, _square: 1, _park: 1, _car_park: 1, _big_hall: 0.6},
     },
     "housing": {
-        "spacing": (54, 86), "cars": 0.3, "river": 0.2,
+        "spacing": (54, 86),
+        "cars": 0.3,
+        "river": 0.2,
         "blocks": {_houses: 7, _terraces: 3, _slabs: 1, _park: 1, _car_park: 0.4},
     },
     "campus": {
-        "spacing": (72, 110), "cars": 0.1, "river": 0.2,
+        "spacing": (72, 110),
+        "cars": 0.1,
+        "river": 0.2,
         "blocks": {_big_hall: 3, _slabs: 3, _park: 2, _car_park: 1.5, _square: 0.5},
     },
     "country": {
-        "spacing": (70, 110), "cars": 0.0, "river": 0.5,
+        "spacing": (70, 110),
+        "cars": 0.0,
+        "river": 0.5,
         "blocks": {_field: 2.5, _maize: 1.5, _wood: 3, _farm: 2, _houses: 1.5},
     },
-}  # fmt: skip
+}

@@ -13,9 +13,19 @@ from maexp.kernels.types import DT
 
 _FORMAT = "maexp-episode-1"
 _KINDS = {
-    "step": "iu", "pose": "f", "center": "f", "goal": "f", "waypoint": "f", "collided": "b", "coverage": "f",
-    "body": "f", "radar_range": "f", "free_seen_at": "iu", "boundary_seen_at": "iu", "visible": "u",
-}  # fmt: skip
+    "step": "iu",
+    "pose": "f",
+    "center": "f",
+    "goal": "f",
+    "waypoint": "f",
+    "collided": "b",
+    "coverage": "f",
+    "body": "f",
+    "radar_range": "f",
+    "free_seen_at": "iu",
+    "boundary_seen_at": "iu",
+    "visible": "u",
+}
 _MAY_BE_NAN = ("goal", "waypoint")  # before the first goal
 
 
@@ -120,10 +130,19 @@ class Episode:
         count, robots = self.step.shape[:1] + (0,), self.radar_range.shape[:1] + (0,)
         t, n, f, b = count[0], robots[0], len(self.map.free), len(self.map.boundary)
         shapes = {
-            "step": (t,), "pose": (t, n, 4), "center": (t, n, 2), "goal": (t, n, 2), "waypoint": (t, n, 2),
-            "collided": (t, n), "coverage": (t,), "body": (n, 2), "radar_range": (n,), "free_seen_at": (n, f),
-            "boundary_seen_at": (n, b), "visible": (t, n, -(-f // 8)),
-        }  # fmt: skip
+            "step": (t,),
+            "pose": (t, n, 4),
+            "center": (t, n, 2),
+            "goal": (t, n, 2),
+            "waypoint": (t, n, 2),
+            "collided": (t, n),
+            "coverage": (t,),
+            "body": (n, 2),
+            "radar_range": (n,),
+            "free_seen_at": (n, f),
+            "boundary_seen_at": (n, b),
+            "visible": (t, n, -(-f // 8)),
+        }
         for name, shape in shapes.items():
             array = getattr(self, name)
             if array.shape != shape or array.dtype.kind not in _KINDS[name] or 0 in (t, n):

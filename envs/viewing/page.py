@@ -25,16 +25,34 @@ _ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.076, 0.90834, 0.01566], [0.
 _ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 TEAM = "the team"
 MOST_LABELS = 40  # robots with a number over them
-LEGEND = (("unexplored", UNEXPLORED), ("explored", EXPLORED), ("explored by two or more", OVERLAP),
-          ("wall, seen", WALL_SEEN), ("wall, unseen", WALL_UNSEEN))  # fmt: skip
+LEGEND = (
+    ("unexplored", UNEXPLORED),
+    ("explored", EXPLORED),
+    ("explored by two or more", OVERLAP),
+    ("wall, seen", WALL_SEEN),
+    ("wall, unseen", WALL_UNSEEN),
+)
 _TILE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]], dtype=np.float32)
 _TILE_FACES = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32)
 _ARROW = np.array([[0.42, 0, 1.03], [-0.1, 0.36, 1.03], [-0.1, -0.36, 1.03]], dtype=np.float32)
 _BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)], dtype=np.float32)
 _BOX_FACES = np.array(
-    [[1, 5, 7], [1, 7, 3], [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
-     [0, 2, 6], [0, 6, 4]], dtype=np.uint32,
-)  # fmt: skip
+    [
+        [1, 5, 7],
+        [1, 7, 3],
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+    ],
+    dtype=np.uint32,
+)
 
 
 def import_viser():
@@ -69,10 +87,18 @@ class Actors:
         self.server, self.labels = server, []
         add, scale = server.scene, np.asarray(scene.ground_size, dtype=np.float32)
         self.ground = add.add_batched_meshes_simple(
-            "/ground", _TILE, _TILE_FACES, _turns(np.zeros(len(scale))), _floats(scene.ground), batched_scales=scale,
-            batched_colors=_paint(scene.ground_colour), side="double", lod="off", cast_shadow=False,
+            "/ground",
+            _TILE,
+            _TILE_FACES,
+            _turns(np.zeros(len(scale))),
+            _floats(scene.ground),
+            batched_scales=scale,
+            batched_colors=_paint(scene.ground_colour),
+            side="double",
+            lod="off",
+            cast_shadow=False,
             receive_shadow=False,
-        )  # fmt: skip
+        )
         self.walls = None
         if len(scene.walls):
             sizes = np.column_stack([scene.wall_size, scene.wall_size, scene.wall_height])
@@ -83,9 +109,17 @@ class Actors:
         self.moving["robots"] = self._boxes("/robots", scene.robots, scene.body, scene.robot_colour)
         white = np.full((len(scene.robots), 3), 255, dtype=np.uint8)
         self.moving["arrows"] = add.add_batched_meshes_simple(
-            "/arrows", _ARROW, np.array([[0, 1, 2]], dtype=np.uint32), _turns(scene.heading), _floats(scene.robots),
-            batched_scales=_floats(scene.body), batched_colors=white, side="double", lod="off", cast_shadow=False,
-        )  # fmt: skip
+            "/arrows",
+            _ARROW,
+            np.array([[0, 1, 2]], dtype=np.uint32),
+            _turns(scene.heading),
+            _floats(scene.robots),
+            batched_scales=_floats(scene.body),
+            batched_colors=white,
+            side="double",
+            lod="off",
+            cast_shadow=False,
+        )
         self.moving["goals"] = self._boxes("/goals", scene.robots, scene.body, scene.robot_colour)
         lines, colours = np.zeros((1, 2, 3), dtype=np.float32), np.zeros((1, 2, 3), dtype=np.uint8)
         for name, width in (("trails", 3.0), ("radar", 1.5)):
@@ -98,10 +132,18 @@ class Actors:
 
     def _boxes(self, name: str, feet, sizes, colours):
         return self.server.scene.add_batched_meshes_simple(
-            name, _BOX, _BOX_FACES, _turns(np.zeros(len(feet))), _floats(feet), batched_scales=_floats(sizes),
-            batched_colors=_paint(colours), flat_shading=True, lod="off", cast_shadow=False,
+            name,
+            _BOX,
+            _BOX_FACES,
+            _turns(np.zeros(len(feet))),
+            _floats(feet),
+            batched_scales=_floats(sizes),
+            batched_colors=_paint(colours),
+            flat_shading=True,
+            lod="off",
+            cast_shadow=False,
             receive_shadow=False,
-        )  # fmt: skip
+        )
 
     def show(self, scene: Scene, radar: bool = True) -> None:
         """Move everything to where it is in `scene`."""

@@ -131,12 +131,22 @@ class Stage:
 
     def _scene(self, ground_colour: np.ndarray, wall_colour: np.ndarray, moving: dict) -> Scene:
         none = {
-            "robots": np.zeros((0, 3)), "heading": np.zeros(0), "body": np.zeros((0, 3)), "collided": np.zeros(0, bool),
-            "robot_colour": np.zeros((0, 3), np.uint8), "trails": np.zeros((0, 0, 3)), "goals": np.zeros((0, 3)),
+            "robots": np.zeros((0, 3)),
+            "heading": np.zeros(0),
+            "body": np.zeros((0, 3)),
+            "collided": np.zeros(0, bool),
+            "robot_colour": np.zeros((0, 3), np.uint8),
+            "trails": np.zeros((0, 0, 3)),
+            "goals": np.zeros((0, 3)),
             "radar_range": np.zeros(0),
-        }  # fmt: skip
+        }
         return Scene(
-            ground=self.ground, ground_size=self.map.free_spacing, ground_colour=ground_colour, walls=self.walls,
-            wall_size=self.map.obstacle_spacing, wall_height=self.wall_height, wall_colour=wall_colour,
+            ground=self.ground,
+            ground_size=self.map.free_spacing,
+            ground_colour=ground_colour,
+            walls=self.walls,
+            wall_size=self.map.obstacle_spacing,
+            wall_height=self.wall_height,
+            wall_colour=wall_colour,
             **(none | moving),
-        )  # fmt: skip
+        )

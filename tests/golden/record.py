@@ -19,9 +19,16 @@ CASES = {name: (name, "dwa") for name, one in SCENARIOS.items() if one.build is 
 CASES |= {f"maze_small_{planner}": ("maze_small", planner) for planner in ("wavefront", "direct")}
 CLEARANCE = {"random": 3.0, "maze": 4.0, "indoor": 4.2, "outdoor": 4.2}  # factor by the first word of a scenario
 REWARD = RewardConfig(
-    explore=0.3, overlap=0.01, time=1.0, success=100.0, collision=200.0, points=60.0, events=60.0 / 7000.0,
-    time_on="uncovered", charge_rest=False,
-)  # fmt: skip
+    explore=0.3,
+    overlap=0.01,
+    time=1.0,
+    success=100.0,
+    collision=200.0,
+    points=60.0,
+    events=60.0 / 7000.0,
+    time_on="uncovered",
+    charge_rest=False,
+)
 
 
 def settings(case: str) -> dict:
@@ -53,14 +60,16 @@ def play(case: str) -> dict[str, np.ndarray]:
             td["agents", "action", "region"] = torch.from_numpy(rng.integers(0, 64, (2, ROBOTS)))
             td["agents", "action", "offset"] = torch.from_numpy(rng.uniform(-1, 1, (2, ROBOTS, 2))).float()
         td = env.step(td)["next"]
-        rows.append({
-            "pose": env.simulation.tensors["pose"].numpy().copy(),
-            "terms": np.stack([td["info", f"reward_{term}"].numpy() for term in REWARD_TERMS], axis=-1),
-            "path_length": td["info", "path_length"].numpy(),
-            "coverage": td["info", "coverage"].numpy()[:, 0],
-            "pictures": td["agents", "observation", "map"].float().mean((-1, -2)).numpy(),
-            "team": td["team", "map"].float().mean((-1, -2)).numpy(),
-        })  # fmt: skip
+        rows.append(
+            {
+                "pose": env.simulation.tensors["pose"].numpy().copy(),
+                "terms": np.stack([td["info", f"reward_{term}"].numpy() for term in REWARD_TERMS], axis=-1),
+                "path_length": td["info", "path_length"].numpy(),
+                "coverage": td["info", "coverage"].numpy()[:, 0],
+                "pictures": td["agents", "observation", "map"].float().mean((-1, -2)).numpy(),
+                "team": td["team", "map"].float().mean((-1, -2)).numpy(),
+            }
+        )
     return {name: np.stack([row[name] for row in rows]).astype(np.float32) for name in rows[0]}
 
 

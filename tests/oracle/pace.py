@@ -18,8 +18,7 @@ def nearest_obstacle(known, x: float, y: float, look: int) -> float:
         math.hypot(column + 0.5 - x, row + 0.5 - y)
         for row in range(height)
         for column in range(width)
-        if known[row, column] == OBSTACLE
-        and max(abs(row - math.floor(y)), abs(column - math.floor(x))) <= look
+        if known[row, column] == OBSTACLE and max(abs(row - math.floor(y)), abs(column - math.floor(x))) <= look
     ]
     return min([*gaps, look])
 

@@ -30,9 +30,7 @@ def touches(r: int, c: int, start, end) -> bool:
     (y0, x0), (y1, x1) = start, end
     if max(y0, y1) < r - 0.5 or min(y0, y1) > r + 0.5 or max(x0, x1) < c - 0.5 or min(x0, x1) > c + 0.5:
         return False
-    sides = [
-        (x1 - x0) * (r + dy - y0) - (y1 - y0) * (c + dx - x0) for dy in (-0.5, 0.5) for dx in (-0.5, 0.5)
-    ]
+    sides = [(x1 - x0) * (r + dy - y0) - (y1 - y0) * (c + dx - x0) for dy in (-0.5, 0.5) for dx in (-0.5, 0.5)]
     return min(sides) <= 0 <= max(sides)
 
 

@@ -18,10 +18,15 @@ from maexp.kernels.types import DT
 GOAL = 0.995
 WORDS = ("scenario.starts=together", f"scenario.success_coverage={GOAL}", "scenario.macro_steps=60", "num_threads=1")
 ROWS = {
-    "steps to 95 %": "coverage_step_95_censored", "steps to 99 %": "coverage_step_99_censored",
-    "steps to 99.5 %": "last", "reached 99.5 % [%]": "there", "coverage over time [%]": "coverage_auc",
-    "needless duplicates": "needless", "robots lost": "collisions", "way of a robot [m]": "path_length",
-}  # fmt: skip
+    "steps to 95 %": "coverage_step_95_censored",
+    "steps to 99 %": "coverage_step_99_censored",
+    "steps to 99.5 %": "last",
+    "reached 99.5 % [%]": "there",
+    "coverage over time [%]": "coverage_auc",
+    "needless duplicates": "needless",
+    "robots lost": "collisions",
+    "way of a robot [m]": "path_length",
+}
 PERCENT = ("coverage_auc", "there")
 
 

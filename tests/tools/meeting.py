@@ -27,8 +27,14 @@ def play(env: ExplorationEnv) -> list[dict]:
     td = env.reset()
     while True:
         known = unpack_flags(s["known_free"], 2)[0].numpy()
-        seen.append({"known": known, "at": s["center"][0, :, :2].numpy().copy(), "hears": bool(s["comm"][0, 0, 1]),
-                     "seconds": float(s["local_step"][0]) / 10})  # fmt: skip
+        seen.append(
+            {
+                "known": known,
+                "at": s["center"][0, :, :2].numpy().copy(),
+                "hears": bool(s["comm"][0, 0, 1]),
+                "seconds": float(s["local_step"][0]) / 10,
+            }
+        )
         if bool(td["done"].any()):
             return seen
         td = step_mdp(env.step(policy(td)), exclude_done=False)
@@ -69,8 +75,12 @@ def draw_moments(moments: list[tuple[str, dict]], world: PointCloudMap, free: np
         ax.set_title(title, loc="left")
         ax.plot(*world.boundary[:, :2].T, ".", color="black", markersize=1)
         known = one["known"][:, : len(free)]
-        parts = ((~known[0] & ~known[1], GREY, None), (known[0] & ~known[1], COLOURS[0], "first alone"),
-                 (known[1] & ~known[0], COLOURS[1], "second alone"), (known[0] & known[1], BOTH, "both"))  # fmt: skip
+        parts = (
+            (~known[0] & ~known[1], GREY, None),
+            (known[0] & ~known[1], COLOURS[0], "first alone"),
+            (known[1] & ~known[0], COLOURS[1], "second alone"),
+            (known[0] & known[1], BOTH, "both"),
+        )
         for which, colour, label in parts:
             ax.plot(*free[which].T, "s", color=colour, markersize=2.2, label=label)
         for (x, y), colour in zip(one["at"], COLOURS[:2], strict=True):

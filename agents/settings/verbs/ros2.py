@@ -10,9 +10,11 @@ from maexp.envs.fields import setting
 
 DriveSettings = make_dataclass(
     "DriveSettings",
-    [(one.name, Any, setting(None if one.default == () else one.default, f"team: {one.metadata['help']}"))
-     for one in fields(DriverSettings)],
-)  # fmt: skip
+    [
+        (one.name, Any, setting(None if one.default == () else one.default, f"team: {one.metadata['help']}"))
+        for one in fields(DriverSettings)
+    ],
+)
 
 
 @dataclass

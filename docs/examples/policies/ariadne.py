@@ -108,10 +108,19 @@ def describe(graph, robot, others, picked, visited, reach, shared):
     taken = np.min([np.hypot(*(goals - one).T) for one in picked] or [np.full(len(ways), np.inf)], 0) / reach
     been = np.min([np.hypot(*(graph.nodes - one).T) for one in visited], 0) / reach
     columns = [
-        away / 3, np.hypot(*away.T) / 3, ways / 3, np.exp(-ways), np.log1p(graph.length / reach), graph.length > 0,
-        np.minimum(theirs, FAR) / 3, np.clip(ways - theirs, -3.0, 3.0), np.exp(-(taken**2)), been < 0.3,
-        np.full(len(ways), shared[0]), np.full(len(ways), shared[1]),
-    ]  # fmt: skip
+        away / 3,
+        np.hypot(*away.T) / 3,
+        ways / 3,
+        np.exp(-ways),
+        np.log1p(graph.length / reach),
+        graph.length > 0,
+        np.minimum(theirs, FAR) / 3,
+        np.clip(ways - theirs, -3.0, 3.0),
+        np.exp(-(taken**2)),
+        been < 0.3,
+        np.full(len(ways), shared[0]),
+        np.full(len(ways), shared[1]),
+    ]
     return np.column_stack(columns).astype(np.float32)
 
 
@@ -141,8 +150,10 @@ class Network:
 
     def _attend(self, name, x, y, edges):
         """Of x to those of y that `edges` [len(x), len(y)] allow."""
-        q, k, v = (self._linear(f"{name}.{one}", z).reshape(len(z), HEADS, -1).swapaxes(0, 1)
-                   for one, z in (("q", x), ("k", y), ("v", y)))  # fmt: skip
+        q, k, v = (
+            self._linear(f"{name}.{one}", z).reshape(len(z), HEADS, -1).swapaxes(0, 1)
+            for one, z in (("q", x), ("k", y), ("v", y))
+        )
         score = np.where(edges, q @ k.swapaxes(1, 2) / np.sqrt(WIDTH / HEADS), -np.inf)
         weight = np.exp(score - score.max(-1, keepdims=True))
         weight = weight / weight.sum(-1, keepdims=True)

@@ -21,9 +21,9 @@ from maexp.agents.runtime.frames import fill_pose
 from . import conversion
 
 OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
-PARAMETERS = {
-    name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()
-} | {"action": "navigate_to_pose"}
+PARAMETERS = {name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()} | {
+    "action": "navigate_to_pose"
+}
 
 
 def latched(depth: int) -> QoSProfile:
