@@ -1,4 +1,4 @@
-"""The paper's Table II in the benchmark, and its slips in docs/paper.md, against the paper's own source."""
+"""The paper's Table II in the benchmark, and its slips in docs/log, against the paper's own source."""
 
 import os
 import re
@@ -59,10 +59,10 @@ def paper_best(scenario: str, metric: str) -> set[str]:
 
 
 def paper_page() -> str:
-    return (Path(__file__).resolve().parents[1] / "docs" / "paper.md").read_text()
+    return (Path(__file__).resolve().parents[1] / "docs" / "log" / "2026-11-22-paper-slips.md").read_text()
 
 
-def test_the_slips_that_the_page_lists_are_the_papers_bold_against_its_numbers():
+def test_the_slips_that_the_log_lists_are_the_papers_bold_against_its_numbers():
     _, bold = printed_table()
     wrong = set()
     for scenario in SCENARIOS:
