@@ -19,10 +19,10 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.baseline import load_baseline
 from maexp.agents.evaluation.begun import is_begun
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import write_json, write_text
 from maexp.agents.locking import lock
 from maexp.agents.settings.overrides import quote, split_paths
+from maexp.agents.tables import POINTS, estimate, fixed, markdown_table
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.scenarios import SCENARIOS
 
@@ -149,27 +149,23 @@ def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
     """Markdown; `found`: condition -> policy -> its episodes, the first condition first."""
     shown = [name for name in METRICS if any(name in one.episodes for row in found.values() for one in row.values())]
     heads = ["condition", "policy", "to the first [points]", *(METRICS[name][0] for name in shown)]
-    lines = [f"**{title}**", "", _row(heads), _row(["---"] * len(heads))]
+    rows = []
     first = next(iter(found.values()), {})
     for condition, row in found.items():
         for policy, one in row.items():
-            apart = "" if row is first or policy not in first else _difference(one.minus(first[policy])["coverage_auc"])
+            apart = (
+                ""
+                if row is first or policy not in first
+                else estimate(one.minus(first[policy])["coverage_auc"], POINTS)
+            )
             summary = one.summary()
-            lines.append(_row([condition, f"`{policy}`", apart, *(_mean(name, summary) for name in shown)]))
-    return "\n".join(lines)
-
-
-def _row(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _difference(one: dict) -> str:
-    return f"{100.0 * one['mean']:+.1f}" + brackets(one, lambda end: f"{100.0 * end:+.1f}")
+            rows.append([condition, f"`{policy}`", apart, *(_mean(name, summary) for name in shown)])
+    return "\n".join([f"**{title}**", "", *markdown_table(heads, rows)])
 
 
 def _mean(name: str, summary: dict[str, dict]) -> str:
     _, factor, digits = METRICS[name]
-    return f"{factor * summary[name]['mean']:.{digits}f}" if name in summary and summary[name]["n"] else ""
+    return fixed(digits, factor)(summary[name]["mean"]) if name in summary and summary[name]["n"] else ""
 
 
 def read_config(words: list[str]) -> ConditionsConfig:

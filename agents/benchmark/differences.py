@@ -2,7 +2,7 @@
 
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.evaluation.evaluate import EvaluationResult, join
-from maexp.agents.evaluation.evidence import brackets
+from maexp.agents.tables import estimate, fixed, markdown_table
 from maexp.envs.metrics import in_reach
 
 Played = list[tuple[Cell, EvaluationResult]]
@@ -25,11 +25,7 @@ def subtract(one: Played, other: Played) -> dict[str, dict]:
 def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:
     """{title: +1.2 [0.3, 2.1]} of the metrics in `SHOWN` that episodes reach which end at the coverage `goal`."""
     shown = [row for row in SHOWN if in_reach(row[0], goal)]
-    return {title: _cell(found[metric], scale, digits) for metric, title, scale, digits in shown}
-
-
-def _cell(one: dict, scale: float, digits: int) -> str:
-    return f"{scale * one['mean']:+.{digits}f}{brackets(one, lambda end: f'{scale * end:+.{digits}f}')}"
+    return {title: estimate(found[metric], fixed(digits, scale, "+")) for metric, title, scale, digits in shown}
 
 
 def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) -> str:
@@ -42,10 +38,9 @@ def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) 
     """
     cells = {name: difference_cells(found, goal) for name, found in rows.items()}
     titles = next(iter(cells.values()))
-    lines = [f"Less {rival}, the best classical planner on the validation maps, episode by episode:", ""]
-    lines += ["| | " + " | ".join(titles) + " |", "| --- |" + " --- |" * len(titles)]
-    lines += [f"| {name} | {' | '.join(found.values())} |" for name, found in cells.items()]
-    return "\n".join(lines)
+    head = f"Less {rival}, the best classical planner on the validation maps, episode by episode:"
+    rows = [[name, *found.values()] for name, found in cells.items()]
+    return "\n".join([head, "", *markdown_table(["", *titles], rows)])
 
 
 def differences_text(scenario: str, rival: str, rows: dict[str, dict], goal: float = 0.95) -> list[str]:

@@ -5,14 +5,25 @@ import io
 from dataclasses import dataclass, field
 
 import numpy as np
-from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.agents.evaluation.evaluate import EvaluationResult, join
-from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence
+from maexp.agents.evaluation.evidence import Evidence, describe_evidence
+from maexp.agents.tables import (
+    NONE,
+    Cell,
+    brackets,
+    fixed,
+    latex_row,
+    latex_small,
+    latex_text,
+    markdown_table,
+    reached,
+    terminal_table,
+)
 from maexp.envs.metrics import in_reach
 
 
@@ -33,7 +44,7 @@ class Row:
         return f"{self.label}{f' {self.unit}' if self.unit else ''} {arrow}"
 
     def number(self, value: float) -> str:
-        return f"{self.scale * value:.{self.digits}f}"
+        return fixed(self.digits, self.scale)(value)
 
 
 ROWS = (
@@ -149,21 +160,21 @@ def evidence_of(columns: list[Column]) -> list[str]:
 def value_text(column: Column, row: Row) -> str:
     """68.8 ± 5.7, or - where no episode got there."""
     one = column.summary[row.metric]
-    return f"{row.number(one['mean'])} ± {row.number(one['std'])}" if one["n"] else "-"
+    return f"{row.number(one['mean'])} ± {row.number(one['std'])}" if one["n"] else NONE
 
 
 def interval_text(column: Column, row: Row) -> str:
     """[67.2, 70.1], and of how many episodes where it can be fewer than all; "" where there is neither."""
     one = column.summary[row.metric]
     counted = row.label.startswith(("CS", "MO")) or not one["n"]
-    return (brackets(one, row.number) + f" ({one['n']}/{column.total})" * counted).strip()
+    return f"{brackets(one, row.number)} {reached(one, column.total) * counted}".strip()
 
 
 def paper_text(scenario: str, column: Column, row: Row, digits: int | None = None) -> str | None:
     """The paper's value of the same scenario and algorithm, to the digits it was printed with or to `digits`."""
     value = paper_value(scenario, column.policy, row.metric)
     digits = (0 if row.label.startswith("CS") else 2) if digits is None else digits
-    return None if value is None else f"{value[0]:.{digits}f} ± {value[1]:.{digits}f}"
+    return None if value is None else " ± ".join(map(fixed(digits), value))
 
 
 # Terminal
@@ -188,59 +199,41 @@ def print_tables(tables: dict[str, list[Column]], console: Console | None = None
 
 def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
     """The table of one scenario."""
-    table = Table(
-        title=f"{scenario}: {columns[0].total} episodes a policy",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        padding=(0, 1),
-    )
-    table.add_column("policy", no_wrap=True)
-    for row in rows:
-        table.add_column(row.title.replace(" steps", ""), justify="right", no_wrap=True)
+    lines = []
     bold = {row.metric: best_columns(columns, row) for row in rows}
     for column in columns:
-        cells = []
-        for row in rows:
-            cell = Text(value_text(column, row), style="bold" if column.name in bold[row.metric] else "")
-            cells.append(cell.append(f"\n{_narrow(column, row)}", style="not bold dim"))
-        table.add_row(column.name.replace(" (", "\n("), *cells)
+        cells = [
+            Cell(value_text(column, row), column.name in bold[row.metric], (_narrow(column, row),)).terminal()
+            for row in rows
+        ]
+        lines.append([column.name.replace(" (", "\n("), *cells])
         published = [paper_text(scenario, column, row, row.digits) for row in rows]
         if any(published):
-            table.add_row(Text("  paper", style="dim"), *(Text(one or "-", style="dim") for one in published))
-    return table
+            lines.append([Text(one or NONE, style="dim") for one in ("  paper", *published)])
+    title = f"{scenario}: {columns[0].total} episodes a policy"
+    return terminal_table(title, ["policy", *(row.title.replace(" steps", "") for row in rows)], lines)
 
 
 def draw_overview(tables: dict[str, list[Column]]) -> Table:
     """Exploration ratio of every policy in every scenario."""
     row = ROWS[0]
-    table = Table(
-        title=f"all scenarios: {row.title}",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        collapse_padding=True,
-        padding=(0, 1),
-    )
-    table.add_column("policy", no_wrap=True)
-    for scenario in tables:
-        table.add_column(scenario.replace("_", "\n", 1), justify="right", no_wrap=True)
+    lines = []
     for name in dict.fromkeys(one.name for columns in tables.values() for one in columns):
         cells = []
         for columns in tables.values():
             bold = best_columns(columns, row)
             found = next((one for one in columns if one.name == name), None)
-            cells.append(Text(value_text(found, row) if found else "", style="bold" if name in bold else ""))
-        table.add_row(name.replace(" (", "\n("), *cells)
-    return table
+            cells.append(Cell(value_text(found, row) if found else "", name in bold).terminal())
+        lines.append([name.replace(" (", "\n("), *cells])
+    heads = ["policy", *(scenario.replace("_", "\n", 1) for scenario in tables)]
+    return terminal_table(f"all scenarios: {row.title}", heads, lines)
 
 
 def _narrow(column: Column, row: Row) -> str:
     """How many got there for CS, else the interval: there is no room for both."""
     one = column.summary[row.metric]
     if row.label.startswith("CS") or not one["n"]:
-        return f"({one['n']}/{column.total})"
+        return reached(one, column.total)
     return brackets(one, row.number).strip()
 
 
@@ -316,11 +309,11 @@ def table_markdown(
     for scenario, columns in tables.items():
         lines = [f"### {scenario}", "", f"{columns[0].total} episodes a policy.", ""]
         lines += [f"{sentence}\n" for sentence in evidence_of(columns)]
-        lines += ["| | " + " | ".join(one.name for one in columns) + " |", "| --- |" + " --- |" * len(columns)]
+        rows = []
         for row in rows_for(goal):
             bold = best_columns(columns, row)
-            cells = [_markdown_cell(scenario, one, row, bold) for one in columns]
-            lines.append(f"| {row.title} | {' | '.join(cells)} |")
+            rows.append([row.title, *(_markdown_cell(scenario, one, row, bold) for one in columns)])
+        lines += markdown_table(["", *(one.name for one in columns)], rows)
         if scenario in (below or {}):
             lines += ["", below[scenario]]
         parts.append("\n".join(lines))
@@ -328,10 +321,9 @@ def table_markdown(
 
 
 def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> str:
-    text = value_text(column, row)
-    text = f"**{text}**" if column.name in bold else text
     published = paper_text(scenario, column, row)
-    return "<br>".join(filter(None, [text, interval_text(column, row), f"paper {published}" if published else ""]))
+    below = filter(None, (interval_text(column, row), published and f"paper {published}"))
+    return Cell(value_text(column, row), column.name in bold, tuple(below)).markdown()
 
 
 def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float = 0.95) -> str:
@@ -340,37 +332,20 @@ def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float 
     rows = rows_for(goal)
     lines = [f"% {heading}", r"% \usepackage{booktabs,multirow}"]
     lines += [rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
-    lines += [" & & " + " & ".join(_escape(one) for one in names) + r" \\"]
+    lines.append(latex_row(["", "", *map(latex_text, names)]))
     for scenario, columns in tables.items():
         lines.append(r"\midrule")
-        have = {one.name: one for one in columns}
+        have = [next((one for one in columns if one.name == name), None) for name in names]
         published = any(paper_text(scenario, one, ROWS[0]) for one in columns)
         height = len(rows) * (3 if published else 2)
         for k, row in enumerate(rows):
-            head = rf"\multirow{{{height}}}{{*}}{{{_escape(scenario)}}}" if k == 0 else ""
+            head = rf"\multirow{{{height}}}{{*}}{{{latex_text(scenario)}}}" if k == 0 else ""
             bold = best_columns(columns, row)
-            label = _escape(row.title).replace("↑", r"$\uparrow$").replace("↓", r"$\downarrow$")
-            cells = [_latex_cell(have.get(name), row, bold) for name in names]
-            lines.append(f"{head} & {label} & {' & '.join(cells)} " + r"\\")
-            small = [rf"{{\scriptsize {interval_text(have[n], row)}}}" if n in have else "" for n in names]
-            lines.append(" & & " + " & ".join(small) + r" \\")
+            cells = [one and Cell(value_text(one, row), one.name in bold).latex() for one in have]
+            intervals = [one and latex_small(interval_text(one, row)) for one in have]
+            lines += [latex_row([head, latex_text(row.title), *cells]), latex_row(["", "", *intervals])]
             if published:
-                texts = [paper_text(scenario, have[n], row) if n in have else None for n in names]
-                small = [rf"{{\scriptsize ${t.replace('±', chr(92) + 'pm')}$}}" if t else "" for t in texts]
-                lines.append(r" & {\scriptsize paper} & " + " & ".join(small) + r" \\")
+                texts = [one and paper_text(scenario, one, row) for one in have]
+                papers = [one and latex_small(Cell(one).latex()) for one in texts]
+                lines.append(latex_row(["", latex_small("paper"), *papers]))
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *("% " + one for one in NOTES)]) + "\n"
-
-
-def _latex_cell(column: Column | None, row: Row, bold: set[str]) -> str:
-    if column is None:
-        return ""
-    one = column.summary[row.metric]
-    if not one["n"]:
-        return "-"
-    mean, std = row.number(one["mean"]), row.number(one["std"])
-    mean = rf"\mathbf{{{mean}}}" if column.name in bold else mean
-    return rf"${mean} \pm {std}$"
-
-
-def _escape(text: str) -> str:
-    return text.replace("_", r"\_").replace("%", r"\%")

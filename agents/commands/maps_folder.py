@@ -10,6 +10,7 @@ from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import short, write_text
+from maexp.agents.tables import markdown_table
 from maexp.envs.checker import check_map
 from maexp.envs.importing import draw_import, import_map_with_report
 from maexp.envs.importing.api import GRIDS, POINTS
@@ -141,8 +142,8 @@ def _write_csv(rows: list[Row], path: Path) -> None:
 
 def _write_markdown(rows: list[Row], path: Path) -> None:
     head = ("file", "result", "scenario", "resolution m", "points", "m2", "room", "visible", "s", "reason or warning")
-    lines = [head, ["---"] * len(head), *(map(_cell, astuple(row)) for row in rows)]
-    write_text(path, "".join(f"| {' | '.join(line)} |\n" for line in lines))
+    lines = markdown_table(head, (map(_cell, astuple(row)) for row in rows))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _cell(value: Any) -> str:

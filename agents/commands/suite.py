@@ -141,7 +141,7 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
             again = command(*words.split(), f"resume={short(where)}")
             print(f"maexp: stopped. Go on with: {again}", file=sys.stderr)
             return STOPPED
-        report.print_table(suite, results)
+        report.print_results(suite, results)
         for sentence in report.describe_results(suite, results):
             print(sentence)
         report.draw_profiles(suite, results, where / "profile.png")

@@ -12,9 +12,9 @@ import numpy as np
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import DECIDES
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.evaluation.results import FORMAT, result_names
 from maexp.agents.files import short, write_text
+from maexp.agents.tables import brackets, fixed
 
 EPISODES_FILE, CHANGES_FILE = "episodes.csv", "changes.json"
 KEY = ("policy", "num_robots", "map")  # columns before those of the metrics
@@ -117,9 +117,8 @@ def describe_changes(changes: dict[str, dict], folder: Path) -> list[str]:
 def _amounts(found: dict[str, dict]) -> list[str]:
     words = []
     for metric, (what, factor, digits) in SHOWN.items():
-        one = found[metric]
-        interval = brackets(one, lambda value, factor=factor, digits=digits: f"{factor * value:+.{digits}f}")
-        words.append(f"{factor * one['mean']:+.{digits}f} {what}{interval}")
+        one, write = found[metric], fixed(digits, factor, "+")
+        words.append(f"{write(one['mean'])} {what}{brackets(one, write)}")
     return words
 
 

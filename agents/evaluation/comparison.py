@@ -7,12 +7,13 @@ import numpy as np
 
 from maexp.agents.build import MapSuite, make_env
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
-from maexp.agents.evaluation.evidence import brackets, verdict
+from maexp.agents.evaluation.evidence import verdict
 from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import EpisodeSettings
+from maexp.agents.tables import POINTS, brackets
 from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
 
@@ -102,7 +103,7 @@ def find_typical(one: EvaluationResult, other: EvaluationResult | None, among: i
 
 def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
     auc = found[DECIDES]
-    points = f"{100 * auc['mean']:+.1f} points of coverage over time{brackets(auc, lambda end: f'{100 * end:+.1f}')}"
+    points = f"{POINTS(auc['mean'])} points of coverage over time{brackets(auc, POINTS)}"
     later = ", ".join(_later(found, mark) for mark in (95, 99) if mark == 95 or in_reach(f"_{mark}", goal))
     name = name.replace("trained", "The trained team", 1)
     return f"{name} {verdict(auc)} {rival}: {points}, {later}."

@@ -1,6 +1,6 @@
 """What a mean, an interval and a comparison rest on, and how that is said."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from maexp.envs.metrics import LEAST_DISTINCT, has_interval
@@ -46,11 +46,6 @@ def _describe_episodes(episodes: int, distinct: int, names: list[str]) -> list[s
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
-
-
-def brackets(found: dict, write: Callable[[float], str]) -> str:
-    """[low, high] of a mean {mean, ci95, n}, with a blank in front; nothing where there is no interval."""
-    return f" [{', '.join(write(end) for end in found['ci95'])}]" if has_interval(found) else ""
 
 
 def verdict(found: dict) -> str:

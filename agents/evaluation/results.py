@@ -4,17 +4,12 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
-from rich import box
-from rich.console import Console
-from rich.markup import escape
-from rich.measure import Measurement
-from rich.table import Table
-
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.evidence import brackets, describe_evidence
+from maexp.agents.evaluation.evidence import describe_evidence
 from maexp.agents.evaluation.headroom import headroom_shares
 from maexp.agents.files import write_json
 from maexp.agents.settings.verbs import EpisodeSettings
+from maexp.agents.tables import NONE, estimate, fixed, print_table, reached
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.metrics import in_reach
 
@@ -87,9 +82,9 @@ def write_results(path: Path, results: list[EvaluationResult], run: dict) -> Non
 
 
 def print_results(results: list[EvaluationResult], title: str) -> None:
-    """`print_table` of results; below it what they rest on, where it is little."""
+    """`print_summaries` of results; below it what they rest on, where it is little."""
     rows = [(name, one.summary()) for name, one in zip(result_names(results), results, strict=True)]
-    print_table(title, rows, results[0].success_coverage)
+    print_summaries(title, rows, results[0].success_coverage)
     whole = [one for one in results if not one.place]
     named = zip(result_names(whole), whole, strict=True)
     evidence = [one.evidence._replace(policy=name) for name, one in named]
@@ -112,7 +107,7 @@ def describe_starts(results: list[EvaluationResult]) -> list[str]:
     return sentences
 
 
-def print_table(
+def print_summaries(
     title: str, rows: list[tuple[str, dict]], goal: float, more: dict[str, Callable[[dict], str]] | None = None
 ) -> None:
     """The table of the main metrics: mean, 95 % interval of coverage, how many episodes got there.
@@ -123,17 +118,13 @@ def print_table(
         more: further columns, and what of a row stands in each.
     """
     more = more or {}
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("policy", no_wrap=True)
     columns = find_columns(rows, goal)
-    for name in [*more, *(COLUMNS[one] for one in columns)]:
-        table.add_column(escape(name), justify="right", no_wrap=True)  # [m] is no style of rich's
+    cells = []
     for name, summary in rows:
         total = summary["exploration_ratio"]["n"]
-        cells = (_cell(metric, summary[metric], total) for metric in columns)
-        table.add_row(escape(name), *(escape(tell(summary)) for tell in more.values()), *map(escape, cells))
-    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
-    Console(width=max(natural, Console().width)).print(table)  # a narrower terminal wraps lines, but nothing is lost
+        metrics = (_cell(metric, summary[metric], total) for metric in columns)
+        cells.append([name, *(tell(summary) for tell in more.values()), *metrics])
+    print_table(title, ["policy", *more, *(COLUMNS[one] for one in columns)], cells)
 
 
 def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:
@@ -143,9 +134,9 @@ def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:
 
 def _cell(metric: str, value: dict, total: int) -> str:
     if not value["n"]:
-        return f"- (0/{total})"
-    digits = 0 if metric.startswith(("coverage_step", "path")) else 3
-    text = f"{value['mean']:.{digits}f}"
+        return f"{NONE} {reached(value, total)}"
+    write = fixed(0 if metric.startswith(("coverage_step", "path")) else 3)
     if metric == "exploration_ratio":
-        return text + brackets(value, "{:.3f}".format)
-    return text if value["n"] == total else f"{text} ({value['n']}/{total})"
+        return estimate(value, write)
+    text = write(value["mean"])
+    return text if value["n"] == total else f"{text} {reached(value, total)}"

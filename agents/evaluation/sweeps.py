@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.evaluation.comparison import DECIDES, STARTS
-from maexp.agents.evaluation.evidence import brackets
-from maexp.agents.evaluation.results import find_columns, print_table
+from maexp.agents.evaluation.results import find_columns, print_summaries
 from maexp.agents.files import write_text
+from maexp.agents.tables import POINTS, estimate
 
 TRAINED = re.compile(r"trained( N=\d+)?")
 LEAD = "ahead [points]"
@@ -31,7 +31,7 @@ def tell_runs(runs: dict[str, Path], path: Path) -> bool:
     rows += _planners(found)
     goal = max(one["run"]["success_coverage"] for one in found.values())
     episodes = max(one["run"]["episodes"] for one in found.values())
-    print_table(f"{len(found)} runs, {episodes} held-out episodes each", rows, goal, {LEAD: _lead})
+    print_summaries(f"{len(found)} runs, {episodes} held-out episodes each", rows, goal, {LEAD: _lead})
     columns = find_columns(rows, goal)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
@@ -71,4 +71,4 @@ def _lead(row: dict[str, Any]) -> str:
     """In points of coverage over time, with its interval."""
     if LEAD not in row or row[LEAD]["mean"] is None:
         return ""
-    return f"{100 * row[LEAD]['mean']:+.1f}{brackets(row[LEAD], lambda end: f'{100 * end:+.1f}')}"
+    return estimate(row[LEAD], POINTS)

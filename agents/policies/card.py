@@ -1,12 +1,11 @@
 """The card of an exported policy: what it was trained on, how well it does, what it is not good for, in Markdown."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
-from maexp.envs.metrics import has_interval
+from maexp.agents.tables import brackets, estimate, fixed, markdown_table
 
 SHOWN = {
     "exploration_ratio": "coverage",
@@ -86,12 +85,9 @@ def describe_results(file: Path) -> list[str]:
         lines = [
             f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval:",
             "",
-            f"| policy | {' | '.join(SHOWN.values())} |",
-            "| --- " * (len(SHOWN) + 1) + "|",
         ]
-        for name, values in rows.items():
-            lines.append(f"| {name} | {' | '.join(_cell(values.get(one)) for one in SHOWN)} |")
-        return [*lines, "", *_differences(content)]
+        cells = [[name, *(_cell(values.get(one)) for one in SHOWN)] for name, values in rows.items()]
+        return [*lines, *markdown_table(["policy", *SHOWN.values()], cells), "", *_differences(content)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"{file} is not the results of an evaluation ({type(error).__name__}: {reason}).") from error
@@ -112,10 +108,10 @@ def _differences(content: dict[str, Any]) -> list[str]:
             label = next((one for one in (f"{best} N={size}", best) if one in rivals), None)
             if label is not None:
                 found = rivals[label][NEXT]
-                interval = _interval(found, lambda end: f"{100 * end:+.2f}")
+                points = fixed(2, 100.0, "+")
                 sentences += [
                     f"{name} less {label}, the best classical planner on the validation maps, on the same episodes: "
-                    f"{100 * found['mean']:+.2f} points of coverage over time{interval}.",
+                    f"{points(found['mean'])} points of coverage over time{brackets(found, points)}.",
                     "",
                 ]
     return sentences
@@ -124,11 +120,7 @@ def _differences(content: dict[str, Any]) -> list[str]:
 def _cell(value: Any) -> str:
     if not isinstance(value, dict) or value.get("mean") is None:
         return ""
-    return f"{_short(value['mean'])}{_interval(value, _short)}"
-
-
-def _interval(found: dict[str, Any], write: Callable[[float], str]) -> str:
-    return f" ({' to '.join(write(end) for end in found['ci95'])})" if has_interval(found) else ""
+    return estimate(value, _short)
 
 
 def _short(value: float) -> str:

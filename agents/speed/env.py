@@ -10,7 +10,8 @@ import torch
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import BenchSettings
-from maexp.agents.speed.shared import LEAST_LAPS, describe_point, print_table, sweep_points, write_report
+from maexp.agents.speed.shared import LEAST_LAPS, describe_point, sweep_points, write_report
+from maexp.agents.tables import print_table
 from maexp.envs import ExplorationEnv
 from maexp.envs.simulation import bytes_per_env
 

@@ -23,7 +23,8 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
 from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.speed.env import Batch
-from maexp.agents.speed.shared import LEAST_LAPS, print_table, write_report
+from maexp.agents.speed.shared import LEAST_LAPS, write_report
+from maexp.agents.tables import print_table
 from maexp.envs import PointCloudMap
 from maexp.envs.scenarios.maze import build_maze
 

@@ -12,10 +12,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from maexp.agents.files import write_json
 from maexp.agents.settings.checks import check_counts, team_sizes
@@ -29,7 +26,6 @@ from maexp.envs import ExplorationEnv
 OWN = ("task", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""
 LEAST_LAPS = 5
-WIDTH = 116  # columns of the widest table; a narrower terminal wraps lines, which is still readable
 
 
 def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[DictConfig]:
@@ -84,16 +80,6 @@ def describe_point(env: ExplorationEnv, cfg: CommonSettings) -> dict[str, Any]:
         "radar_range": max(one.range for one in env.radar_configs),
         "free_points": env.bank.max_free,
     }
-
-
-def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
-    """A table on the terminal: the first column is text, the others are numbers."""
-    table = Table(title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for k, name in enumerate(columns):
-        table.add_column(escape(name), justify="right" if k else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*row, style="bold" if row[0].startswith("=") else None)
-    Console(width=max(WIDTH, Console().width)).print(table)
 
 
 def write_report(path: Path, kind: str, device: str, body: dict) -> None:

@@ -12,7 +12,8 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.model import SIZES
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.verbs import BenchSettings, TrainSettings
-from maexp.agents.speed.shared import describe_point, print_table, spread, sweep_points, write_report
+from maexp.agents.speed.shared import describe_point, spread, sweep_points, write_report
+from maexp.agents.tables import print_table
 from maexp.agents.training.checkpoint import seed_everything
 from maexp.agents.training.collect import Stopwatch, TeamCollector, make_collector
 from maexp.agents.training.train import make_actor

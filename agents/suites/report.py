@@ -6,16 +6,12 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from rich import box
-from rich.console import Console
-from rich.markup import escape
-from rich.measure import Measurement
-from rich.table import Table
 
-from maexp.agents.evaluation.evidence import Evidence, brackets, describe_evidence, verdict
+from maexp.agents.evaluation.evidence import Evidence, describe_evidence, verdict
 from maexp.agents.evaluation.plots import COLOURS, LOOK, save
-from maexp.agents.suites.score import RANDOM
+from maexp.agents.suites.score import RANDOM, score_cells
 from maexp.agents.suites.suite import Suite
+from maexp.agents.tables import NONE, brackets, fixed, markdown_table, print_table
 from maexp.envs.metrics import label_copies
 
 COLUMNS = ("part", "score", "95 % interval", RANDOM, "reference", "between", "less reference", "95 % at", "lost")
@@ -29,56 +25,44 @@ def describe_suite(suite: Suite) -> list[str]:
         f"{suite.name}, version {suite.version}, checksum {suite.checksum[:16]}",
         f"score: mean {suite.score} of {suite.episodes} episodes of each of {len(suite.parts)} parts",
         f"frozen scores: {told or 'none yet'} (0 and 1 of the normalised score)",
-        "",
-        "| part | maps | robots | radar [m] | starts | episode [s] |",
-        "| --- | --- | --- | --- | --- | --- |",
     ]
+    heads, rows = ("part", "maps", "robots", "radar [m]", "starts", "episode [s]"), []
     for name, part in suite.parts.items():
         maps = f"{part.scenario} {part.first} to {part.first + part.count - 1}"
         robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"
         seconds = f"{0.1 * part.limit:g}, a decision every {0.1 * part.local_steps:g}"
-        lines.append(f"| {name} | {maps} | {robots} | {part.radar['range']:g} | {part.starts} | {seconds} |")
-    return [*lines, "", f"File: {suite.path}"]
+        rows.append([name, maps, robots, f"{part.radar['range']:g}", part.starts, seconds])
+    return [*lines, "", *markdown_table(heads, rows), "", f"File: {suite.path}"]
 
 
-def print_table(suite: Suite, results: dict[str, Any]) -> None:
+def print_results(suite: Suite, results: dict[str, Any]) -> None:
     """A row for each part and one for all."""
     title = f"{results['policy']} on {suite.name}, version {suite.version}, checksum {suite.checksum[:16]}"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in COLUMNS:
-        table.add_column(escape(column), justify="left" if column == "part" else "right", no_wrap=True)
     reference, zero, name = results["reference"], results[RANDOM], suite.score
+    cells = []
     for part, one in results["parts"].items():
         ends = (zero["parts"][part], reference["parts"][part])
-        table.add_row(part, *_cells(one[name], ends, one["normalised"], reference["differences"][part]), *_more(one))
-    ends = (zero["score"], reference["score"])
-    score = results["score"]
-    table.add_row("all", *_cells(score, ends, score["normalised"], reference["difference"][name]), "", "")
-    natural = Measurement.get(Console(width=1000), Console(width=1000).options, table).maximum
-    Console(width=max(natural, Console().width)).print(table)
-
-
-def _cells(score: dict, ends: tuple[float, float], normalised: float | None, less: dict) -> list[str]:
-    between = "-" if normalised is None else f"{normalised:.2f}"
-    difference = f"{100 * less['mean']:+.1f}{brackets(less, lambda end: f'{100 * end:+.1f}')}"
-    interval = brackets(score, "{:.3f}".format).strip()
-    return [f"{score['mean']:.3f}", interval, *(f"{end:.3f}" for end in ends), between, difference]
+        score = score_cells(one[name], one["normalised"], reference["differences"][part], ends)
+        cells.append([part, *score, *_more(one)])
+    score, ends = results["score"], (zero["score"], reference["score"])
+    cells.append(["all", *score_cells(score, score["normalised"], reference["difference"][name], ends), "", ""])
+    print_table(title, COLUMNS, cells)
 
 
 def _more(part: dict) -> list[str]:
     steps = part.get("coverage_step_95", {"n": 0})
-    when = f"{0.1 * steps['mean']:.1f} s ({steps['n']})" if steps["n"] else "-"
+    when = f"{0.1 * steps['mean']:.1f} s ({steps['n']})" if steps["n"] else NONE
     return [when, f"{part['collisions']['mean']:.2f}" if "collisions" in part else ""]
 
 
 def describe_results(suite: Suite, results: dict[str, Any]) -> list[str]:
     """Sentences below the table."""
     found, better = results["reference"]["difference"][suite.score], results["reference"]["improvement"]
-    interval = brackets(found, lambda end: f"{100 * end:+.2f}")
+    points = fixed(2, 100.0, "+")
     lines = [
         f"{results['policy']} {verdict(found)} the reference, {suite.reference} as it was frozen: "
-        f"{100 * found['mean']:+.2f} points of {suite.score}{interval} in the same episodes. An episode of its is "
-        f"better than one of the reference with probability {better['mean']:.2f}.",
+        f"{points(found['mean'])} points of {suite.score}{brackets(found, points)} in the same episodes. An "
+        f"episode of its is better than one of the reference with probability {better['mean']:.2f}.",
     ]
     lines += describe_evidence([_evidence(suite, results)])
     if results["decisions"]["count"]:

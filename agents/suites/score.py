@@ -11,6 +11,7 @@ import numpy as np
 from maexp.agents.benchmark.compare import improvement
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.suites.suite import Suite
+from maexp.agents.tables import NONE, POINTS, brackets, estimate, fixed
 from maexp.envs.metrics import LEAST_DISTINCT, resample_weights, resampled_means
 
 Results = dict[str, EvaluationResult]  # part -> its episodes
@@ -104,3 +105,13 @@ def profile(values: dict[str, np.ndarray]) -> list[float]:
 
 def _values(metric: str, results: Results) -> dict[str, np.ndarray]:
     return {part: one.episodes[metric] for part, one in results.items()}
+
+
+def score_cells(
+    score: dict[str, Any], normalised: float | None, less: dict[str, Any], ends: tuple[float, ...] = ()
+) -> list[str]:
+    """What tables show of a score {mean, ci95, n}: with `ends`, the scores of `random` and the reference, before where
+    it lies between them, and `less`, in points how far it is from the reference."""
+    share, between = fixed(3), NONE if normalised is None else fixed(2)(normalised)
+    interval = brackets(score, share).strip() or NONE
+    return [share(score["mean"]), interval, *map(share, ends), between, estimate(less, POINTS)]

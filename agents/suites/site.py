@@ -2,17 +2,16 @@
 
 import html
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from maexp.agents.benchmark.compare import improvement
-from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.evaluation.figures import COLOURS
 from maexp.agents.files import without_nan, write_text
-from maexp.agents.suites.score import profile
+from maexp.agents.suites.score import profile, score_cells
+from maexp.agents.tables import markdown_table
 
 TEMPLATE = Path(__file__).with_name("page.html")
 PAGE, TABLES = "index.html", "README.md"
@@ -66,26 +65,18 @@ def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def table(rows: list[dict[str, Any]]) -> list[str]:
     """A suite's rows as a table in Markdown."""
     suite, reference = rows[0]["suite"], rows[0]["reference"]["policy"]
-    columns = (
+    heads = [
         "",
         "policy",
         "score",
         "95 % interval",
         f"between `random` and `{reference}`",
         f"less `{reference}`, points",
-        "verified",
-    )
-    lines = [f"## {suite['name']}, version {suite['version']}", "", _line(columns), _line(["---"] * len(columns))]
+    ]
+    cells = []
     for number, row in enumerate(rows, 1):
-        score, less = row["score"], row["reference"]["difference"]
-        between = "-" if score["normalised"] is None else f"{score['normalised']:.2f}"
         name = html.escape(row["policy"]).replace("|", "\\|").replace("`", "'")
-        points = f"{100 * less['mean']:+.1f}{brackets(less, lambda end: f'{100 * end:+.1f}')}"
-        interval = brackets(score, "{:.3f}".format).strip() or "-"
-        verified = "yes" if row["verified"] else "no"
-        lines.append(_line([str(number), f"`{name}`", f"{score['mean']:.3f}", interval, between, points, verified]))
-    return [*lines, ""]
-
-
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+        score = score_cells(row["score"], row["score"]["normalised"], row["reference"]["difference"])
+        cells.append([str(number), f"`{name}`", *score, "yes" if row["verified"] else "no"])
+    title = f"## {suite['name']}, version {suite['version']}"
+    return [title, "", *markdown_table([*heads, "verified"], cells), ""]

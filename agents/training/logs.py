@@ -15,6 +15,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.results import COLUMNS
 from maexp.agents.files import write_text
 from maexp.agents.settings.groups import LoggerSettings
+from maexp.agents.tables import markdown_table
 
 MODES = ("online", "offline")
 RESULTS = "summary.json"
@@ -182,8 +183,8 @@ class TensorBoard:
                 for name, value in zip(columns[1:], values, strict=True):
                     if value is not None:
                         self.writer.add_scalar(f"comparison/{name}/{policy}", value, frames)
-            lines = [columns, ["---"] * len(columns), *([_cell(value) for value in row] for row in rows)]
-            self.writer.add_text("comparison", "\n".join(f"| {' | '.join(line)} |" for line in lines), frames)
+            lines = markdown_table(columns, ([_cell(value) for value in row] for row in rows))
+            self.writer.add_text("comparison", "\n".join(lines), frames)
         for name, path in pictures.items():
             width, height = Image.open(path).size
             image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())

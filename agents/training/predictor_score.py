@@ -21,6 +21,7 @@ from scipy import ndimage
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.networks.map_predictor import load_predictor, predict, sample_worlds
+from maexp.agents.tables import fixed, markdown_table
 from maexp.agents.training.beliefs import Episode, load_groups
 from maexp.agents.training.map_predictor import BAND, matters
 from maexp.envs.fields import check_settings, setting
@@ -218,11 +219,12 @@ def print_scores(found: dict) -> None:
 def print_table(what: str, tables: dict[str, dict[str, dict[str, float]]]) -> None:
     """A line for each scenario and guess."""
     columns = list(next(iter(tables["mean"].values())))
-    print(f"| scenario | {what} | " + " | ".join(one.replace("_", " ") for one in columns) + " |")
-    print("| --- | --- |" + " --- |" * len(columns))
-    for scenario, rows in tables.items():
-        for way, figures in rows.items():
-            print(f"| {scenario} | {way} | " + " | ".join(f"{figures[one]:.3f}" for one in columns) + " |")
+    rows = [
+        [scenario, way, *(fixed(3)(figures[one]) for one in columns)]
+        for scenario, ways in tables.items()
+        for way, figures in ways.items()
+    ]
+    print("\n".join(markdown_table(["scenario", what, *(one.replace("_", " ") for one in columns)], rows)))
 
 
 def main() -> int:

@@ -26,7 +26,6 @@ from maexp.agents.build import (
 )
 from maexp.agents.checksums import changed_maps, checksums
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluation.evidence import brackets
 from maexp.agents.files import command, short, write_text
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
@@ -39,6 +38,7 @@ from maexp.agents.settings.overrides import without
 from maexp.agents.settings.resolved import algorithm_settings, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.verbs import TrainSettings
+from maexp.agents.tables import brackets
 from maexp.agents.training.checkpoint import (
     check_action,
     find_checkpoint,
