@@ -17,7 +17,10 @@ from maexp.agents.words import as_list
 
 KEPT = ("place", "seed", "name")
 """Settings of a served suite that `resume` keeps."""
-TF, WAITS = ("shared", "own"), ("all", "idle")
+CHOICES = {
+    "serve": {"tf": ("shared", "own"), "wait_for": ("all", "idle")},
+    "team": {"goals": ("goal_pose", "navigate_to_pose")},
+}
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -36,13 +39,13 @@ def check(cfg: Ros2Settings) -> None:
         if not cfg.place:
             raise UserError(f"maexp ros2 serve needs a suite after it: {', '.join(suite_names())}.")
         load_suite(cfg.place)
-        for name, choices in (("tf", TF), ("wait_for", WAITS)):
-            if cfg[name] not in choices:
-                raise UserError(f"{name}={cfg[name]} is unknown: choose {' or '.join(choices)}.")
     elif cfg.place:
         raise UserError(f"maexp ros2 team takes no name: leave {cfg.place} out, and name the robots: robots=a,b,c.")
     elif not cfg.robots:
         raise UserError("No robots: name those of the team, as in maexp ros2 team robots=robot1,robot2,robot3.")
+    for name, choices in CHOICES[cfg.task].items():
+        if cfg[name] not in choices:
+            raise UserError(f"{name}={cfg[name]} is unknown: choose {' or '.join(choices)}.")
     for name in ("answer", "limit", "stands"):
         if not 0.0 < cfg[name] < math.inf:
             raise UserError(f"{name}={cfg[name]} must be a number of seconds above 0.")
@@ -101,7 +104,7 @@ def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
 def _team(cfg: Ros2Settings, wire: Any) -> int:
     from maexp.agents.ros2.team import Ros2Team
 
-    course = Ros2Team(TeamDriver(driver_settings(cfg)), wire, cfg.answer, _tell).run()
+    course = Ros2Team(TeamDriver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
     each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" * bool(course.plans)
     print(f"{course.plans} decisions{each}; {course.episodes} episodes of an arena.")
     return 0

@@ -1,15 +1,18 @@
 """Topics of ROS 2 over DDS: names, kinds and qualities of service as `rmw_cyclonedds` has them on the wire.
 
 A topic /robot1/map of ROS is rt/robot1/map of DDS. What a topic carries and how it is delivered is written once, in
-`TOPICS`. The hash of the definition goes with it, as ROS 2 from Iron on tells it.
+`TOPICS`. The hash of the definition goes with it, as ROS 2 from Iron on tells it. A service /a is two topics,
+rq/aRequest and rr/aReply.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from uuid import uuid4
 
 from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import DomainParticipant
@@ -19,7 +22,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from maexp.agents.ros2.messages import CLASSES
+from maexp.agents.ros2.messages import CLASSES, NAVIGATE
 
 BLOCKING = 0.1  # seconds that a write may wait for slow readers
 MOST = 1_000  # messages taken at once
@@ -33,7 +36,7 @@ class Kind:
 
     Attributes:
         message: as ROS calls it.
-        hash: of its definition (REP 2016).
+        hash: of its definition (REP 2016); "": not told, for it is not the same in every release.
         depth: messages kept.
         reliable: lost messages are sent again.
         latched: who comes later gets the last one.
@@ -41,7 +44,7 @@ class Kind:
     """
 
     message: str
-    hash: str
+    hash: str = ""
     depth: int = 10
     reliable: bool = True
     latched: bool = False
@@ -74,20 +77,34 @@ TOPICS = {
     "episode": Kind(
         "std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18", 1, latched=True
     ),
+    "status": Kind(
+        "action_msgs/msg/GoalStatusArray",
+        "6c1684b00f177d37438febe6e709fc4e2b0d4248dca4854946f9ed8b30cda83e",
+        1,
+        latched=True,
+    ),
+    "feedback": Kind(f"{NAVIGATE}_FeedbackMessage"),
 }
 """By the last part of the topic's name. `episode` is ours: what an arena tells of an episode, as JSON."""
 EPISODE = "/maexp/episode"
+SERVICES = {
+    "send_goal": f"{NAVIGATE}_SendGoal",
+    "cancel_goal": "action_msgs/srv/CancelGoal",
+    "get_result": f"{NAVIGATE}_GetResult",
+}
+"""By the last part of the service's name."""
 
 
-def quality(kind: Kind, reads: bool) -> Qos:
-    """The qualities of service of a writer or reader."""
+def quality(kind: Kind, reads: bool, about: str = "") -> Qos:
+    """The qualities of service of a writer or reader; `about`: what it tells of itself instead of the hash."""
+    about = about or (f"typehash=RIHS01_{kind.hash};" if kind.hash else "")
     reliable = kind.reliable and not (reads and kind.easy)
     return Qos(
         Policy.Reliability.Reliable(duration(seconds=BLOCKING)) if reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if kind.latched else Policy.Durability.Volatile,
         Policy.History.KeepLast(kind.depth),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        Policy.Userdata(f"typehash=RIHS01_{kind.hash};".encode()),
+        Policy.Userdata(about.encode()),
     )
 
 
@@ -113,13 +130,12 @@ class Wire:
         self.conditions: list[Any] = []
         self.writers: dict[str, Writer] = {}
         self.readers: dict[str, Reader] = {}
+        self.servers: dict[str, Server] = {}
 
     def writer(self, name: str) -> Writer:
         """Writes to a topic, /robot1/map: always the same one."""
         if name not in self.writers:
-            kind, topic = self._open(name, "")
-            writer = DataWriter(self.participant, topic, qos=quality(kind, reads=False))
-            self.writers[name] = Writer(writer, CLASSES[kind.message])
+            self.writers[name] = self._writer(f"rt{name}", TOPICS[name.rpartition("/")[2]])
         return self.writers[name]
 
     def reader(self, name: str, kind: str = "") -> Reader:
@@ -129,16 +145,40 @@ class Wire:
             kind: one of `TOPICS`, if it is not the last part of the name.
         """
         if name not in self.readers:
-            found, topic = self._open(name, kind)
-            reader = DataReader(self.participant, topic, qos=quality(found, reads=True))
-            self.conditions.append(ReadCondition(reader, ALL))
-            self.waits.attach(self.conditions[-1])
-            self.readers[name] = Reader(reader)
+            self.readers[name] = self._reader(f"rt{name}", TOPICS[kind or name.rpartition("/")[2]])
         return self.readers[name]
 
-    def _open(self, name: str, kind: str) -> tuple[Kind, Topic]:
-        found = TOPICS[kind or name.rpartition("/")[2]]
-        return found, Topic(self.participant, f"rt{name}", CLASSES[found.message])
+    def server(self, name: str) -> Server:
+        """Answers who calls a service, /robot1/navigate_to_pose/_action/send_goal: always the same one."""
+        if name not in self.servers:
+            asked, answered = self._service(name)
+            about = f"serviceid={uuid4().bytes.hex('.')};"
+            self.servers[name] = Server(self._reader(*asked, about), self._writer(*answered, about))
+        return self.servers[name]
+
+    def client(self, name: str) -> Client:
+        """Calls a service."""
+        asked, answered = self._service(name)
+        about = f"clientid={uuid4().bytes.hex('.')};"  # a server waits for the reader with the same before it answers
+        return Client(self._reader(*answered, about), self._writer(*asked, about))
+
+    def _service(self, name: str) -> tuple[tuple[str, Kind], tuple[str, Kind]]:
+        """The topics of questions and answers."""
+        kind = SERVICES[name.rpartition("/")[2]]
+        return (f"rq{name}Request", Kind(f"{kind}_Request")), (f"rr{name}Reply", Kind(f"{kind}_Response"))
+
+    def _writer(self, topic: str, kind: Kind, about: str = "") -> Writer:
+        """For a topic by its name in DDS."""
+        made = Topic(self.participant, topic, CLASSES[kind.message])
+        writer = DataWriter(self.participant, made, qos=quality(kind, reads=False, about=about))
+        return Writer(writer, CLASSES[kind.message])
+
+    def _reader(self, topic: str, kind: Kind, about: str = "") -> Reader:
+        made = Topic(self.participant, topic, CLASSES[kind.message])
+        reader = DataReader(self.participant, made, qos=quality(kind, reads=True, about=about))
+        self.conditions.append(ReadCondition(reader, ALL))
+        self.waits.attach(self.conditions[-1])
+        return Reader(reader)
 
     def wait(self, seconds: float) -> None:
         """Until something has come that was not taken yet, but no longer than that."""
@@ -167,9 +207,9 @@ class Writer:
             return False
 
     @property
-    def matched(self) -> bool:
-        """Whether somebody reads."""
-        return bool(self.writer.get_matched_subscriptions())
+    def matched(self) -> int:
+        """How many read."""
+        return len(self.writer.get_matched_subscriptions())
 
 
 class Reader:
@@ -185,9 +225,50 @@ class Reader:
                 yield message
 
     @property
+    def matched(self) -> int:
+        """How many write."""
+        return len(self.reader.get_matched_publications())
+
+
+class Server:
+    """The end of a service that answers."""
+
+    def __init__(self, asked: Reader, answers: Writer):
+        self.asked, self.answers = asked, answers
+
+    def take(self) -> Iterator[Any]:
+        """The questions that have come since, oldest first."""
+        return self.asked.take()
+
+    def answer(self, question: Any, **fields) -> None:
+        """Answer a question; who asks it may have been started a moment ago, and as a reader is waited for."""
+        end = time.monotonic() + BLOCKING
+        while self.answers.matched < self.asked.matched and time.monotonic() < end:
+            time.sleep(0.005)
+        self.answers.write(self.answers.make(guid=question.guid, seq=question.seq, **fields))
+
+
+class Client:
+    """The end of a service that asks."""
+
+    def __init__(self, answers: Reader, asks: Writer):
+        self.answers, self.asks = answers, asks
+        self.guid, self.seq = uuid4().int >> 64, 0
+
+    def ask(self, **fields) -> int:
+        """Returns the number of the question."""
+        self.seq += 1
+        self.asks.write(self.asks.make(guid=self.guid, seq=self.seq, **fields))
+        return self.seq
+
+    def take(self) -> Iterator[Any]:
+        """The answers to this client that have come since; `seq` is the number of the question."""
+        return (one for one in self.answers.take() if one.guid == self.guid)
+
+    @property
     def matched(self) -> bool:
-        """Whether somebody writes."""
-        return bool(self.reader.get_matched_publications())
+        """Whether there is a server."""
+        return bool(self.answers.matched and self.asks.matched)
 
 
 def read_domain(domain: int | None) -> int:

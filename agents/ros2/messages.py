@@ -6,12 +6,14 @@ The classes are made from it; a field that is not given has the value that ROS g
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from types import new_class
 from typing import Any
 
 from cyclonedds.idl import IdlStruct, types
 
+NAVIGATE = "nav2_msgs/action/NavigateToPose"
 TABLE = {
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
     "rosgraph_msgs/msg/Clock": "builtin_interfaces/Time clock",
@@ -37,17 +39,46 @@ TABLE = {
     "sensor_msgs/msg/LaserScan": "std_msgs/Header header, float32 angle_min, float32 angle_max, "
     "float32 angle_increment, float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, "
     "float32[] ranges, float32[] intensities",
+    "builtin_interfaces/msg/Duration": "int32 sec, uint32 nanosec",
+    "unique_identifier_msgs/msg/UUID": "uint8[16] uuid",
+    "action_msgs/msg/GoalInfo": "unique_identifier_msgs/UUID goal_id, builtin_interfaces/Time stamp",
+    "action_msgs/msg/GoalStatus": "action_msgs/GoalInfo goal_info, int8 status",
+    "action_msgs/msg/GoalStatusArray": "action_msgs/GoalStatus[] status_list",
+    "action_msgs/srv/CancelGoal_Request": "action_msgs/GoalInfo goal_info",
+    "action_msgs/srv/CancelGoal_Response": "int8 return_code, action_msgs/GoalInfo[] goals_canceling",
+    f"{NAVIGATE}_Goal": "geometry_msgs/PoseStamped pose, string behavior_tree",
+    f"{NAVIGATE}_Result": "uint16 error_code, string error_msg",
+    f"{NAVIGATE}_Feedback": "geometry_msgs/PoseStamped current_pose, builtin_interfaces/Duration navigation_time, "
+    "builtin_interfaces/Duration estimated_time_remaining, int16 number_of_recoveries, float32 distance_remaining, "
+    "float32 position_tracking_error, float32 heading_tracking_error",
+    f"{NAVIGATE}_SendGoal_Request": f"unique_identifier_msgs/UUID goal_id, {NAVIGATE}_Goal goal",
+    f"{NAVIGATE}_SendGoal_Response": "bool accepted, builtin_interfaces/Time stamp",
+    f"{NAVIGATE}_GetResult_Request": "unique_identifier_msgs/UUID goal_id",
+    f"{NAVIGATE}_GetResult_Response": f"int8 status, {NAVIGATE}_Result result",
+    f"{NAVIGATE}_FeedbackMessage": f"unique_identifier_msgs/UUID goal_id, {NAVIGATE}_Feedback feedback",
 }
-"""Message -> its fields, each message after those that it is made of."""
+"""Message -> its fields, each message after those that it is made of.
+
+The result and the feedback of `NavigateToPose` have grown at their ends with the releases of nav2. Here they are as in
+the newest: who has an older definition reads the part that it knows.
+"""
+HEADER = "uint64 guid, int64 seq, "
+"""What `rmw_cyclonedds` puts before requests and responses: who asks, and the number of the question."""
 PLAIN = {
+    "bool": bool,
     "int8": types.int8,
+    "uint8": types.uint8,
+    "int16": types.int16,
+    "uint16": types.uint16,
     "int32": types.int32,
     "uint32": types.uint32,
+    "int64": types.int64,
+    "uint64": types.uint64,
     "float32": types.float32,
     "float64": types.float64,
     "string": str,
 }
-FIRST = {"string": "", "float32": 0.0, "float64": 0.0}
+FIRST = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
 ONE = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
 
 
@@ -58,14 +89,15 @@ def wire_name(message: str) -> str:
 
 
 def _full(kind: str) -> str:
-    return kind.replace("/", "/msg/")
+    return kind if kind.count("/") == 2 else kind.replace("/", "/msg/")
 
 
 def _make_classes() -> dict[str, type]:
     found: dict[str, type] = {}
     for message, text in TABLE.items():
         hints, defaults = {}, {}
-        for one in text.split(", "):
+        before = HEADER if message.endswith(("_Request", "_Response")) else ""
+        for one in f"{before}{text}".split(", "):
             kind, name = one.split()
             hints[name], defaults[name] = _read_field(found, kind, ONE.get((message, name)))
         words = {"typename": wire_name(message).replace("::", ".")}
@@ -88,9 +120,9 @@ def _read_field(found: dict[str, type], kind: str, default: Any) -> tuple[Any, A
         return hint, field(default=FIRST.get(inner, 0) if default is None else default) if simple else field(
             default_factory=hint
         )
-    count = size.removesuffix("]")
-    if count:
-        return types.array[hint, int(count)], field(default_factory=lambda: [FIRST.get(inner, 0)] * int(count))
+    if count := size.removesuffix("]"):
+        first = bytes(int(count)) if inner == "uint8" else [FIRST.get(inner, 0)] * int(count)
+        return types.array[hint, int(count)], field(default_factory=lambda: copy(first))
     return types.sequence[hint], field(default_factory=list)
 
 

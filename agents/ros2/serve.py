@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from maexp.agents.ros2.convert import (
     transform,
 )
 from maexp.agents.ros2.dds import EPISODE, Wire
+from maexp.agents.ros2.goals import ABORTED, SUCCEEDED, NavigationServer
 from maexp.agents.runtime.frames import Pose
 from maexp.envs import ExplorationEnv, ObservationConfig
 from maexp.kernels.types import DT
@@ -39,6 +41,8 @@ TICK = round(DT * SECOND)
 LOOKS = 2  # ticks between two scans
 GAP = 10 * SECOND  # between two episodes, so that nobody believes poses of the last
 SETTLE = 1.0  # seconds that slow readers are waited for
+PROGRESS = 5  # ticks between two feedbacks of navigate_to_pose
+MOVES, PATIENCE = 0.5, 10 * SECOND  # a goal is given up where a robot moves less in this time [m, ns]; nav2's defaults
 WORD = "ros2"
 """What results say instead of a policy's name on the command line."""
 
@@ -128,7 +132,7 @@ class Robot:
     def __init__(self, name: str, wire: Wire, own_tf: bool):
         self.name, place = name, f"/{name}"
         self.map, self.odom, self.scan = (wire.writer(f"{place}/{one}") for one in ("map", "odom", "scan"))
-        self.goals = wire.reader(f"{place}/goal_pose")
+        self.goals, self.action = wire.reader(f"{place}/goal_pose"), NavigationServer(wire, name)
         before = "" if own_tf else f"{name}/"
         self.frames = {one: before + one for one in ("map", "odom", "base_link", "base_scan")}
         root = [] if own_tf else [("map", self.frames["map"])]
@@ -142,21 +146,72 @@ class Robot:
     def begin(self) -> None:
         """Forget what was sent for an episode before."""
         list(self.goals.take())
+        for request in self.action.take():
+            self.action.accept(request, False, 0)
+        self.end()
         self.goal: np.ndarray | None = None
+        self.moved: tuple[np.ndarray, int] | None = None  # where it was, and when, as it had moved last
         self.answered = False
 
-    def listen(self, since: int, refused: Callable[[str], None]) -> None:
-        """Take the goals that have come; one that was sent before `since` [ns] is no answer to this decision."""
+    def end(self) -> None:
+        """The episode is over."""
+        self.action.tell_results()
+        self.action.end(ABORTED, "the episode is over")
+
+    @property
+    def matched(self) -> bool:
+        """Whether somebody may send it goals."""
+        return self.action.matched or bool(self.goals.matched)
+
+    def listen(self, since: int, now: int, refused: Callable[[str], None]) -> None:
+        """Take the goals that have come until `now`; one that was sent before `since` is no answer to this decision."""
         for message in self.goals.take():
-            frame, place = message.header.frame_id.lstrip("/"), message.pose.position
-            if frame not in ("", "map", self.frames["map"], self.frames["odom"]):
-                refused(f"/{self.name}/goal_pose: a goal in the frame {frame} is not known: give it in map")
-            elif not (abs(place.x) < 1e9 and abs(place.y) < 1e9):
-                refused(f"/{self.name}/goal_pose: x={place.x}, y={place.y} is no goal")
-            else:
-                stamp = read_nanoseconds(message.header.stamp)
-                self.goal = np.array([place.x, place.y])
-                self.answered |= stamp == 0 or stamp >= since
+            if self._take(message, since, "goal_pose", refused):
+                self.action.end(ABORTED, "a newer goal has come")
+        for request in self.action.take():
+            self.action.accept(request, self._take(request.goal.pose, since, "navigate_to_pose", refused), now)
+        if self.action.cancel():
+            self.goal = None
+        self.action.tell_results()
+
+    def _take(self, message: Any, since: int, topic: str, refused: Callable[[str], None]) -> bool:
+        """A geometry_msgs/PoseStamped as the goal; whether it can be one."""
+        frame, place = message.header.frame_id.lstrip("/"), message.pose.position
+        if frame not in ("", "map", self.frames["map"], self.frames["odom"]):
+            refused(f"/{self.name}/{topic}: a goal in the frame {frame} is not known: give it in map")
+            return False
+        if not (abs(place.x) < 1e9 and abs(place.y) < 1e9):
+            refused(f"/{self.name}/{topic}: x={place.x}, y={place.y} is no goal")
+            return False
+        stamp = read_nanoseconds(message.header.stamp)
+        self.goal, self.moved = np.array([place.x, place.y]), None
+        self.answered |= stamp == 0 or stamp >= since
+        return True
+
+    def drive(self, pose: Pose | None, driven: int, now: int, near: float) -> None:
+        """What a tick of driving means for a goal of navigate_to_pose.
+
+        Args:
+            pose: None: the robot has collided.
+            driven: time of the episode [ns], without what the clock ran on for.
+            near: the goal is reached where it is no farther away [m].
+        """
+        if self.action.active is None:
+            return
+        if pose is None:
+            self.action.end(ABORTED, "the robot has collided")
+            return
+        at = np.array(pose[:2])
+        far = float(np.linalg.norm(self.goal - at))
+        if self.moved is None or np.linalg.norm(at - self.moved[0]) >= MOVES:
+            self.moved = at, driven
+        if far <= near:
+            self.action.end(SUCCEEDED)
+        elif driven - self.moved[1] >= PATIENCE:
+            self.goal = None
+            self.action.end(ABORTED, f"the robot moved less than {MOVES:g} m in {PATIENCE // SECOND} s")
+        elif driven // TICK % PROGRESS == 0:
+            self.action.tell_progress(pose, now, far)
 
 
 class Ros2Policy:
@@ -178,6 +233,7 @@ class Ros2Policy:
         places = [f"/{robot.name}" for robot in self.robots] if serving.own_tf else [""]
         self.tf = [wire.writer(f"{place}/tf") for place in places]
         self.tf_static = [wire.writer(f"{place}/tf_static") for place in places]
+        self.near = 2.0 * float(env.simulation.robot_tensors["collision_threshold"][0].max())  # a goal is reached [m]
         self.begin = self.idle = 0  # when the episode began, and how long it stood since [ns]
 
     def __enter__(self) -> Ros2Policy:
@@ -186,6 +242,8 @@ class Ros2Policy:
 
     def __exit__(self, *error) -> None:
         self.env.set_step_hook(None)
+        for robot in self.robots:
+            robot.end()
 
     @torch.no_grad()
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
@@ -216,15 +274,15 @@ class Ros2Policy:
 
     def _await_somebody(self) -> None:
         end, told = time.monotonic() + self.serving.answer, False
-        while not all(robot.goals.matched for robot in self.robots):
-            missing = [f"/{robot.name}/goal_pose" for robot in self.robots if not robot.goals.matched]
+        while missing := [f"/{robot.name}" for robot in self.robots if not robot.matched]:
             if not told:
-                self.serving.tell(f"Waiting for somebody who publishes {', '.join(missing)} ...")
+                self.serving.tell(f"Waiting for somebody who sends goals to {', '.join(missing)} ...")
                 told = True
             if time.monotonic() > end:
                 raise UserError(
-                    f"Nobody publishes {', '.join(missing)} in {self.serving.answer:g} s: start the team, and check "
-                    "that both have the same ROS_DOMAIN_ID and network (answer=SECONDS waits longer)."
+                    f"Nobody sends goals to {', '.join(missing)}, by goal_pose or navigate_to_pose, in "
+                    f"{self.serving.answer:g} s: start the team, and check that both have the same ROS_DOMAIN_ID and "
+                    "network (answer=SECONDS waits longer)."
                 )
             time.sleep(0.05)
 
@@ -252,7 +310,7 @@ class Ros2Policy:
         begin, runs = time.monotonic(), 0
         while True:
             for robot in self.robots:
-                robot.listen(asked, self._refuse)
+                robot.listen(asked, self._now(), self._refuse)
             if all(robot.answered or (self.serving.wait_for == "idle" and self._drives(robot)) for robot in can):
                 return
             left = begin + self.serving.stands + runs * DT - time.monotonic()
@@ -272,8 +330,7 @@ class Ros2Policy:
             return False
         k = self.robots.index(robot)
         at = self.env.simulation.tensors["center"][0, k, :2].cpu().numpy()
-        radius = float(self.env.simulation.robot_tensors["collision_threshold"][0].max())
-        return float(np.linalg.norm(robot.goal - at)) > 2.0 * radius
+        return float(np.linalg.norm(robot.goal - at)) > self.near
 
     def _refuse(self, sentence: str) -> None:
         if sentence not in self.said:
@@ -286,12 +343,15 @@ class Ros2Policy:
 
     def _drive(self, env: ExplorationEnv) -> None:
         """After every tick of the simulation."""
-        if int(env.simulation.tensors["local_step"][0]) and not self.reasons[0]:
-            self._publish_robots(self._now())
+        ticks = int(env.simulation.tensors["local_step"][0])
+        if ticks and not self.reasons[0]:
+            places = self._publish_robots(self._now())
+            for robot in self.robots:
+                robot.drive(places.get(robot.name), ticks * TICK, self._now(), self.near)
             self.clock.publish(self._now())
 
-    def _publish_robots(self, now: int) -> None:
-        """Poses, odometry and scans of those that have not collided."""
+    def _publish_robots(self, now: int) -> dict[str, Pose]:
+        """Odometry and scans of those that have not collided, and their poses, which are returned, too."""
         held = {
             name: self.env.simulation.tensors[name][0].cpu().numpy().astype(np.float64)
             for name in ("center", "pose", "slip", "collided", "map_id")
@@ -316,6 +376,7 @@ class Ros2Policy:
                 [(robot.frames["odom"], robot.frames["base_link"], places[robot.name])] if robot.name in places else []
             ),
         )
+        return places
 
     def _publish_scan(self, robot: Robot, now: int, pose: Pose, number: int) -> None:
         message, reach = robot.scan.make(), float(max(one.range for one in self.env.radar_configs))

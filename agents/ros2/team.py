@@ -8,11 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from maexp.agents.errors import UserError
-from maexp.agents.ros2.convert import SECOND, fill_header, read_nanoseconds
+from maexp.agents.ros2.convert import SECOND, read_nanoseconds
 from maexp.agents.ros2.dds import EPISODE, Wire
+from maexp.agents.ros2.goals import SENDERS
 from maexp.agents.runtime.driver import Decision, TeamDriver
-from maexp.agents.runtime.frames import fill_pose
 
 POLL = 0.1  # seconds between two looks where nothing comes
 
@@ -41,9 +43,17 @@ class Ros2Team:
     Args:
         answer: how long the first map and pose are waited for, and new ones after the last [s by the wall].
         tell: called with a sentence.
+        goals: how they are sent, one of `SENDERS`.
     """
 
-    def __init__(self, driver: TeamDriver, wire: Wire, answer: float = 60.0, tell: Callable[[str], None] = print):
+    def __init__(
+        self,
+        driver: TeamDriver,
+        wire: Wire,
+        answer: float = 60.0,
+        tell: Callable[[str], None] = print,
+        goals: str = "goal_pose",
+    ):
         self.driver, self.wire, self.answer, self.tell = driver, wire, answer, tell
         robots = driver.settings.robots
         self.maps = {topic: wire.reader(topic, "map") for topic in driver.topics}
@@ -54,7 +64,8 @@ class Ros2Team:
         }
         self.odometry = {name: wire.reader(f"/{name}/odom") for name in robots}
         self.clock, self.episode = wire.reader("/clock"), wire.reader(EPISODE)
-        self.goals = {name: wire.writer(f"/{name}/goal_pose") for name in robots}
+        self.goals = {name: SENDERS[goals](wire, name) for name in robots}
+        self.sent: dict[str, np.ndarray] = {}  # the last goal of each
         self.time: int | None = None  # that /clock showed last [ns]
         self.planned: float | None = None  # time of the last decision [s]
         self.said: set[str] = set()
@@ -85,6 +96,7 @@ class Ros2Team:
         if told:
             self._begin(told[-1])
         self._take_others()
+        self._heed()
         for topic, message in maps.items():
             self.driver.take_map(topic, message)
         self.heard = time.monotonic() if maps else self.heard
@@ -134,7 +146,7 @@ class Ros2Team:
         if episode is not None:
             topics = [self.driver.topic_of(name) for name in self.driver.robots]
             stamps = {self._stamp(topic) for topic in topics}
-            now = stamps.pop() if len(stamps) == 1 else None
+            now = stamps.pop() if len(stamps) == 1 and all(goals.ready for goals in self.goals.values()) else None
             return None if now is None or now / SECOND == self.planned or now < episode["begins"] else now / SECOND
         if self.time is None and self.clock.matched:
             return None
@@ -163,9 +175,20 @@ class Ros2Team:
         self.said = set(decision.notes)
 
     def _send(self, decision: Decision, now: float) -> None:
-        """Goals, and for robots that are to stop, where they are: /goal_pose knows no cancelling."""
+        """Goals; robots that are to stop are told so, and in an arena, which waits for goals, where they are."""
         for order in decision.orders:
-            message = self.goals[order.name].make()
-            fill_header(message.header, order.frame, round(now * SECOND))
-            fill_pose(message.pose, *order.pose)
-            self.goals[order.name].write(message)
+            goals = self.goals[order.name]
+            if not goals.ready:
+                self.driver.forget(order.name, order.goal)
+                decision.notes.append(f"{order.name}: nobody offers /{order.name}/navigate_to_pose yet")
+            elif order.stop and self.driver.episode is None:
+                goals.stop(order, now)
+            else:
+                goals.send(order, now)
+                self.sent[order.name] = order.goal
+
+    def _heed(self) -> None:
+        """A goal that was refused or has ended may be sent again."""
+        for name, goals in self.goals.items():
+            if goals.ended():
+                self.driver.forget(name, self.sent[name])

@@ -26,6 +26,7 @@ class Ros2Settings(DriveSettings):
     domain: int | None = setting(None, "number of DDS's domain; default: ROS_DOMAIN_ID, or 0")
     answer: float = setting(60.0, "how long the other side may be silent before this ends [s]")
     robots: Any = setting(None, "namespaces, a,b,c; serve: default robot1,robot2,...")
+    goals: str = setting("goal_pose", "team: sends goals by this topic, or by the action navigate_to_pose")
     name: str = setting("ros2", "serve: what results call those who play")
     seed: int | None = setting(None, "serve: plays other maps and starts than the frozen ones, those of this seed")
     resume: str | None = setting(None, "serve: folder of a run to go on with")
