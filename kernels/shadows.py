@@ -17,6 +17,18 @@ BIN_MARGIN = 1.0e-4  # in diamond angle; far above float32 error of the exact te
 LEAST_SINE = 0.01  # below it that of the angle whose cosine is tested differs by more than rounding
 
 
+@wp.struct
+class Sensor:
+    """The radar of robot ``robot`` of env ``env``, and how wide its beams are."""
+
+    env: int
+    robot: int
+    origin: wp.vec3  # [m]
+    radius: float  # [m]
+    cos_beam: float  # of half a beam
+    spread: float  # its sine, `FAR` beyond a right angle
+
+
 @wp.func
 def diamond_angle(x: float, y: float) -> float:
     """A monotone stand-in for atan2 on [0, 4), exact enough for bins and free of trigonometry."""
@@ -90,12 +102,12 @@ def is_hidden(bins: wp.array3d(dtype=wp.float32), e: int, i: int, x: float, y: f
 
 
 @wp.func
-def shadow(delta: wp.vec3, rho: float, cos_beam: float, spread: float) -> wp.vec4:
+def shadow(delta: wp.vec3, rho: float, sensor: Sensor) -> wp.vec4:
     """Of an occluder at ``delta`` from the sensor: cosine of its angular half-width, distance, and `sector`."""
     dist = wp.length(delta)
     s = wp.min(1.0, rho / dist)
-    c = wp.min(cos_beam, wp.sqrt(1.0 - s * s))
-    sine = wp.max(s, spread)
+    c = wp.min(sensor.cos_beam, wp.sqrt(1.0 - s * s))
+    sine = wp.max(s, sensor.spread)
     if sine < LEAST_SINE:
         sine = wp.sqrt(wp.max(1.0 - c * c, 0.0))
     edges = sector(delta[0], delta[1], c, sine)
@@ -106,10 +118,8 @@ def shadow(delta: wp.vec3, rho: float, cos_beam: float, spread: float) -> wp.vec
 def add_occluder(
     delta: wp.vec3,
     cast: wp.vec4,
-    radius: float,
+    sensor: Sensor,
     cull: int,
-    e: int,
-    i: int,
     count: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
@@ -118,7 +128,9 @@ def add_occluder(
     """Append an occluder at ``delta`` that casts a `shadow` if it is in range and matters; returns the new count."""
     c = cast[0]
     dist = cast[1]
-    if dist > radius or dist == 0.0:
+    e = sensor.env
+    i = sensor.robot
+    if dist > sensor.radius or dist == 0.0:
         return count
     u = delta / dist
     if c < 0.0 or wp.abs(u[2]) > 1.0e-6:
@@ -170,13 +182,8 @@ def add_outline(
     offset: float,
     spacing: float,
     radius_max: float,
-    origin: wp.vec3,
-    radius: float,
-    cos_beam: float,
-    spread: float,
+    sensor: Sensor,
     cull: int,
-    e: int,
-    i: int,
     start: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
@@ -188,17 +195,19 @@ def add_outline(
     along = wp.max(2, int(wp.ceil(length / spacing)))
     across = wp.max(2, int(wp.ceil(width / spacing)))
     rho = wp.min(radius_max, wp.max(length / float(along), width / float(across)) * 0.70710678)
-    nearest = nearest_outline(wp.vec2(origin[0], origin[1]) - center, forward, length, width, along, across)
+    nearest = nearest_outline(
+        wp.vec2(sensor.origin[0], sensor.origin[1]) - center, forward, length, width, along, across
+    )
     total = 2 * (along + across)
     for j in range(along + across):
-        dp = outline_point(nearest - j + total, along, across, center, forward, length, width) - origin
-        dq = outline_point(nearest + 1 + j, along, across, center, forward, length, width) - origin
+        dp = outline_point(nearest - j + total, along, across, center, forward, length, width) - sensor.origin
+        dq = outline_point(nearest + 1 + j, along, across, center, forward, length, width) - sensor.origin
         dp[2] = 0.0
         dq[2] = 0.0
-        sp = shadow(dp, rho, cos_beam, spread)
-        sq = shadow(dq, rho, cos_beam, spread)
-        count = add_occluder(dp, sp, radius, cull, e, i, count, bins, direction, limit)
-        count = add_occluder(dq, sq, radius, cull, e, i, count, bins, direction, limit)
+        sp = shadow(dp, rho, sensor)
+        sq = shadow(dq, rho, sensor)
+        count = add_occluder(dp, sp, sensor, cull, count, bins, direction, limit)
+        count = add_occluder(dq, sq, sensor, cull, count, bins, direction, limit)
     return count
 
 

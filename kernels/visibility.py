@@ -20,7 +20,7 @@ import warp as wp
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch
 from maexp.kernels.sensing import sense
-from maexp.kernels.shadows import BINS, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
+from maexp.kernels.shadows import BINS, Sensor, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     ERROR_CAPACITY,
@@ -64,13 +64,8 @@ def add_cells(
     row: int,
     col: int,
     run: int,
-    origin: wp.vec3,
-    radius: float,
-    cos_beam: float,
-    spread: float,
+    sensor: Sensor,
     cull: int,
-    e: int,
-    i: int,
     start: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
@@ -78,26 +73,28 @@ def add_cells(
 ) -> int:
     """Append the occluders of a run of cells, unless it is one that is hidden; returns the new count."""
     count = int(start)
+    e = sensor.env
+    i = sensor.robot
     cell = maps.cell_begin[m] + row * maps.cells_x[m] + col
     begin = maps.occluder_cell[cell]
     end = maps.occluder_cell[cell + run]
     if run == 1 and end > begin and cull != 0:
-        at = cell_center(maps, m, row, col) - wp.vec2(origin[0], origin[1])
+        at = cell_center(maps, m, row, col) - wp.vec2(sensor.origin[0], sensor.origin[1])
         half = CELL_HALF * maps.cell_size[m]
         dist = wp.length(at)
-        width = wp.max(maps.occluder_radius_max[m], spread * (dist + half))
+        width = wp.max(maps.occluder_radius_max[m], sensor.spread * (dist + half))
         if is_hidden(bins, e, i, at[0], at[1], half + width, dist - half):
             return count
     first = maps.occluder_begin[m]
     for j in range(first + begin, first + end, 2):
         k = wp.min(j + 1, first + end - 1)
-        delta = maps.occluder[j] - origin
-        delta2 = maps.occluder[k] - origin
-        cast = shadow(delta, maps.occluder_radius[j], cos_beam, spread)
-        cast2 = shadow(delta2, maps.occluder_radius[k], cos_beam, spread)
-        count = add_occluder(delta, cast, radius, cull, e, i, count, bins, direction, limit)
+        delta = maps.occluder[j] - sensor.origin
+        delta2 = maps.occluder[k] - sensor.origin
+        cast = shadow(delta, maps.occluder_radius[j], sensor)
+        cast2 = shadow(delta2, maps.occluder_radius[k], sensor)
+        count = add_occluder(delta, cast, sensor, cull, count, bins, direction, limit)
         if k > j:
-            count = add_occluder(delta2, cast2, radius, cull, e, i, count, bins, direction, limit)
+            count = add_occluder(delta2, cast2, sensor, cull, count, bins, direction, limit)
     return count
 
 
@@ -110,25 +107,23 @@ def add_body(
     pose: wp.vec4,
     forward: wp.vec2,
     at: wp.vec2,
-    origin: wp.vec3,
-    radius: float,
-    cos_beam: float,
-    spread: float,
+    sensor: Sensor,
     planar: int,
-    e: int,
-    i: int,
     start: int,
     bins: wp.array3d(dtype=wp.float32),
     direction: wp.array3d(dtype=wp.vec3),
     limit: wp.array3d(dtype=wp.vec2),
 ) -> int:
     """Append the outline of robot ``other`` at ``at`` from the sensor, unless it is hidden; returns the new count."""
+    e = sensor.env
     length = robots.length[e, other]
     width = robots.width[e, other]
     dist = wp.length(at)
     half = HALF * wp.sqrt(length * length + width * width)
-    reach = half + wp.max(0.36 * wp.max(length, width), spread * (dist + half))
-    if dist > 1.0001 * radius + half or (planar != 0 and is_hidden(bins, e, i, at[0], at[1], reach, dist - half)):
+    reach = half + wp.max(0.36 * wp.max(length, width), sensor.spread * (dist + half))
+    if dist > 1.0001 * sensor.radius + half or (
+        planar != 0 and is_hidden(bins, e, sensor.robot, at[0], at[1], reach, dist - half)
+    ):
         return start
     return add_outline(
         pose,
@@ -138,13 +133,8 @@ def add_body(
         robots.center_offset[e, other],
         maps.resolution[m],
         maps.outline_radius_max[m],
-        origin,
-        radius,
-        cos_beam,
-        spread,
+        sensor,
         planar,
-        e,
-        i,
         start,
         bins,
         direction,
@@ -190,6 +180,13 @@ def _collect_occluders(
     if cos_beam < 0.0:
         spread = FAR
     origin = center[e, i]
+    sensor = Sensor()
+    sensor.env = e
+    sensor.robot = i
+    sensor.origin = origin
+    sensor.radius = radius
+    sensor.cos_beam = cos_beam
+    sensor.spread = spread
     visible_count[e, i] = 0
     for b in range(2 * BINS):
         bins[e, i, b] = FAR
@@ -215,13 +212,8 @@ def _collect_occluders(
                     row,
                     col,
                     run,
-                    origin,
-                    radius,
-                    cos_beam,
-                    spread,
+                    sensor,
                     cull,
-                    e,
-                    i,
                     count,
                     bins,
                     direction,
@@ -242,13 +234,8 @@ def _collect_occluders(
                 pose[e, other],
                 facing[e, other],
                 there,
-                origin,
-                radius,
-                cos_beam,
-                spread,
+                sensor,
                 planar,
-                e,
-                i,
                 count,
                 bins,
                 direction,
