@@ -6,9 +6,8 @@ envs at once, on the env's device, without a loop over envs or robots.
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,7 +45,7 @@ class Rows:
 class Navigation:
     """Known grids, distances and targets of all envs of an `ExplorationEnv`.
 
-    Inside `only` everything is about some envs: E below then counts those. `grow_trees`, `waypoints` and
+    That of `some` is about some envs: E below then counts those. `grow_trees`, `waypoints` and
     `leads_through_open_ground` need all envs and are errors there.
 
     R rows per env hold what is known: 1 where all communicate, else N (a robot knows what it has heard). K is
@@ -94,7 +93,7 @@ class Navigation:
         self.blocks = FrontierBlocks(self.paths, bank_block_sides(env.bank, least), float(threshold.max()))
         self.num_blocks = self.blocks.num_blocks
         self._make_views(cells)
-        self._all = self._listed = torch.arange(self.num_envs, dtype=torch.int32, device=env.device)
+        self._listed = torch.arange(self.num_envs, dtype=torch.int32, device=env.device)
         self._updates = record(self._update, self.known_grids.known.device)
         self._rays: dict[float, list[wp.array]] = {}
         finish_filling(env.device)
@@ -116,18 +115,11 @@ class Navigation:
         self._target, self._size = (wp.to_torch(one).view(e, r, -1) for one in (blocks.target_cell, blocks.size))
         self._looked, self._count = wp.to_torch(blocks.looked), wp.to_torch(blocks.count)
 
-    @contextmanager
-    def only(self, envs: torch.Tensor | None) -> Iterator[None]:
-        """Look at some envs, int64 [S], and leave what is there of the others as it is; None: at all."""
-        self.envs = envs
-        if envs is not None:
-            self._listed = envs.to(torch.int32)
-            self._looked.zero_().index_fill_(0, envs, 1)
-        try:
-            yield
-        finally:
-            self.envs, self._listed = None, self._all
-            self._looked.fill_(1)
+    def some(self, envs: torch.Tensor) -> Navigation:
+        """The same of some envs, int64 [S], by itself: what is there of the others stays as it is."""
+        found = copy.copy(self)
+        found.envs, found._listed = envs, envs.to(torch.int32)
+        return found
 
     def values(self) -> dict:
         """Arrays by the names of the kernels' parameters; `env` is int32 [S], the envs looked at."""
@@ -142,9 +134,9 @@ class Navigation:
         return rows if self.envs is None else values.index_copy_(0, self.envs, rows)
 
     def _need_all(self, name: str) -> None:
-        """Raise RuntimeError inside `only`: what is asked for looks at all envs."""
+        """Raise RuntimeError for that of `some`: what is asked for looks at all envs."""
         if self.envs is not None:
-            raise RuntimeError(f"{name} is about all envs: call it outside of `only`")
+            raise RuntimeError(f"{name} is about all envs, and here are some")
 
     def _spread(self, rows: torch.Tensor) -> torch.Tensor:
         """[S, ...] -> int32 [E, ...], -1 for envs not looked at."""
@@ -153,7 +145,11 @@ class Navigation:
 
     def update(self) -> None:
         """Bring everything up to date with the env."""
+        if self.envs is not None:
+            self._looked.zero_().index_fill_(0, self.envs, 1)
         replay(self._updates)
+        if self.envs is not None:
+            self._looked.fill_(1)
         looks, most = len(self._listed), max(int(self.pick(self._count).max()), 1)
         shape, device = (looks, self.num_robots, most), self.device
         self.block = torch.empty((looks, 1, most), dtype=torch.int64, device=device)

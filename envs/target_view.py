@@ -54,18 +54,14 @@ class TargetView:
         is the one choice; its features are 0. ``mask`` int32 [E]: look at these envs only, the others show nothing.
         """
         if mask is None or bool(mask.all()):
-            return self._look()
+            return self.show(self.tracker.look())[0]
         features = torch.zeros((*self.state["mask"].shape, len(FEATURES)), device=mask.device)
         blank = {"features": features, "mask": torch.zeros_like(self.state["mask"])}
         envs = mask.nonzero().squeeze(-1)
         if not len(envs):
             return blank
-        with self.tracker.nav.only(envs):
-            return {name: blank[name].index_copy_(0, envs, rows) for name, rows in self._look().items()}
-
-    def _look(self) -> dict[str, torch.Tensor]:
-        """`observe` of the envs that `Navigation.only` leaves."""
-        return self.show(self.tracker.look())[0]
+        found = self.show(self.tracker.look(envs))[0]
+        return {name: blank[name].index_copy_(0, envs, rows) for name, rows in found.items()}
 
     def show(self, scene: Scene) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """`observe` of what the tracker has just seen; and which of the scene's targets the candidates are, int64
@@ -105,7 +101,7 @@ class TargetView:
         rival, *gaps = compare_with_others(point, best, ways, hears, plans, last)
         plan_gap, own_last, mates_last = (gap / reach for gap in gaps)
         near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR + EDGE, AROUND + EDGE)
-        speed, at = tracker.speed(), nav.centers()
+        speed, at = tracker.speed(nav), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
         left = 1.0 - nav.state["macro_step"].float() / env.macro_steps
         cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
@@ -133,7 +129,7 @@ class TargetView:
             heading=nav.state["pose"][..., 3:],
             speed=speed.unsqueeze(-1),
             max_speed=nav.pick(env.simulation.robot_tensors["max_speed"]).unsqueeze(-1),
-            drive=tracker.drive(speed).unsqueeze(-1),
+            drive=tracker.drive(nav, speed).unsqueeze(-1),
             mates=hears & ~own & scene.alive.unsqueeze(1),
             time_left=left.view(-1, 1, 1),
             area=cells.unsqueeze(-1),

@@ -163,17 +163,21 @@ class TargetTracker:
         half = 0.5 * torch.hypot(robots["length"], robots["width"])
         self.body = torch.maximum(half, robots["collision_threshold"])
 
-    def look(self) -> Scene:
-        """Bring everything up to date with the env, and give up what led nowhere (once a macro step)."""
-        nav, robots = self.nav, self.env.num_robots
+    def look(self, envs: torch.Tensor | None = None) -> Scene:
+        """Bring everything up to date with the env, and give up what led nowhere (once a macro step).
+
+        Args:
+            envs: int64 [S], the scene is of these, and the others stay as they are; None: all.
+        """
+        nav, robots = self.nav if envs is None else self.nav.some(envs), self.env.num_robots
         nav.update()
-        self._note_home()
+        self._note_home(nav)
         area, middle = nav.look_from_targets()
         return Scene(
-            travel=self._give_up(nav.way, nav.point, nav.block),
+            travel=self._give_up(nav, nav.way, nav.point, nav.block),
             points=nav.point,
             size=nav.around,
-            gain=self._share(area),
+            gain=self._share(nav, area),
             middle=middle.expand(-1, robots, -1, -1),
             alive=nav.alive(),
             nav=nav,
@@ -183,11 +187,11 @@ class TargetTracker:
     def outlook(self, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """`Scene.gain` and `Scene.middle` if ``known``, as in `Navigation.look_around`, were what is known."""
         area, middle = self.nav.look_around(self.nav.radar_range, self.nav.cell, known)
-        return self._share(area), middle.expand(-1, self.env.num_robots, -1, -1)
+        return self._share(self.nav, area), middle.expand(-1, self.env.num_robots, -1, -1)
 
-    def _share(self, area: torch.Tensor) -> torch.Tensor:
+    def _share(self, nav: Navigation, area: torch.Tensor) -> torch.Tensor:
         """Unknown cells, [E, R, T], as a share of the radar's disc, for every robot: [E, N, T]."""
-        disc = self.disc[self.nav.state["map_id"]].view(-1, 1, 1)
+        disc = self.disc[nav.state["map_id"]].view(-1, 1, 1)
         return (area / disc).expand(-1, self.env.num_robots, -1)
 
     def share(
@@ -207,7 +211,7 @@ class TargetTracker:
         some = (preference > -torch.inf).any(-1)
         if not self.env.targets_config.distinct:
             return torch.where(some, preference.argmax(-1), -1), torch.zeros_like(some)
-        chosen = share_targets(preference, travel, points, self.nav.state["comm"], self.nav.pick(self.body))
+        chosen = share_targets(preference, travel, points, self.nav.state["comm"], self.body)
         return chosen, some & (chosen < 0)
 
     def take(
@@ -246,20 +250,20 @@ class TargetTracker:
         """
         return self.state["home"] if self.env.targets_config.spare == "home" else self.nav.centers()
 
-    def _note_home(self) -> None:
+    def _note_home(self, nav: Navigation) -> None:
         """Remember where the robots stand whose episode begins, or that are seen for the first time."""
-        home, at = self.nav.pick(self.state["home"]), self.nav.centers()
-        begins = (self.nav.state["macro_step"] == 0).view(-1, 1, 1) | home.isnan()
-        self.state["home"] = self.nav.put(self.state["home"], torch.where(begins, at, home))
+        home, at = nav.pick(self.state["home"]), nav.centers()
+        begins = (nav.state["macro_step"] == 0).view(-1, 1, 1) | home.isnan()
+        self.state["home"] = nav.put(self.state["home"], torch.where(begins, at, home))
 
-    def drive(self, speed: torch.Tensor) -> torch.Tensor:
+    def drive(self, nav: Navigation, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
-        accel, limit = (self.nav.pick(self.env.simulation.robot_tensors[one]) for one in ("max_accel", "max_speed"))
+        accel, limit = (nav.pick(self.env.simulation.robot_tensors[one]) for one in ("max_accel", "max_speed"))
         return drive_until_next(torch, speed, accel, limit, self.seconds)
 
-    def speed(self) -> torch.Tensor:
+    def speed(self, nav: Navigation) -> torch.Tensor:
         """Of every robot [m/s], float32 [E, N]."""
-        return torch.hypot(self.nav.state["pose"][..., 2], self.nav.state["slip"])
+        return torch.hypot(nav.state["pose"][..., 2], nav.state["slip"])
 
     def _approach(self, goal_cell: torch.Tensor, target: torch.Tensor, toward: torch.Tensor) -> torch.Tensor:
         """Goals [m] on the way to `target` (of cell `goal_cell`, -1 = none), float32 [E, N, 2].
@@ -270,7 +274,7 @@ class TargetTracker:
         for.
         """
         nav = self.nav
-        drive = self.drive(self.speed())
+        drive = self.drive(nav, self.speed(nav))
         gap = (target - nav.centers()).norm(dim=-1)
         left = (drive - gap).clamp_min(0.0) / toward.norm(dim=-1).clamp_min(1e-6)
         beyond = target + toward * left.unsqueeze(-1)
@@ -278,14 +282,14 @@ class TargetTracker:
             return beyond
         threshold = self.env.simulation.robot_tensors["collision_threshold"]
         far = nav.waypoints(goal_cell, target, (drive + threshold).clamp(max=SIGHT * nav.radar_range))
-        near = (self.drive(torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
+        near = (self.drive(nav, torch.zeros_like(drive)) + threshold).clamp(max=nav.radar_range)
         near = nav.waypoints(goal_cell, target, near)
         is_open = nav.leads_through_open_ground(far)
         at_target = (far - target).norm(dim=-1) <= nav.cell_of_env().view(-1, 1)
         far = torch.where(at_target.unsqueeze(-1), beyond, far)
         return torch.where(is_open.unsqueeze(-1), far, near)
 
-    def _give_up(self, way: torch.Tensor, point: torch.Tensor, block: torch.Tensor) -> torch.Tensor:
+    def _give_up(self, nav: Navigation, way: torch.Tensor, point: torch.Tensor, block: torch.Tensor) -> torch.Tensor:
         """Drop targets that robots stood beside in vain (what is unknown there cannot be seen from there), and for
         each robot those that it got stuck on the way to; if nothing else is left, try them all once more.
 
@@ -296,7 +300,7 @@ class TargetTracker:
         Returns:
             float32 [E, N, T], `way`, infinite for targets given up.
         """
-        nav, s = self.nav, self.state
+        s = self.state
         idle = self.env.simulation.tensors["failed"] != 0  # who has failed, or was sent elsewhere, has tried no target
         if self.env.strategy is not None:
             idle = idle | self.env.strategy.state["duty"]

@@ -47,7 +47,7 @@ def play(env: ExplorationEnv, steps: int = 5):
     for step in range(steps):
         nav.update()
         now = moment(env, nav)
-        heading, speed = nav.state["pose"][0, :, 3].numpy(), env.target_view.tracker.speed()[0].numpy()
+        heading, speed = nav.state["pose"][0, :, 3].numpy(), env.target_view.tracker.speed(nav)[0].numpy()
         here, left = last - np.array(now.call["origin"]), 1.0 - step / env.macro_steps
         ours = list_candidates(survey(now), 24, heading, speed, here, left, motion_of(env))
         seen = td["agents", "observation"]

@@ -47,8 +47,7 @@ def test_what_is_kept_is_what_is_there(reach):
         if step in (1, 5):
             reset = torch.tensor([[step == 1], [False], [step == 5], [False]])
             td = env.reset(td.set("_reset", reset))
-        with nav.only(torch.tensor([0, 3])):
-            nav.update()  # a look at some leaves the others, and what has changed of them counts later
+        nav.some(torch.tensor([0, 3])).update()  # leaves the others, and what has changed of them counts later
         nav.update()
         kept += int((wp_array(nav, "looked_from") >= 0).sum()) if changed.any() else 0
         assert_up_to_date(nav, env)

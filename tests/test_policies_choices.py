@@ -179,11 +179,11 @@ def test_a_target_that_stays_is_given_up_and_tried_again_when_nothing_else_is_le
     for step in range(1, 5):
         env.simulation.tensors["macro_step"].fill_(step)
         for _ in range(2):  # looking twice counts once
-            given = planner.tracker._give_up(travel, points, block)[0, 0, :2].tolist()
+            given = planner.tracker._give_up(planner.tracker.nav, travel, points, block)[0, 0, :2].tolist()
         kept.append(given)
     assert kept == [[0.5, 20.0], [0.5, 20.0], [INF, 20.0], [INF, 20.0]]
     travel[..., 1] = INF
-    assert planner.tracker._give_up(travel, points, block)[0, 0, 0] == 0.5
+    assert planner.tracker._give_up(planner.tracker.nav, travel, points, block)[0, 0, 0] == 0.5
 
 
 def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
@@ -199,10 +199,13 @@ def test_a_robot_that_gets_stuck_gives_its_target_up_and_the_others_do_not():
         env.simulation.tensors["macro_step"].fill_(step)
         state["chosen"], state["stood"] = torch.zeros_like(state["chosen"]), planner.tracker.nav.centers().clone()
         state["stood"][0, 1, 0] -= 1.0  # the second robot has moved
-        kept = planner.tracker._give_up(travel, points, block)
+        kept = planner.tracker._give_up(planner.tracker.nav, travel, points, block)
     assert kept[0, :, :2].tolist() == [[INF, 20.0], [9.0, 20.0]]
     env.simulation.tensors["macro_step"].fill_(0)
-    assert planner.tracker._give_up(travel, points, block)[0, :, :2].tolist() == [[9.0, 20.0], [9.0, 20.0]]
+    assert planner.tracker._give_up(planner.tracker.nav, travel, points, block)[0, :, :2].tolist() == [
+        [9.0, 20.0],
+        [9.0, 20.0],
+    ]
 
 
 @pytest.mark.parametrize("speed, drive", [(0.0, 4.0), (3.0, 10.0), (8.0, 16.0)])

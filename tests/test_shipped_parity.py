@@ -104,7 +104,7 @@ def play_runtime(planner: TeamPlanner, env: ExplorationEnv) -> tuple[float, np.n
     while not done:
         nav.update()
         left = 1 - len(goals) / env.macro_steps
-        speeds = view.tracker.speed()[0].numpy()
+        speeds = view.tracker.speed(view.tracker.nav)[0].numpy()
         seconds = 0.1 * env.local_steps * len(goals)
         plan = planner.plan(**moment(env, nav).call, velocities=speeds, time_left=left, now=seconds)
         goals.append(plan.goals.copy())
