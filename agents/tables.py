@@ -42,7 +42,7 @@ def reached(found: dict, total: int) -> str:
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """A value, bold or not, and small lines below it."""
 
     text: str

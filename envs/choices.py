@@ -1,8 +1,8 @@
 """The classical planners: what robots think of targets, for tensors of many teams as for NumPy arrays of one.
 
-A planner is a function of a scene and a row of `CLASSICAL`. Scenes are `maexp.envs.targets.Scene`, in torch, and
-`maexp.agents.runtime.scene.Scene`, in NumPy; `Scene` here says what both give. `scene.xp` is the array library: use
-what torch and NumPy call by the same name. Imports neither torch nor Warp.
+A planner is a function of a scene and a row of `CLASSICAL`. Scenes are `maexp.envs.targets.TensorScene`, in torch, and
+`maexp.agents.runtime.scene.ArrayScene`, in NumPy; `Scene` here says what both give. `scene.xp` is the array library:
+use what torch and NumPy call by the same name. Imports neither torch nor Warp.
 
 Sources: docs/planners.md.
 """

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from maexp.envs.choices import WAY_AHEAD, value_targets
 from maexp.envs.features import AROUND, EDGE, FEATURES, NEAR, Moment
-from maexp.envs.targets import Scene, TargetTracker, plan_in_turn
+from maexp.envs.targets import TargetTracker, TensorScene, plan_in_turn
 from maexp.kernels.teamwork import compare_with_others, gather_gain
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class TargetView:
         found = self.show(self.tracker.look(envs))[0]
         return {name: blank[name].index_copy_(0, envs, rows) for name, rows in found.items()}
 
-    def show(self, scene: Scene) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    def show(self, scene: TensorScene) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """`observe` of what the tracker has just seen; and which of the scene's targets the candidates are, int64
         [E, N, M]."""
         nav = scene.nav
@@ -82,7 +82,12 @@ class TargetView:
         return {"features": features, "mask": first_if_none(some)}, best
 
     def _moment(
-        self, state: dict[str, torch.Tensor], scene: Scene, best: torch.Tensor, some: torch.Tensor, value: torch.Tensor
+        self,
+        state: dict[str, torch.Tensor],
+        scene: TensorScene,
+        best: torch.Tensor,
+        some: torch.Tensor,
+        value: torch.Tensor,
     ) -> Moment:
         """What features are made of; each robot hears only those it hears.
 

@@ -28,7 +28,7 @@ SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 
 
 @dataclass(frozen=True)
-class Scene:
+class TensorScene:
     """What targets are chosen from, a `maexp.envs.choices.Scene`. K targets per robot; those that are absent are
     infinitely far.
 
@@ -163,7 +163,7 @@ class TargetTracker:
         half = 0.5 * torch.hypot(robots["length"], robots["width"])
         self.body = torch.maximum(half, robots["collision_threshold"])
 
-    def look(self, envs: torch.Tensor | None = None) -> Scene:
+    def look(self, envs: torch.Tensor | None = None) -> TensorScene:
         """Bring everything up to date with the env, and give up what led nowhere (once a macro step).
 
         Args:
@@ -173,7 +173,7 @@ class TargetTracker:
         nav.update()
         self._note_home(nav)
         area, middle = nav.look_from_targets()
-        return Scene(
+        return TensorScene(
             travel=self._give_up(nav, nav.way, nav.point, nav.block),
             points=nav.point,
             size=nav.around,
@@ -185,7 +185,7 @@ class TargetTracker:
         )
 
     def outlook(self, known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """`Scene.gain` and `Scene.middle` if ``known``, as in `Navigation.look_around`, were what is known."""
+        """`gain` and `middle` of a `TensorScene` if ``known``, as in `Navigation.look_around`, were what is known."""
         area, middle = self.nav.look_around(self.nav.radar_range, self.nav.cell, known)
         return self._share(self.nav, area), middle.expand(-1, self.env.num_robots, -1, -1)
 

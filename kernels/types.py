@@ -41,8 +41,10 @@ DT = 0.1
 """Length of a local step [s]."""
 
 START_CLEARANCE = 3.0
-BESIDE = 1.5  # robots that start together stand at most so many clearances from another one
 """Starts keep this many collision thresholds from the boundary and from other robots."""
+
+BESIDE = 1.5
+"""Robots that start together stand at most so many clearances from another one."""
 
 PI = 3.14159265358979
 

@@ -19,7 +19,7 @@ from maexp.envs.choices import (
     value_targets,
     worthwhile,
 )
-from maexp.envs.targets import Scene, plan_in_turn
+from maexp.envs.targets import TensorScene, plan_in_turn
 
 
 def test_goals_under_dwa_are_in_sight_and_in_reach():
@@ -69,14 +69,14 @@ class Places:
         return torch.ones(len(self.at), 1, self.ways.shape[2], dtype=torch.bool)
 
 
-def scene_of(travel, points=None, size=None, alive=None, nav=None) -> Scene:
+def scene_of(travel, points=None, size=None, alive=None, nav=None) -> TensorScene:
     travel = torch.tensor(travel)
     points = torch.zeros(*travel.shape, 2) if points is None else torch.tensor(points)
     size = torch.ones_like(travel) if size is None else torch.tensor(size)
     alive = torch.ones(travel.shape[:2], dtype=torch.bool) if alive is None else torch.tensor(alive)
     gain = torch.ones_like(travel)
     nav = nav or Places(np.zeros((*travel.shape[:2], 2), np.float32))
-    return Scene(travel, points, size, gain, torch.zeros_like(points), alive, nav)
+    return TensorScene(travel, points, size, gain, torch.zeros_like(points), alive, nav)
 
 
 INF = float("inf")

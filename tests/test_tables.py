@@ -8,7 +8,7 @@ from rich.console import Console
 
 from maexp.agents.tables import (
     POINTS,
-    Cell,
+    TableCell,
     brackets,
     estimate,
     fixed,
@@ -28,9 +28,9 @@ def test_figures_have_their_interval_where_there_is_one():
 
 
 def test_a_cell_is_bold_and_has_lines_below_in_each_layout():
-    cell = Cell("93.5 ± 3.5", bold=True, below=("[90.0, 97.0]", "(3/6)"))
+    cell = TableCell("93.5 ± 3.5", bold=True, below=("[90.0, 97.0]", "(3/6)"))
     assert cell.markdown() == "**93.5 ± 3.5**<br>[90.0, 97.0]<br>(3/6)"
-    assert cell.latex() == r"$\mathbf{93.5} \pm 3.5$" and Cell("-").latex() == "-"
+    assert cell.latex() == r"$\mathbf{93.5} \pm 3.5$" and TableCell("-").latex() == "-"
     out = StringIO()
     table = terminal_table("maze [m]", ["policy [m]", "ER"], [["[red]", cell.terminal()]])
     Console(file=out, width=80, force_terminal=True, color_system="standard").print(table)

@@ -8,7 +8,7 @@ from maexp.agents.algorithms.expert import ExpertUpdater
 from maexp.agents.algorithms.losses import ActorCriticLoss, ClippedLoss, TrustRegionLoss
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.networks.critics import build_critic
-from maexp.agents.settings.algorithms import TUNINGS, Settings, Tunings
+from maexp.agents.settings.algorithms import TUNINGS, AlgorithmSettings, Tunings
 from maexp.agents.settings.model import ModelConfig, model_config
 
 
@@ -31,16 +31,16 @@ class Algorithm:
     tunings: Tunings
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> AlgorithmSettings:
         """The defaults."""
         return self.tunings.default
 
     @property
-    def reference(self) -> Settings:
+    def reference(self) -> AlgorithmSettings:
         """Those of the original platform."""
         return self.tunings.reference
 
-    def configure(self, tuning: str = "default", **overrides) -> Settings:
+    def configure(self, tuning: str = "default", **overrides) -> AlgorithmSettings:
         """The settings of a tuning ("default" or "reference") with some replaced.
 
         Raises:
@@ -48,21 +48,21 @@ class Algorithm:
         """
         return self.tunings.configure(tuning, **overrides)
 
-    def make_critic(self, env, model: "str | ModelConfig", settings: Settings | None = None):
+    def make_critic(self, env, model: "str | ModelConfig", settings: AlgorithmSettings | None = None):
         """The critic of this algorithm for the specs of `env`; beside a trust region it has an encoder of its own."""
         if self.updater is TrustRegionUpdater:
             model = replace(model_config(model), critic_encoder="own")
         mixer = getattr(settings or self.settings, "mixer", "qmix")
         return build_critic(self.critic, env, model, mixer)
 
-    def make_loss(self, policy, critic, settings: Settings | None = None):
+    def make_loss(self, policy, critic, settings: AlgorithmSettings | None = None):
         """The loss for a policy and critic, with its estimator of advantages."""
         settings = settings or self.settings
         norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
         loss = self.loss(policy, critic, value_norm=norm, **settings.loss_arguments())
         return loss.to(next(policy.parameters()).device)
 
-    def make_updater(self, loss, settings: Settings | None = None) -> Updater:
+    def make_updater(self, loss, settings: AlgorithmSettings | None = None) -> Updater:
         """The updater that trains the networks behind `loss`."""
         return self.updater(loss, settings or self.settings)
 

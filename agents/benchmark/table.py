@@ -14,7 +14,7 @@ from maexp.agents.evaluation.evaluate import EvaluationResult, join
 from maexp.agents.evaluation.evidence import Evidence, describe_evidence
 from maexp.agents.tables import (
     NONE,
-    Cell,
+    TableCell,
     brackets,
     fixed,
     latex_row,
@@ -203,7 +203,7 @@ def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
     bold = {row.metric: best_columns(columns, row) for row in rows}
     for column in columns:
         cells = [
-            Cell(value_text(column, row), column.name in bold[row.metric], (_narrow(column, row),)).terminal()
+            TableCell(value_text(column, row), column.name in bold[row.metric], (_narrow(column, row),)).terminal()
             for row in rows
         ]
         lines.append([column.name.replace(" (", "\n("), *cells])
@@ -223,7 +223,7 @@ def draw_overview(tables: dict[str, list[Column]]) -> Table:
         for columns in tables.values():
             bold = best_columns(columns, row)
             found = next((one for one in columns if one.name == name), None)
-            cells.append(Cell(value_text(found, row) if found else "", name in bold).terminal())
+            cells.append(TableCell(value_text(found, row) if found else "", name in bold).terminal())
         lines.append([name.replace(" (", "\n("), *cells])
     heads = ["policy", *(scenario.replace("_", "\n", 1) for scenario in tables)]
     return terminal_table(f"all scenarios: {row.title}", heads, lines)
@@ -323,7 +323,7 @@ def table_markdown(
 def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> str:
     published = paper_text(scenario, column, row)
     below = filter(None, (interval_text(column, row), published and f"paper {published}"))
-    return Cell(value_text(column, row), column.name in bold, tuple(below)).markdown()
+    return TableCell(value_text(column, row), column.name in bold, tuple(below)).markdown()
 
 
 def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float = 0.95) -> str:
@@ -341,11 +341,11 @@ def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float 
         for k, row in enumerate(rows):
             head = rf"\multirow{{{height}}}{{*}}{{{latex_text(scenario)}}}" if k == 0 else ""
             bold = best_columns(columns, row)
-            cells = [one and Cell(value_text(one, row), one.name in bold).latex() for one in have]
+            cells = [one and TableCell(value_text(one, row), one.name in bold).latex() for one in have]
             intervals = [one and latex_small(interval_text(one, row)) for one in have]
             lines += [latex_row([head, latex_text(row.title), *cells]), latex_row(["", "", *intervals])]
             if published:
                 texts = [one and paper_text(scenario, one, row) for one in have]
-                papers = [one and latex_small(Cell(one).latex()) for one in texts]
+                papers = [one and latex_small(TableCell(one).latex()) for one in texts]
                 lines.append(latex_row(["", latex_small("paper"), *papers]))
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *("% " + one for one in NOTES)]) + "\n"

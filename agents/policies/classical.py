@@ -20,7 +20,7 @@ from tensordict.nn import TensorDictModule
 from maexp.envs import ExplorationEnv
 from maexp.envs.choices import CLASSICAL, rank_by_utility
 from maexp.envs.nav_grid import build_nav_grid, open_cells
-from maexp.envs.targets import Scene, TargetTracker, keyed_uniform
+from maexp.envs.targets import TargetTracker, TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.types import REGIONS
 
@@ -30,14 +30,14 @@ class FrontierPlanner:
 
     Args:
         env: the env to plan for.
-        rank: `Scene` -> float32 [E, N, K], what each robot thinks of each target; it wants the one with the highest
-            number, and takes the next one that is free where another robot has that; -inf: out of reach.
+        rank: `TensorScene` -> float32 [E, N, K], what each robot thinks of each target; it wants the one with the
+            highest number, and takes the next one that is free where another robot has that; -inf: out of reach.
     """
 
-    def __init__(self, env: ExplorationEnv, rank: Callable[[Scene], torch.Tensor]):
+    def __init__(self, env: ExplorationEnv, rank: Callable[[TensorScene], torch.Tensor]):
         self.rank, self.tracker = rank, TargetTracker(env)
 
-    def look(self) -> Scene:
+    def look(self) -> TensorScene:
         """What there is to choose from."""
         return self.tracker.look()
 
@@ -51,7 +51,7 @@ class FrontierPlanner:
         toward = scene.middle.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
         return self.tracker.take(torch.where(chosen >= 0, block, -1), cell.squeeze(-1), toward, waits)
 
-    def choose(self, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    def choose(self, scene: TensorScene) -> tuple[torch.Tensor, torch.Tensor]:
         """The target of each robot, and which robots wait, as `TargetTracker.share` shares them out."""
         return self.tracker.share(self.rank(scene), scene.travel, scene.points)
 
@@ -67,7 +67,7 @@ class OraclePlanner(FrontierPlanner):
         for row, one in zip(self.open, grids, strict=True):
             row[: len(one)] = torch.from_numpy(one).to(env.device)
 
-    def look(self) -> Scene:
+    def look(self) -> TensorScene:
         scene, nav = super().look(), self.tracker.nav
         seen = torch.where(nav.known == UNKNOWN, UNKNOWN, FREE)
         truth = torch.where(self.open[nav.state["map_id"].long()].unsqueeze(1), seen, OBSTACLE).to(torch.uint8)

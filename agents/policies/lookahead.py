@@ -15,7 +15,7 @@ from maexp.agents.policies.rollouts import ROLLOUT_POLICY, Rollouts, check_rollo
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.choices import value_targets
-from maexp.envs.targets import Scene
+from maexp.envs.targets import TensorScene
 
 
 class LookaheadPlanner(FrontierPlanner):
@@ -40,7 +40,7 @@ class LookaheadPlanner(FrontierPlanner):
         self.env, self.config = env, config
         self.rollouts = Rollouts(env, config, self.tracker, true_world)
 
-    def choose(self, scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    def choose(self, scene: TensorScene) -> tuple[torch.Tensor, torch.Tensor]:
         """The target of each robot, and which robots wait: as the rollout policy says, but where a branch is better."""
         preference = self.rank(scene)
         chosen, waits = self._improve(scene, preference)
@@ -48,7 +48,7 @@ class LookaheadPlanner(FrontierPlanner):
             self.rank.note(scene, chosen)
         return chosen, waits
 
-    def _improve(self, scene: Scene, preference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _improve(self, scene: TensorScene, preference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """As of `choose`, where robots think so of targets, float32 [E, N, T]."""
         own, waits = self.tracker.share(preference, scene.travel, scene.points)
         offers = self._offer(scene, preference, own, waits)
@@ -63,7 +63,7 @@ class LookaheadPlanner(FrontierPlanner):
         return self.tracker.share(preference.scatter(2, best, wanted), scene.travel, scene.points)
 
     def _offer(
-        self, scene: Scene, preference: torch.Tensor, own: torch.Tensor, waits: torch.Tensor
+        self, scene: TensorScene, preference: torch.Tensor, own: torch.Tensor, waits: torch.Tensor
     ) -> dict[str, torch.Tensor]:
         """What each robot may try, the choice of the rollout policy first.
 
@@ -138,7 +138,7 @@ def list_candidates(preference: torch.Tensor, own: torch.Tensor, count: int) -> 
     return torch.cat([own.unsqueeze(-1), place[..., 1:]], -1)
 
 
-def _value(scene: Scene) -> torch.Tensor:
+def _value(scene: TensorScene) -> torch.Tensor:
     """What targets are worth to `cost_utility` when it is the robot's turn [radar discs], float32 [E, N, T]."""
     value = torch.where(scene.travel.isfinite(), value_targets(scene), -torch.inf)
     return scene.in_turn(scene.gain, value)

@@ -7,13 +7,13 @@ import torch
 from maexp.agents.policies.load import load_chooser
 from maexp.envs import ExplorationEnv
 from maexp.envs.target_view import TargetView
-from maexp.envs.targets import Scene, TargetTracker
+from maexp.envs.targets import TargetTracker, TensorScene
 
 HIDDEN = -1e3  # what targets are worth that the policy is not shown [radar discs]: less than any
 
 
 class TrainedRank:
-    """Calling it with a `Scene` gives what each robot thinks of each target [radar discs], float32 [E, N, K].
+    """Calling it with a `TensorScene` gives what each robot thinks of each target [radar discs], float32 [E, N, K].
 
     Args:
         word: a policy that ships, or a folder that `maexp export` wrote.
@@ -31,7 +31,7 @@ class TrainedRank:
         self.view = TargetView(env, count, tracker)
 
     @torch.no_grad()
-    def __call__(self, scene: Scene) -> torch.Tensor:
+    def __call__(self, scene: TensorScene) -> torch.Tensor:
         seen, best = self.view.show(scene)
         logits = self.chooser(seen["features"], seen["mask"], scene.nav.state["comm"])[0]
         there = self.view.state["mask"]
@@ -39,7 +39,7 @@ class TrainedRank:
         shown = torch.where(there, logits / self.chooser.score_weight, -torch.inf)
         return worth.scatter_reduce(2, best, shown, "amax")
 
-    def note(self, scene: Scene, chosen: torch.Tensor) -> None:
+    def note(self, scene: TensorScene, chosen: torch.Tensor) -> None:
         """Remember which targets robots take, int64 [E, N], -1 = none."""
         place = chosen.clamp_min(0).view(*chosen.shape, 1, 1).expand(-1, -1, -1, 2)
         self.view.note(chosen, scene.points.gather(2, place).squeeze(2))

@@ -9,10 +9,10 @@ import numpy as np
 from maexp.envs.choices import CLASSICAL, rank
 
 from .frontiers import STRIDE
-from .scene import Scene
+from .scene import ArrayScene
 
 
-def rank_any(scene: Scene) -> np.ndarray:
+def rank_any(scene: ArrayScene) -> np.ndarray:
     """Each robot any target that it can get to, and that one again as long as it is there."""
     start = scene.rng.bit_generator.seed_seq.entropy
     draw = [
@@ -23,5 +23,5 @@ def rank_any(scene: Scene) -> np.ndarray:
     return rank(scene, np.reshape(draw, scene.travel.shape), np.isfinite(scene.travel))
 
 
-CHOICES: dict[str, Callable[[Scene], np.ndarray]] = {"random": rank_any} | CLASSICAL
-"""Name -> `Scene` to what each robot thinks of each target, float [n, K]; -inf: out of reach."""
+CHOICES: dict[str, Callable[[ArrayScene], np.ndarray]] = {"random": rank_any} | CLASSICAL
+"""Name -> `ArrayScene` to what each robot thinks of each target, float [n, K]; -inf: out of reach."""

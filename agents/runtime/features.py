@@ -11,7 +11,7 @@ from maexp.envs.features import AROUND, EDGE, NEAR, Moment, drive_until_next
 from maexp.kernels.constants import UNKNOWN
 
 from .in_turn import plan_in_turn
-from .scene import Scene
+from .scene import ArrayScene
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class Candidates:
     target: np.ndarray
 
 
-def list_candidates(scene: Scene, count: int, heading, speed, last, time_left: float, motion: Motion) -> Candidates:
+def list_candidates(
+    scene: ArrayScene, count: int, heading, speed, last, time_left: float, motion: Motion
+) -> Candidates:
     """The candidates of every robot of a scene with at least one target.
 
     Args:
@@ -67,7 +69,7 @@ def list_candidates(scene: Scene, count: int, heading, speed, last, time_left: f
     return Candidates(moment.features().astype(np.float32), mask, target)
 
 
-def _moment(scene: Scene, target, mask, value, heading, speed, last, time_left: float, motion: Motion) -> Moment:
+def _moment(scene: ArrayScene, target, mask, value, heading, speed, last, time_left: float, motion: Motion) -> Moment:
     """What features are made of; everyone hears everyone."""
     reach, point, gain, robots = scene.radar_range, scene.points[target], scene.gain[target], np.arange(len(target))
     own = np.eye(len(target), dtype=bool)

@@ -18,7 +18,7 @@ from maexp.envs.choices import rank
 from maexp.envs.features import FEATURES
 
 from .features import Candidates, Motion, list_candidates
-from .scene import Scene
+from .scene import ArrayScene
 from .shipped import CONTRACT
 
 FORMAT = "maexp-policy-2"
@@ -90,7 +90,7 @@ class LearnedChoice:
         }
         return self.session.run(["logits"], inputs)[0][0]
 
-    def rank(self, scene: Scene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
+    def rank(self, scene: ArrayScene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
         """What every robot thinks of every target, float [n, K]; the arguments of `list_candidates`.
 
         Targets that the policy was not shown come behind the others.

@@ -19,7 +19,7 @@ from .coarse import coarsen
 from .features import Motion
 from .folder import Contract, LearnedChoice
 from .grid import MAX_CELLS, KnownGrid, read_grid
-from .scene import Scene, look_at
+from .scene import ArrayScene, look_at
 from .sharing import Shares
 from .shipped import find_policy
 from .team import Team, read_team
@@ -174,7 +174,7 @@ class TeamPlanner:
         self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
         return self._finish(self._send_away(plan, team, scene, shares))
 
-    def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> Scene:
+    def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> ArrayScene:
         shift = self._shift(grid, notes)
         return look_at(grid, team, reach, self.clearance_factor, self.bounded, self.least_area, shift, self.rng, notes)
 
@@ -190,7 +190,7 @@ class TeamPlanner:
         x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
         return int(x), int(y)
 
-    def _choose(self, team: Team, scene: Scene, time_left: float) -> tuple[Shares, list[str]]:
+    def _choose(self, team: Team, scene: ArrayScene, time_left: float) -> tuple[Shares, list[str]]:
         """The target of each robot of the scene, and what happened."""
         notes = []
         allowed = self.watch.allowed(team, scene.robots, scene.targets)
@@ -218,7 +218,7 @@ class TeamPlanner:
         notes += self.watch.settle(team, scene.robots, scene.targets, travel, shares, scene.radar_range)
         return shares, notes
 
-    def _ask(self, team: Team, scene: Scene, time_left: float) -> np.ndarray:
+    def _ask(self, team: Team, scene: ArrayScene, time_left: float) -> np.ndarray:
         """What the policy thinks of each target for each robot of the scene, float [n, K]."""
         if self.learned is None:
             return CHOICES[str(self.policy)](scene)
@@ -228,7 +228,7 @@ class TeamPlanner:
         before = scene.grid.from_map(np.array(last))
         return self.learned.rank(scene, heading, team.speed[robots], before, time_left, self.motion)
 
-    def _send_away(self, plan: Plan, team: Team, scene: Scene, shares: Shares) -> Plan:
+    def _send_away(self, plan: Plan, team: Team, scene: ArrayScene, shares: Shares) -> Plan:
         """The plan with what robots do for which no target is left."""
         for robot in np.flatnonzero(np.isfinite(team.at).all(-1)):
             self.home.setdefault(team.names[robot], team.at[robot].copy())
@@ -243,7 +243,7 @@ class TeamPlanner:
             notes.append(f"{team.title(robot)} {does}: the others have the targets that are left")
         return replace(plan, notes=(*plan.notes, *notes))
 
-    def _way_home(self, team: Team, scene: Scene, row: int) -> np.ndarray | None:
+    def _way_home(self, team: Team, scene: ArrayScene, row: int) -> np.ndarray | None:
         """Corners of the way to where a robot was first seen, [k, 2]; None where it is there or gets nowhere near."""
         robot = scene.robots[row]
         home = self.home[team.names[robot]]
@@ -263,7 +263,7 @@ class TeamPlanner:
         return plan
 
 
-def _describe(team: Team, scene: Scene, chosen: np.ndarray, notes: list[str]) -> Plan:
+def _describe(team: Team, scene: ArrayScene, chosen: np.ndarray, notes: list[str]) -> Plan:
     """The plan of a choice, with a way to every goal."""
     plan = _stay(team, notes)
     for row, robot in enumerate(scene.robots):

@@ -24,7 +24,7 @@ UNREACHABLE = 1e12  # stands for no way where numbers must be finite [m]
 
 
 @dataclass(frozen=True)
-class Scene:
+class ArrayScene:
     """What targets are chosen from: n robots that take part, K targets, lengths on the grid in metres. Planners use it
     as a `maexp.envs.choices.Scene`.
 
@@ -100,7 +100,7 @@ class Scene:
         block = self.targets.block_of(ends % self.grid.width, ends // self.grid.width)
         return (self.targets.block[:, None] == block).all(-1).any(1)
 
-    def of(self, rows: np.ndarray) -> Scene:
+    def of(self, rows: np.ndarray) -> ArrayScene:
         """The scene for some of its robots, bool [n]."""
         passable = [mask for mask, kept in zip(self.passable, rows, strict=True) if kept]
         parts = {name: getattr(self, name)[rows] for name in ("robots", "at", "distance", "travel", "way", "near")}
@@ -117,7 +117,7 @@ def look_at(
     shift: tuple[int, int],
     rng: np.random.Generator,
     notes: list[str],
-) -> Scene:
+) -> ArrayScene:
     """Looks at the grid for the whole team.
 
     Args:
@@ -144,7 +144,7 @@ def look_at(
     way = np.where(way < UNREACHED, way * np.float32(grid.cell / STRAIGHT), np.float32(np.inf))
     at = grid.from_map(team.at[robots])
     beside = np.maximum(1.5 * grid.cell, clearance_factor * radius)[:, None]
-    return Scene(
+    return ArrayScene(
         grid=grid,
         radar_range=radar_range,
         robots=robots,

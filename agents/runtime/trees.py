@@ -9,10 +9,10 @@ import numpy as np
 from maexp.kernels.constants import FREE, UNKNOWN
 
 if TYPE_CHECKING:
-    from .scene import Scene
+    from .scene import ArrayScene
 
 
-def grow_trees(scene: Scene, samples: int, branch: float) -> np.ndarray:
+def grow_trees(scene: ArrayScene, samples: int, branch: float) -> np.ndarray:
     """Free cells where the branches of the robots' trees left what is known, int64 [n].
 
     Args:

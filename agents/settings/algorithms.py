@@ -7,7 +7,7 @@ from maexp.envs.fields import check_settings, replaced, setting
 
 
 @dataclass(frozen=True)
-class Settings:
+class AlgorithmSettings:
     """Settings that all algorithms share. A team step is one macro step of one team.
 
     ValueError where one is out of its range (all subclasses).
@@ -50,7 +50,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class ClippedSettings(Settings):
+class ClippedSettings(AlgorithmSettings):
     """Settings of the clipped algorithms."""
 
     epochs: int = setting(3, "passes over each batch", low=1)
@@ -72,12 +72,12 @@ class MixedClippedSettings(ClippedSettings):
     The advantage is the team's, with the noise of all robots in it: a shorter trace learned faster.
     """
 
-    lmbda: float = replaced(Settings, "lmbda", 0.8)
+    lmbda: float = replaced(AlgorithmSettings, "lmbda", 0.8)
     mixer: Literal["qmix", "vdn"] = setting("qmix", "how the robots' values make the team's, vdn or qmix")
 
 
 @dataclass(frozen=True)
-class TrustRegionSettings(Settings):
+class TrustRegionSettings(AlgorithmSettings):
     """Settings of the trust-region algorithms."""
 
     max_kl: float = setting(0.03, "bound on the mean divergence of a policy step", above=0)
@@ -92,23 +92,23 @@ class TrustRegionSettings(Settings):
 
 
 @dataclass(frozen=True)
-class ActorCriticSettings(Settings):
+class ActorCriticSettings(AlgorithmSettings):
     """Settings of advantage actor-critic: one pass, for its gradient is that of the acting policy.
 
     The pass is cut in minibatches, whose steps stay close to the policy that acted (logged as `kl`). Nothing bounds a
     step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
     """
 
-    lmbda: float = replaced(Settings, "lmbda", 0.8)
-    lr: float = replaced(Settings, "lr", 2e-3)
-    final_lr_share: float = replaced(Settings, "final_lr_share", 0.1)
-    entropy_coeff: float = replaced(Settings, "entropy_coeff", 5e-4)
+    lmbda: float = replaced(AlgorithmSettings, "lmbda", 0.8)
+    lr: float = replaced(AlgorithmSettings, "lr", 2e-3)
+    final_lr_share: float = replaced(AlgorithmSettings, "final_lr_share", 0.1)
+    entropy_coeff: float = replaced(AlgorithmSettings, "entropy_coeff", 5e-4)
     epochs: int = replaced(ClippedSettings, "epochs", 1)
     mixer: Literal["qmix", "vdn"] = replaced(MixedClippedSettings, "mixer", "qmix")
 
 
 @dataclass(frozen=True)
-class ExpertSettings(Settings):
+class ExpertSettings(AlgorithmSettings):
     """Settings of expert iteration, which has neither returns nor a critic."""
 
     minibatch_size: int = setting(64, "decisions of teams per gradient step", low=1)
@@ -140,7 +140,7 @@ class ExpertSettings(Settings):
     )
 
 
-def _reference(settings: Settings, **others) -> Settings:
+def _reference(settings: AlgorithmSettings, **others) -> AlgorithmSettings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
     shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
     shared |= dict(finite_horizon=False, mask_collided=False)
@@ -163,11 +163,11 @@ class Tunings:
     """
 
     name: str
-    default: Settings
-    reference: Settings
+    default: AlgorithmSettings
+    reference: AlgorithmSettings
     summary: str
 
-    def configure(self, tuning: str = "default", **overrides) -> Settings:
+    def configure(self, tuning: str = "default", **overrides) -> AlgorithmSettings:
         """The settings of a tuning ("default" or "reference") with some replaced.
 
         Raises:
@@ -182,7 +182,7 @@ class Tunings:
         return replace(getattr(self, tuning), **overrides)
 
 
-def _tunings(name: str, summary: str, settings: Settings, **reference) -> Tunings:
+def _tunings(name: str, summary: str, settings: AlgorithmSettings, **reference) -> Tunings:
     return Tunings(name, settings, _reference(settings, **reference), summary)
 
 

@@ -37,15 +37,6 @@ def check_distinct(name: str, values: Sequence) -> None:
         raise UserError(f"{name}={','.join(map(str, values))} names {twice} twice: give each once.")
 
 
-def check_goals(policies: Sequence[str], planner: str) -> None:
-    """Raise UserError where classical policies, which pick goals, meet a planner that takes controls."""
-    if policies and planner == "direct":
-        raise UserError(
-            f"planner=direct takes controls, and {', '.join(policies)} pick{'s' if len(policies) == 1 else ''} goals: "
-            "use planner=dwa or wavefront."
-        )
-
-
 def words_of(value: Any) -> list[str]:
     """The words of a setting that names one policy or several."""
     if value is None:

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from maexp.agents.settings.algorithms import Settings, find_tunings
+from maexp.agents.settings.algorithms import AlgorithmSettings, find_tunings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
 from maexp.agents.settings.env import env_settings, robot_config
@@ -106,7 +106,7 @@ def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in planner.items() if name not in PLANNER_LACKS.get(planner["name"], ())}
 
 
-def algorithm_settings(cfg: LearnerSettings) -> Settings:
+def algorithm_settings(cfg: LearnerSettings) -> AlgorithmSettings:
     """The settings of the algorithm."""
     given = {name: value for name, value in cfg.algorithm.items() if name != "name" and value is not None}
     return find_tunings(cfg.algorithm.name).configure(**given)

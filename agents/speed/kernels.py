@@ -29,7 +29,7 @@ from maexp.agents.speed.shared import (
     time_call,
     write_report,
 )
-from maexp.agents.tables import Cell, print_table
+from maexp.agents.tables import TableCell, print_table
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
 from maexp.kernels.observe import picture_shapes
@@ -305,7 +305,7 @@ def print_kernels(rows: list[dict], compared: bool) -> None:
         mine = [row for row in rows if row["stage"] == stage]
         cells += [kernel_cells(row, compared) for row in mine]
         total = sum(row["in_place_us"]["median"] / row["robots"] for row in mine)
-        cells.append([Cell(one, bold=True).terminal() for one in (f"= {stage}", f"{total:.3f}")])
+        cells.append([TableCell(one, bold=True).terminal() for one in (f"= {stage}", f"{total:.3f}")])
     if compared:
         columns.append("ratio")
         title += f"; ratio to the baseline, ! beyond {NOISE} and the spread"

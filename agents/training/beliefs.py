@@ -33,7 +33,7 @@ from maexp.envs.importing.report import ImportReport
 from maexp.envs.importing.sources import GridSource
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, default_macro_steps, find_scenario, split
-from maexp.envs.targets import Scene, keyed_uniform
+from maexp.envs.targets import TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 NEVER = 255  # a cell that does not get known
@@ -125,7 +125,7 @@ def import_plan(path: Path) -> PointCloudMap:
 def depart_at_random(env: ExplorationEnv, share: float) -> FrontierPlanner:
     """`cost_utility` as a policy that takes, in a share of its decisions, any target that can be reached."""
 
-    def rank(scene: Scene) -> torch.Tensor:
+    def rank(scene: TensorScene) -> torch.Tensor:
         own, draw = rank_by_utility(scene), keyed_uniform(env, scene.travel.shape[-1] + 1)
         others = torch.where(scene.travel.isfinite(), draw[..., 1:], -torch.inf)
         return torch.where(draw[..., :1] < share, others, own)

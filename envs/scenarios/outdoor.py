@@ -3,8 +3,6 @@
 Streets and blocks are laid out in bent street coordinates (u, v) [m], turned against the lattice, as towns are.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -23,7 +21,7 @@ STEEPEST = 0.3  # slope a car climbs
 Rect = tuple[float, float, float, float]  # u0, v0, u1, v1
 
 
-class Scene:
+class Landscape:
     """What stands where: `height` [m] above ground of the obstacle over each lattice point, NaN where free.
 
     Args:
@@ -74,7 +72,7 @@ class Scene:
 def build_outdoor(index: int, *, scenario: str) -> PointCloudMap:
     """Tile `index`: a town centre, a housing estate, a campus or open country at 1.5 to 2 m."""
     rng = make_generator(scenario, index)
-    scene = Scene(RESOLUTIONS[int(rng.integers(len(RESOLUTIONS)))], rng)
+    scene = Landscape(RESOLUTIONS[int(rng.integers(len(RESOLUTIONS)))], rng)
     theme = ("centre", "housing", "campus", "country")[int(rng.integers(4))]
     _lay_town(scene, _THEMES[theme])
     ground = _terrain(scene, 14.0 if theme == "country" else 6.0)
@@ -93,7 +91,7 @@ def build_outdoor(index: int, *, scenario: str) -> PointCloudMap:
     )
 
 
-def _terrain(scene: Scene, relief: float) -> np.ndarray:
+def _terrain(scene: Landscape, relief: float) -> np.ndarray:
     """Ground height [m] above the lowest point: hills of about 60 m and bumps of about 25 m across."""
     ground = np.zeros(scene.u.shape)
     for scale, share in ((60.0, 1.0), (25.0, 0.15)):
@@ -102,7 +100,7 @@ def _terrain(scene: Scene, relief: float) -> np.ndarray:
     return ground - ground.min()
 
 
-def _drivable(scene: Scene, ground: np.ndarray) -> np.ndarray:
+def _drivable(scene: Landscape, ground: np.ndarray) -> np.ndarray:
     """Free lattice points a car can get to: flat enough, wide enough, in one piece, inside the tile's edge."""
     slope = np.hypot(*np.gradient(ground, scene.resolution))
     free = np.isnan(scene.height) & (slope < STEEPEST)
@@ -123,7 +121,7 @@ def _street_lines(rng: np.random.Generator, spacing: tuple[float, float]) -> lis
     return lines
 
 
-def _lay_town(scene: Scene, theme: dict) -> None:
+def _lay_town(scene: Landscape, theme: dict) -> None:
     """Streets with their trees and parked cars, something in every block between them, at times a river."""
     rng = scene.rng
     across, along = _street_lines(rng, theme["spacing"]), _street_lines(rng, theme["spacing"])
@@ -141,7 +139,7 @@ def _lay_town(scene: Scene, theme: dict) -> None:
         _cut_river(scene, along)
 
 
-def _line_street(scene: Scene, position: float, half: float, swap: bool, cars: float) -> None:
+def _line_street(scene: Landscape, position: float, half: float, swap: bool, cars: float) -> None:
     """Trees on both sides of an avenue; cars parked along one side of a narrower street."""
     rng = scene.rng
     step = rng.uniform(12, 18)
@@ -157,7 +155,7 @@ def _line_street(scene: Scene, position: float, half: float, swap: bool, cars: f
             scene.box((car[1], car[0], car[3], car[2]) if swap else car, 1.5)
 
 
-def _cut_river(scene: Scene, along: list[tuple[float, float]]) -> None:
+def _cut_river(scene: Landscape, along: list[tuple[float, float]]) -> None:
     """A river across the tile; two streets in three cross it on a bridge."""
     rng = scene.rng
     middle = rng.uniform(-70, 70) + rng.uniform(5, 15) * np.sin(scene.v / rng.uniform(25, 45) + rng.uniform(0, 6))
@@ -171,7 +169,7 @@ def _cut_river(scene: Scene, along: list[tuple[float, float]]) -> None:
             scene.height[water & (np.abs(scene.v - position) < street)] = np.nan
 
 
-def _perimeter(scene: Scene, rect: Rect) -> None:
+def _perimeter(scene: Landscape, rect: Rect) -> None:
     """Closed block around a courtyard, entered through one or two gates."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, rng.uniform(1.5, 3))
@@ -198,7 +196,7 @@ def _perimeter(scene: Scene, rect: Rect) -> None:
         scene.box((middle - 5, court[1], middle + 5, court[1] + 0.5 * (court[3] - court[1])), rng.uniform(4, 8))
 
 
-def _slabs(scene: Scene, rect: Rect) -> None:
+def _slabs(scene: Landscape, rect: Rect) -> None:
     """Parallel slab buildings on a lawn with trees."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, rng.uniform(4, 7))
@@ -214,7 +212,7 @@ def _slabs(scene: Scene, rect: Rect) -> None:
     _trees(scene, rect, 0.003)
 
 
-def _houses(scene: Scene, rect: Rect) -> None:
+def _houses(scene: Landscape, rect: Rect) -> None:
     """Two rows of detached houses, hedges between the plots, trees in the gardens."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, 2)
@@ -240,7 +238,7 @@ def _houses(scene: Scene, rect: Rect) -> None:
     _trees(scene, (u0, v0 + 14, u1, v1 - 14), 0.006)
 
 
-def _terraces(scene: Scene, rect: Rect) -> None:
+def _terraces(scene: Landscape, rect: Rect) -> None:
     """Terraced houses along both long sides, walled gardens between, a passage at times."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, rng.uniform(3, 5))
@@ -254,7 +252,7 @@ def _terraces(scene: Scene, rect: Rect) -> None:
         scene.box((left, v0 + depth, right, v1 - depth), 1.8)
 
 
-def _big_hall(scene: Scene, rect: Rect) -> None:
+def _big_hall(scene: Landscape, rect: Rect) -> None:
     """One large building of one to three wings, the rest of the block a car park."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, rng.uniform(4, 8))
@@ -266,7 +264,7 @@ def _big_hall(scene: Scene, rect: Rect) -> None:
     _car_park(scene, (cut + 6, v0 + 22, rect[2], rect[3]))
 
 
-def _car_park(scene: Scene, rect: Rect) -> None:
+def _car_park(scene: Landscape, rect: Rect) -> None:
     """Double rows of parked cars with aisles of 8 m, a tree here and there."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, 3)
@@ -282,7 +280,7 @@ def _car_park(scene: Scene, rect: Rect) -> None:
         v += 18
 
 
-def _park(scene: Scene, rect: Rect) -> None:
+def _park(scene: Landscape, rect: Rect) -> None:
     """Lawn with groups of trees, a hedge around half of it, at times a pond."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, 3)
@@ -295,7 +293,7 @@ def _park(scene: Scene, rect: Rect) -> None:
             scene.disc(u + rng.uniform(-6, 6), v + rng.uniform(-6, 6), radius * rng.uniform(0.6, 1) + k, WATER)
 
 
-def _square(scene: Scene, rect: Rect) -> None:
+def _square(scene: Landscape, rect: Rect) -> None:
     """Open square with a large building (church, town hall) and rows of trees."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, 5)
@@ -309,7 +307,7 @@ def _square(scene: Scene, rect: Rect) -> None:
         scene.disc(w, v1, 1.2, 7.0)
 
 
-def _field(scene: Scene, rect: Rect) -> None:
+def _field(scene: Landscape, rect: Rect) -> None:
     """Open ground with a hedgerow on one or two sides and a lone tree."""
     rng = scene.rng
     u0, v0, u1, v1 = _shrink(rect, 2)
@@ -325,12 +323,12 @@ def _field(scene: Scene, rect: Rect) -> None:
     _trees(scene, rect, 0.0012)
 
 
-def _maize(scene: Scene, rect: Rect) -> None:
+def _maize(scene: Landscape, rect: Rect) -> None:
     """A field of maize: nothing drives through it or sees through it, but around it."""
     scene.box(_shrink(rect, scene.rng.uniform(3, 8)), 2.2)
 
 
-def _wood(scene: Scene, rect: Rect) -> None:
+def _wood(scene: Landscape, rect: Rect) -> None:
     """Trees with room to drive between them, thicker groves here and there."""
     rng = scene.rng
     inner = _shrink(rect, 3)
@@ -341,7 +339,7 @@ def _wood(scene: Scene, rect: Rect) -> None:
             scene.disc(u + du, v + dv, rng.uniform(1.5, 3), rng.uniform(6, 14))
 
 
-def _farm(scene: Scene, rect: Rect) -> None:
+def _farm(scene: Landscape, rect: Rect) -> None:
     """Barns around a yard, fields behind."""
     rng = scene.rng
     u, v = (rect[0] + rect[2]) / 2, (rect[1] + rect[3]) / 2
@@ -351,7 +349,7 @@ def _farm(scene: Scene, rect: Rect) -> None:
     _field(scene, rect)
 
 
-def _trees(scene: Scene, rect: Rect, density: float) -> None:
+def _trees(scene: Landscape, rect: Rect, density: float) -> None:
     """Scatter `density` trees a square metre over `rect`."""
     rng = scene.rng
     u0, v0, u1, v1 = rect
@@ -363,7 +361,6 @@ def _shrink(rect: Rect, margin: float) -> Rect:
     return rect[0] + margin, rect[1] + margin, rect[2] - margin, rect[3] - margin
 
 
-_Block = Callable[[Scene, Rect], None]
 _THEMES: dict[str, dict] = {
     "centre": {
         "spacing": (58, 88),

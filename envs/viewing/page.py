@@ -13,7 +13,7 @@ from maexp.envs.files import whole_file
 from maexp.envs.render import EXPLORED, OVERLAP, UNEXPLORED, WALL_SEEN, WALL_UNSEEN, percent
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at
-from maexp.envs.viewing.scene import Scene, Stage
+from maexp.envs.viewing.scene import DrawnScene, Stage
 from maexp.kernels.types import DT
 
 HOST = "127.0.0.1"  # this machine only: the page has no password
@@ -83,7 +83,7 @@ def stop_server(server) -> None:
 class Actors:
     """The nodes of a scene on a viser server, moved from scene to scene."""
 
-    def __init__(self, server, scene: Scene):
+    def __init__(self, server, scene: DrawnScene):
         self.server, self.labels = server, []
         add, scale = server.scene, np.asarray(scene.ground_size, dtype=np.float32)
         self.ground = add.add_batched_meshes_simple(
@@ -145,7 +145,7 @@ class Actors:
             receive_shadow=False,
         )
 
-    def show(self, scene: Scene, radar: bool = True) -> None:
+    def show(self, scene: DrawnScene, radar: bool = True) -> None:
         """Move everything to where it is in `scene`."""
         _change(self.ground, "batched_colors", _paint(scene.ground_colour))
         if self.walls is not None:
@@ -175,7 +175,7 @@ class Actors:
             node.points, node.colors = _floats(points), _linear(colours)
 
 
-def trail_lines(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def trail_lines(scene: DrawnScene) -> tuple[np.ndarray, np.ndarray]:
     """Line segments of the trails [S, 2, 3] and their colours, paler with age; at most about 50 a robot."""
     count = len(scene.trails)
     picked = np.unique(np.linspace(0, count - 1, min(count, 51)).round().astype(int))
@@ -187,7 +187,7 @@ def trail_lines(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return points.reshape(-1, 2, 3), colours.reshape(-1, 2, 3)
 
 
-def radar_lines(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def radar_lines(scene: DrawnScene) -> tuple[np.ndarray, np.ndarray]:
     """Circles of the radars' range as line segments [S, 2, 3], and their colours."""
     angle = np.linspace(0, 2 * np.pi, 49)
     circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
@@ -303,7 +303,7 @@ class Page:
             self._follow(scene, chosen)
             self.status.content = describe(snapshot, chosen)
 
-    def _follow(self, scene: Scene, chosen: int | None) -> None:
+    def _follow(self, scene: DrawnScene, chosen: int | None) -> None:
         """Move every camera along with the chosen robot."""
         if chosen is None or not self.follow.value:
             self._moved = None

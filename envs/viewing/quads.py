@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maexp.envs.viewing.scene import Scene
+from maexp.envs.viewing.scene import DrawnScene
 
 SHADES = {"top": 1.0, "south": 0.80, "east": 0.68, "west": 0.74, "north": 0.62}  # light from above, a little from -y
 _SIDES = {"south": (0, -1), "east": (1, 0), "north": (0, 1), "west": (-1, 0)}  # outward normals
@@ -42,7 +42,7 @@ class Quads:
         return Quads(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
 
-def make_quads(scene: Scene) -> Quads:
+def make_quads(scene: DrawnScene) -> Quads:
     """All quadrilaterals of a scene."""
     unit = float(np.ptp(np.stack(scene.bounds), axis=0).max()) / 400  # width of a line
     tile, across = 1.5 * float(scene.ground_size.max()), float(np.linalg.norm(np.ptp(np.stack(scene.bounds), axis=0)))
@@ -61,7 +61,7 @@ def make_quads(scene: Scene) -> Quads:
     return Quads.join(parts)
 
 
-def _ground(scene: Scene) -> Quads:
+def _ground(scene: DrawnScene) -> Quads:
     """The tiles, with sides where an obstacle beside them lies lower, as water in a canal does."""
     size = np.asarray(scene.ground_size, dtype=np.float64)
     offsets = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -81,7 +81,7 @@ def _quads(corners, colour, at, reach: float, layer: int) -> Quads:
     return Quads(corners, colour, at, np.full(len(corners), reach), np.full(len(corners), layer))
 
 
-def _columns(scene: Scene) -> Quads:
+def _columns(scene: DrawnScene) -> Quads:
     """Top and sides of the obstacles' columns; a side hidden by a neighbour that is as high is left out."""
     size, top = np.asarray(scene.wall_size, dtype=np.float64), scene.walls[:, 2] + scene.wall_height
     boxes = _boxes(scene.walls, np.column_stack([size, size, scene.wall_height]), scene.wall_colour)
@@ -116,7 +116,7 @@ def _boxes(feet, sizes, colours, heading=None, reach: float = 0.0, layer: int = 
     return [_quads(corners, shaded[name], feet[:, :2], reach, layer) for name, corners in faces.items()]
 
 
-def _robot(scene: Scene, i: int, tile: float) -> Quads:
+def _robot(scene: DrawnScene, i: int, tile: float) -> Quads:
     """A box on its heading, with a light arrow forward on its roof; a collided one has a light roof."""
     feet, body, heading = scene.robots[i : i + 1], scene.body[i : i + 1], scene.heading[i : i + 1]
     foot = feet + [0, 0, 0.1 * body[0, 2]]

@@ -16,7 +16,7 @@ _HEIGHT_RAMP = ((68, 84, 120), (96, 130, 160), (150, 178, 178), (210, 205, 170))
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class DrawnScene:
     """Coloured boxes and lines; colours are uint8 (..., 3), positions and sizes in metres, z up.
 
     Attributes:
@@ -90,7 +90,7 @@ class Stage:
         nearest = self._tree.query(np.nan_to_num(positions))[1]
         return np.concatenate([positions, self.ground[nearest][..., 2:]], axis=-1)
 
-    def empty(self) -> Scene:
+    def empty(self) -> DrawnScene:
         """The map alone; columns are coloured by their height where heights differ."""
         heights = self.walls[:, 2] + self.wall_height
         ramp, spread = np.array(_HEIGHT_RAMP, dtype=np.float64), float(np.ptp(heights)) if len(heights) else 0.0
@@ -99,7 +99,7 @@ class Stage:
         ground = np.tile(np.array(GROUND, dtype=np.uint8), (len(self.ground), 1))
         return self._scene(ground, np.rint(colours).astype(np.uint8), {})
 
-    def moment(self, snapshot: dict, robot: int | None = None) -> Scene:
+    def moment(self, snapshot: dict, robot: int | None = None) -> DrawnScene:
         """A moment of an episode; `robot`: only what this robot has seen counts as explored.
 
         Args:
@@ -129,7 +129,7 @@ class Stage:
             "radar_range": np.asarray(snapshot["radar_range"], dtype=np.float64),
         }
 
-    def _scene(self, ground_colour: np.ndarray, wall_colour: np.ndarray, moving: dict) -> Scene:
+    def _scene(self, ground_colour: np.ndarray, wall_colour: np.ndarray, moving: dict) -> DrawnScene:
         none = {
             "robots": np.zeros((0, 3)),
             "heading": np.zeros(0),
@@ -140,7 +140,7 @@ class Stage:
             "goals": np.zeros((0, 3)),
             "radar_range": np.zeros(0),
         }
-        return Scene(
+        return DrawnScene(
             ground=self.ground,
             ground_size=self.map.free_spacing,
             ground_colour=ground_colour,

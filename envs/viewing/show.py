@@ -15,7 +15,7 @@ from maexp.envs.files import whole_file
 from maexp.envs.render import draw_caption
 from maexp.envs.viewing.paint import Camera, look_at, paint
 from maexp.envs.viewing.quads import Quads, make_quads
-from maexp.envs.viewing.scene import Scene
+from maexp.envs.viewing.scene import DrawnScene
 
 RENDERERS = ("auto", "open3d", "painter")
 CAPTION = 20  # height of the letters below a picture [px]
@@ -27,13 +27,13 @@ def has_display() -> bool:
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def open_window(scene: Scene, title: str, **view) -> str | None:
+def open_window(scene: DrawnScene, title: str, **view) -> str | None:
     """An Open3D window, until it is closed; returns None, or why there was none."""
     camera = look_at(scene.bounds, 1200, 800, **view)
     return _run_open3d(make_quads(scene), camera, title, None)
 
 
-def draw_scene(scene: Scene, width: int = 1200, renderer: str = "auto", **view) -> tuple[np.ndarray, str]:
+def draw_scene(scene: DrawnScene, width: int = 1200, renderer: str = "auto", **view) -> tuple[np.ndarray, str]:
     """A picture of a scene, uint8 (height, width, 3), and a sentence on what drew it.
 
     Args:
