@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
-from maexp.agents.algorithms.table import TRAININGS, find_algorithm
+from maexp.agents.algorithms.catalogue import TRAININGS, find_algorithm
 from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
 from maexp.agents.networks.actor import make_policy

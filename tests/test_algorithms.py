@@ -9,8 +9,8 @@ from torchrl.collectors import Collector
 from toy_env import ToyEnv
 
 from maexp.agents import ALGORITHMS, make_critic, make_loss, make_policy
+from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.algorithms.losses import NonFiniteLoss
-from maexp.agents.algorithms.table import find_algorithm
 from maexp.agents.settings.model import ModelConfig
 
 TINY = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)

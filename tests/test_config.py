@@ -7,7 +7,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from maexp.agents.algorithms.table import ALGORITHMS, TRAININGS
+from maexp.agents.algorithms.catalogue import ALGORITHMS, TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings
 from maexp.agents.errors import UserError
 from maexp.agents.settings.compose import compose_config, group_choices, groups

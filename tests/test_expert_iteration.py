@@ -9,8 +9,8 @@ from test_train import TINY, assert_same_runs, resume, run
 from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy
+from maexp.agents.algorithms.catalogue import TRAININGS
 from maexp.agents.algorithms.expert import ADVANTAGE, TRIED
-from maexp.agents.algorithms.table import TRAININGS
 from maexp.agents.cli import main
 from maexp.agents.networks.actor import ALIVE, COMM, PREFERENCE, TARGETS, TARGETS_MASK
 from maexp.agents.policies import POLICIES

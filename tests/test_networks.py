@@ -9,7 +9,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_policy
-from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.networks.actor import CELLS, MAP
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE, build_critic
 from maexp.agents.networks.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling

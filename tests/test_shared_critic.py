@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from maexp.agents.algorithms.advantages import write_advantages
-from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.networks import target_chooser
 from maexp.agents.networks.actor import COMM, SEEN, TARGETS, TARGETS_MASK, make_policy

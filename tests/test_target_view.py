@@ -8,7 +8,7 @@ from oracle.targets import columns as oracle_columns
 from torchrl.envs.utils import check_env_specs, step_mdp
 from worlds import ways_to_blocks
 
-from maexp.agents.algorithms.table import find_algorithm
+from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import ModelConfig

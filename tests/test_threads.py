@@ -8,8 +8,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from maexp.agents import make_policy
+from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.algorithms.losses import NonFiniteLoss
-from maexp.agents.algorithms.table import find_algorithm
 from maexp.agents.algorithms.threads import at_once
 from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.settings.model import ModelConfig

@@ -6,7 +6,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from toy_env import ToyEnv
 
 from maexp.agents import make_policy
-from maexp.agents.algorithms.table import ALGORITHMS, make_critic, make_loss
+from maexp.agents.algorithms.catalogue import ALGORITHMS, make_critic, make_loss
 from maexp.agents.algorithms.trust_region import TRPO, conjugate_gradient, flatten
 from maexp.agents.settings.model import ModelConfig
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from maexp.agents.algorithms.table import TRAININGS
+from maexp.agents.algorithms.catalogue import TRAININGS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES

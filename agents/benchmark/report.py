@@ -8,8 +8,7 @@ import numpy as np
 from maexp.agents.benchmark.cell import VALIDATION, finished, read_result
 from maexp.agents.benchmark.differences import differences_markdown, differences_text, subtract
 from maexp.agents.benchmark.paper_results import paper_value
-from maexp.agents.benchmark.plan import SUITES, Cell, as_list, is_learned, training_cell
-from maexp.agents.benchmark.table import (
+from maexp.agents.benchmark.paper_table import (
     Column,
     pool_column,
     print_tables,
@@ -17,6 +16,7 @@ from maexp.agents.benchmark.table import (
     table_latex,
     table_markdown,
 )
+from maexp.agents.benchmark.plan import SUITES, Cell, as_list, is_learned, training_cell
 from maexp.agents.evaluation.comparison import find_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, join, pool
 from maexp.agents.files import short, write_json, write_text

@@ -8,8 +8,7 @@ import pytest
 from rich.console import Console
 
 from maexp.agents.benchmark.differences import differences_markdown, differences_text, subtract
-from maexp.agents.benchmark.plan import Cell
-from maexp.agents.benchmark.table import (
+from maexp.agents.benchmark.paper_table import (
     ROWS,
     best,
     best_columns,
@@ -20,6 +19,7 @@ from maexp.agents.benchmark.table import (
     table_latex,
     table_markdown,
 )
+from maexp.agents.benchmark.plan import Cell
 from maexp.agents.evaluation.comparison import find_best
 from maexp.agents.evaluation.evaluate import EvaluationResult
 
