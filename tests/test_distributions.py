@@ -13,7 +13,7 @@ from toy_env import ToyEnv
 from maexp.agents import ModelConfig, make_critic, make_loss, make_policy
 from maexp.agents.algorithms.advantages import write_advantages
 from maexp.agents.networks.actor import REGION_HEADS
-from maexp.agents.networks.distributions import OFFSET, REGION, Heads, RegionHeads
+from maexp.agents.networks.distributions import OFFSET, REGION, Heads, RegionHeads, divergence
 
 TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 BATCH, ROBOTS, REGIONS = 5, 3, 7
@@ -157,3 +157,12 @@ def test_heads_without_regions_are_plain():
     assert torch.equal(dist.mode["agents", "action", "control"], loc)
     torch.testing.assert_close(dist.entropy(), torch.distributions.Normal(loc, scale).entropy().sum(-1))
     assert isinstance(RegionHeads(parameters(0), REGION_HEADS).region, Categorical)
+
+
+def test_divergence_stays_finite_where_a_probability_vanishes():
+    """KL from the logits by hand in float64; torch's own is infinite where float32 has no such small probability."""
+    before, now = torch.tensor([[0.0, -95.0, -1e9]]), torch.tensor([[-120.0, 0.0, -1e9]])
+    p, q = (one.double().log_softmax(-1) for one in (before, now))
+    expected = (p.exp() * (p - q)).sum(-1)
+    found = divergence(Categorical(logits=before), Categorical(logits=now))
+    torch.testing.assert_close(found.double(), expected)

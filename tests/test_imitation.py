@@ -15,6 +15,7 @@ from maexp.agents.cli import main
 from maexp.agents.networks.actor import ALIVE, MAP
 from maexp.agents.networks.distributions import OFFSET as OFFSET_KEY
 from maexp.agents.networks.distributions import REGION
+from maexp.agents.policies.load import load_chooser
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.checkpoint import find_checkpoint, load_checkpoint
 from maexp.agents.training.imitation import imitate, negative_log_likelihood
@@ -149,6 +150,21 @@ def test_a_trained_team_of_another_size_of_network_is_a_teacher_too():
     teacher = run("teacher", "total_frames=6", "warm_start=null")
     folder = run("pupil", "total_frames=6", f"warm_start={teacher}", "model.channels=8")
     assert (folder / "warm_start.csv").is_file()
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "expert_iteration"])
+def test_a_teacher_with_the_same_network_hands_over_its_weights(algorithm, capsys):
+    words = ["action=targets", "warm_start=universal", f"algorithm={algorithm}", "total_frames=6"]
+    folder = run("learned_on", *words)
+    assert "The policy begins with the weights of universal." in capsys.readouterr().out
+    own = load_chooser("universal")[0].state_dict()
+    first = load_checkpoint(folder / "checkpoints" / "iteration_000000.pt")["policy"]
+    begun = {name: value for name, value in first.items() if name.endswith(tuple(own))}
+    assert len(begun) == len(own)
+    assert all(torch.equal(value, next(own[end] for end in own if name.endswith(end))) for name, value in begun.items())
+    assert (folder / "warm_start.csv").is_file() == (algorithm == "mappo"), "what has no critic need not watch"
+    other = run("imitated", *words, "model.score_weight=20")
+    assert (other / "warm_start.csv").is_file(), "the same sizes, and another network"
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,8 @@ class ExpertUpdater(Updater):
         memory: the decisions that were branched at, by the number of robots.
     """
 
+    uses_critic = False
+
     def __init__(self, loss, settings):
         super().__init__(loss, settings)
         self.memory: dict[int, TensorDict] = {}

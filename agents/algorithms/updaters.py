@@ -48,6 +48,8 @@ class Updater:
         settings: the algorithm's settings
     """
 
+    uses_critic = True
+
     def __init__(self, loss, settings):
         self.loss = loss
         self.settings = settings

@@ -51,7 +51,7 @@ class Heads(Distribution):
     def divergence_from(self, params: TensorDictBase) -> Tensor:
         """KL(policy with `params` || this one) over the whole action, shape [*, robots]."""
         before = type(self)(params, self.heads)
-        return sum(kl_divergence(before.dists[key], head) for key, head in self.dists.items())
+        return sum(divergence(before.dists[key], head) for key, head in self.dists.items())
 
     def _pack(self, values: dict, lead: Size = Size()) -> TensorDict:  # noqa: B008
         return TensorDict(values, batch_size=[*lead, *self.batch_shape])
@@ -111,5 +111,13 @@ class RegionHeads(Heads):
 
     def divergence_from(self, params: TensorDictBase) -> Tensor:
         before = type(self)(params, self.heads)
-        offsets = (before.region.probs * kl_divergence(before.within, self.within)).sum(-1)
-        return kl_divergence(before.region, self.region) + offsets
+        offsets = (before.region.probs * divergence(before.within, self.within)).sum(-1)
+        return divergence(before.region, self.region) + offsets
+
+
+def divergence(before: Distribution, now: Distribution) -> Tensor:
+    """KL(before || now). Of choices from their logits: torch's is infinite where a probability is too small for
+    float32."""
+    if isinstance(now, Categorical):
+        return (before.probs * (before.logits - now.logits)).sum(-1)
+    return kl_divergence(before, now)

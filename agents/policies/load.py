@@ -65,6 +65,15 @@ def load_chooser(word: str, setting: str = "policy") -> tuple[TargetChooser, int
     return chooser, contract.candidates
 
 
+def read_model(word: str, setting: str = "policy") -> ModelConfig:
+    """Sizes of a trained policy's network.
+
+    Raises:
+        UserError: it is unknown, damaged, or of another kind.
+    """
+    return _read_network(*open_policy(word, setting))[0]
+
+
 def _read_network(folder: Path, contract: Contract) -> tuple[ModelConfig, dict[str, Tensor]]:
     """Settings and weights of a policy's network; UserError where they do not fit each other."""
     from safetensors import SafetensorError

@@ -1,6 +1,6 @@
 """Sizes of the networks: the dataclass, and those that have a name."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from maexp.envs.fields import check_settings, setting
@@ -53,6 +53,16 @@ class ModelConfig:
     def width(self) -> int:
         """Features per cell (D in the paper)."""
         return self.channels + self.grid_features
+
+    @property
+    def policy(self) -> dict[str, object]:
+        """What a policy's network is made from: two policies that agree in this can take each other's weights."""
+        if self.action == "targets":
+            names = ("action", "target_width", "target_heads", "score_weight")
+        else:
+            critics = ("target_width", "target_heads", "score_weight", "critic_hidden", "critic_encoder")
+            names = tuple(one.name for one in fields(self) if one.name not in critics)
+        return {name: getattr(self, name) for name in names}
 
 
 SIZES = {

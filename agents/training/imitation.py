@@ -2,7 +2,8 @@
 
 The teacher acts, any policy that takes the same env: the policy learns by supervision to give its actions a high
 probability, and the critic what they earn. Each batch is looked at a few times and forgotten, so that memory does
-not grow. Afterwards the algorithm may keep the policy near what it has become (`algorithm.anchor_coeff`).
+not grow. A teacher whose network is the policy's gives it its weights; only the critic has to learn then. Afterwards
+the algorithm may keep the policy near what it has become (`algorithm.anchor_coeff`).
 """
 
 import copy
@@ -20,6 +21,7 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.networks.actor import ALIVE
 from maexp.agents.networks.distributions import ACTION
+from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.resolved import model_settings
@@ -67,22 +69,41 @@ def _check_kind(cfg: TrainSettings, taught: str | None) -> None:
 def warm_start(run: TrainingRun) -> None:
     """Let the policy and critic of a `TrainingRun` that has not begun imitate; the log is `warm_start.csv`."""
     cfg, updater = run.cfg, run.learner.updater
+    taken = take_weights(run)
+    if taken:
+        print(f"The policy begins with the weights of {cfg.warm_start}.", flush=True)
+    if taken and not updater.uses_critic:
+        run.experience.update_policy_weights_()
+        return
     optimizer = torch.optim.Adam(run.learner.policy.parameters(), lr=LEARNING_RATE, eps=1e-5)
     rounds, rows = math.ceil(cfg.warm_start_frames / run.batch_frames), []
-    with Progress(f"imitating {cfg.warm_start}", rounds * run.batch_frames) as progress:
+    with Progress(f"{'watching' if taken else 'imitating'} {cfg.warm_start}", rounds * run.batch_frames) as progress:
         for number, batches in enumerate(demonstrate(run, rounds), start=1):
             meter = Meter()
             steps = [updater.prepare(batch) for batch in batches]
             for _ in range(PASSES):
-                imitate(run.learner, optimizer, steps, meter)
+                if not taken:
+                    imitate(run.learner, optimizer, steps, meter)
                 updater.learn_values(steps, meter)
             row = {"frames": number * run.batch_frames, "coverage": batch_statistics(*batches)["coverage"]}
             rows.append(row | meter.means())
-            progress.show(row["frames"], f"negative log-likelihood {rows[-1]['nll']:.2f}")
+            progress.show(row["frames"], "" if taken else f"negative log-likelihood {rows[-1]['nll']:.2f}")
     lines = [",".join(rows[0]), *(",".join(f"{value:.6g}" for value in row.values()) for row in rows)]
     write_text(run.folder / LOG, "\n".join(lines) + "\n")
     updater.set_anchor()
     run.experience.update_policy_weights_()
+
+
+def take_weights(run: TrainingRun) -> bool:
+    """Give the policy of `run` its teacher's weights, where both have the same network; else False."""
+    cfg = run.cfg
+    teacher = find_player(cfg.warm_start, "warm_start")
+    if teacher.model is None or teacher.model.policy != model_settings(cfg).policy:
+        return False
+    with blame_input():
+        env = make_env(cfg, run.suite.train[:1], run.sizes[0], 1, device=choose_device(cfg, "train_device"))
+        load_matching(run.learner.policy, teacher.make(env).state_dict())
+    return True
 
 
 def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]:

@@ -18,11 +18,12 @@ from maexp.agents.checksums import warn_of_changed_maps
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import STARTS
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
-from maexp.agents.policies.load import is_exported, load_policy_folder, open_policy
+from maexp.agents.policies.load import is_exported, load_policy_folder, open_policy, read_model
 from maexp.agents.policies.names import describe_unknown, plug_ins
 from maexp.agents.policies.own import find_own, is_foreign, is_reference, make_own, source_of
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.groups import CommonSettings
+from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.resolved import flatten
 from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, model_of, restore_policy
 from maexp.envs import ExplorationEnv, PointCloudMap
@@ -45,6 +46,7 @@ class Player:
         direct: whether it gives controls (planner=direct) and no goals; None: not known.
         source: text that changes with the policy itself, "" for what comes with the package.
         saved: the checkpoint that it comes from.
+        model: sizes of its network, of a trained one.
         found: what one's own word stands for.
     """
 
@@ -58,6 +60,7 @@ class Player:
     source: str = ""
     saved: dict[str, Any] | None = field(default=None, repr=False)
     found: Callable | None = None
+    model: ModelConfig | None = None
 
     @property
     def learned(self) -> bool:
@@ -117,6 +120,7 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
         "exported",
         targets=contract.candidates,
         source=str(contract.content["sha256"]),
+        model=read_model(word, setting),
     )
 
 
@@ -134,6 +138,7 @@ def _from_checkpoint(word: str, name: str) -> Player:
         direct=direct,
         source=f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
         saved=saved,
+        model=model,
     )
 
 
