@@ -21,8 +21,9 @@ from maexp.agents.evaluation.begun import is_begun
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import write_json, write_text
 from maexp.agents.locking import lock
+from maexp.agents.measures import MEASURES, Measure
 from maexp.agents.settings.overrides import quote, split_paths
-from maexp.agents.tables import POINTS, estimate, fixed, markdown_table
+from maexp.agents.tables import markdown_table
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.scenarios import SCENARIOS
 
@@ -47,18 +48,18 @@ CONDITIONS = {
     "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5", *RADAR, *ODOMETRY),
 }
 """Name -> words of `maexp evaluate`; the others are compared with the first."""
-METRICS = {
-    "coverage_auc": ("over time", 100.0, 1),
-    "base_coverage_auc": ("base over time", 100.0, 1),
-    "worst_coverage_auc": ("worst over time", 100.0, 1),
-    "coverage_step_95_censored": ("steps to 95 %", 1.0, 0),
-    "told_step_95_censored": ("steps to all know 95 %", 1.0, 0),
-    "mutual_overlap_85": ("overlap [%]", 100.0, 0),
-    "connected": ("connected [%]", 100.0, 0),
-    "odometry_error": ("off [m]", 1.0, 2),
-    "collisions": ("lost", 1.0, 2),
-}
-"""Metric -> column, factor and digits."""
+METRICS = (
+    "coverage_auc",
+    "base_coverage_auc",
+    "worst_coverage_auc",
+    "coverage_step_95_censored",
+    "told_step_95_censored",
+    "mutual_overlap_85",
+    "connected",
+    "odometry_error",
+    "collisions",
+)
+"""Columns of the table."""
 PLAN, TABLE, FORMAT = "conditions.json", "conditions.md", "maexp-conditions-1"
 
 
@@ -147,25 +148,24 @@ def read(config: ConditionsConfig, scenario: str, team: int, condition: str) -> 
 
 def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
     """Markdown; `found`: condition -> policy -> its episodes, the first condition first."""
-    shown = [name for name in METRICS if any(name in one.episodes for row in found.values() for one in row.values())]
-    heads = ["condition", "policy", "to the first [points]", *(METRICS[name][0] for name in shown)]
+    played = {name for row in found.values() for one in row.values() for name in one.episodes}
+    shown = [MEASURES[name] for name in METRICS if name in played]
+    heads = ["condition", "policy", "to the first [points]", *(f"{one.column} [{one.unit}]" for one in shown)]
     rows = []
     first = next(iter(found.values()), {})
     for condition, row in found.items():
         for policy, one in row.items():
-            apart = (
-                ""
-                if row is first or policy not in first
-                else estimate(one.minus(first[policy])["coverage_auc"], POINTS)
-            )
+            apart = ""
+            if row is not first and policy in first:
+                apart = MEASURES["coverage_auc"].difference(one.minus(first[policy])["coverage_auc"])
             summary = one.summary()
-            rows.append([condition, f"`{policy}`", apart, *(_mean(name, summary) for name in shown)])
+            rows.append([condition, f"`{policy}`", apart, *(_mean(measure, summary) for measure in shown)])
     return "\n".join([f"**{title}**", "", *markdown_table(heads, rows)])
 
 
-def _mean(name: str, summary: dict[str, dict]) -> str:
-    _, factor, digits = METRICS[name]
-    return fixed(digits, factor)(summary[name]["mean"]) if name in summary and summary[name]["n"] else ""
+def _mean(measure: Measure, summary: dict[str, dict]) -> str:
+    found = summary.get(measure.metric, {"n": 0})
+    return measure.write(found["mean"]) if found["n"] else ""
 
 
 def read_config(words: list[str]) -> ConditionsConfig:

@@ -70,9 +70,9 @@ def test_changes_are_paired_and_maps_have_their_own(saved):
     for name in list(found)[:3]:
         assert found[name]["coverage_auc"]["ci95"] == [pytest.approx(0.1)] * 2
     assert found["voronoi on b N=3"]["coverage_auc"]["n"] == 5 and found["voronoi N=2"]["coverage_auc"]["n"] == 10
-    assert describe_changes({"voronoi N=2": found["voronoi N=2"]}, saved) == [
+    assert describe_changes({"voronoi N=2": found["voronoi N=2"]}, saved, 0.95) == [
         f"voronoi N=2 less {saved}: -10.0 points of coverage over time [-10.0, -10.0], "
-        "+0 steps to 95 % [+0, +0], +0.00 robots lost [+0.00, +0.00]."
+        "+0 steps to 95 % [+0, +0], +0.000 robots lost [+0.000, +0.000]."
     ]
 
 

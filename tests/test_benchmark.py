@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from metrics_file import read_metrics
 from omegaconf import OmegaConf
 from tiny_benchmark import CELLS, TINY, settings
 
@@ -24,7 +25,6 @@ from maexp.agents.benchmark.plan import (
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.locking import lock
-from maexp.agents.training.logs import read_metrics
 
 pytestmark = pytest.mark.slow  # trainings
 

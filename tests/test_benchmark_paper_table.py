@@ -22,6 +22,7 @@ from maexp.agents.benchmark.paper_table import (
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.evaluation.comparison import find_best
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.measures import MEASURES
 
 
 def column(policy: str, seed: int = 0, **values: list[float]):
@@ -34,7 +35,7 @@ def column(policy: str, seed: int = 0, **values: list[float]):
 
 ZERO = {"mean": 0.0, "ci95": [0.0, 0.0]}
 APART = {"ippo": {row.metric: ZERO for row in ROWS} | {"collisions": ZERO}}
-ER, CS = (next(row for row in ROWS if row.label == label) for label in ("ER", "CS85"))
+ER, CS = MEASURES["exploration_ratio"], MEASURES["coverage_step_85"]
 
 
 def test_best_goes_by_direction_and_by_what_is_printed():
@@ -88,8 +89,8 @@ def test_rows_of_99_percent_stand_where_episodes_go_on_until_then(tables):
         assert text.count("\n| CS99") == text.count("\n| to 99") == 2 * count
         assert (" CS99 " in out.getvalue()) == bool(count)
         assert latex.count("& CS99") == 2 * count and rf"\multirow{{{3 * (8 + 2 * count)}}}" in latex
-        assert ("to 99, steps" in differences_markdown("voronoi", APART, goal)) == bool(count)
-        assert ("to 99, steps" in differences_text("maze", "voronoi", APART, goal)[1]) == bool(count)
+        assert ("steps to 99 %" in differences_markdown("voronoi", APART, goal)) == bool(count)
+        assert ("steps to 99 %" in differences_text("maze", "voronoi", APART, goal)[1]) == bool(count)
 
 
 def test_the_terminals_table_fits_100_columns(tables):
@@ -124,7 +125,7 @@ def test_differences_are_of_the_same_episodes_and_resample_the_seeds_of_training
     assert found["mean"] == pytest.approx(0.0) and found["ci95"] == [pytest.approx(-0.1), pytest.approx(0.1)]
     assert subtract([played("ippo", [0.5, 0.5], 7)], planner) == {}
     text = differences_markdown("voronoi", {"ippo": subtract(alike, planner)})
-    assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.00 [+0.00, +0.00] |" in text
+    assert "| ippo | +10.0 [+10.0, +10.0] | -10 [-10, -10] | +0.000 [+0.000, +0.000] |" in text
 
 
 def test_copies_of_an_episode_are_told_and_give_no_interval():
@@ -140,7 +141,7 @@ def test_copies_of_an_episode_are_told_and_give_no_interval():
     means = {"one": 0.6, "two": 0.5}
     pairs = [[played(name, [mean] * 3, seed, ["a"] * 3) for seed in (0, 1)] for name, mean in means.items()]
     text = differences_markdown("two", {"one": subtract(*pairs)})
-    assert "| one | +10.0 | -10 | +0.00 |" in text
+    assert "| one | +10.0 | -10 | +0.000 |" in text
 
 
 def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from metrics_file import read_metrics
 
 from maexp.agents.build import load_maps
 from maexp.agents.cli import main
@@ -20,7 +21,7 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.collect import Teams, WorkerLost, batch_statistics, divide_teams
-from maexp.agents.training.logs import read_metrics, tag
+from maexp.agents.training.logs import tag
 from maexp.agents.training.train import make_both
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.metrics import episode_metrics

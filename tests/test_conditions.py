@@ -32,8 +32,8 @@ def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):
     rows = [line.split(" | ") for line in text.splitlines() if "`cost_utility`" in line]
     assert [row[0] for row in rows] == ["| perfect", "| base_return"]
     heads = next(line for line in text.splitlines() if line.startswith("| condition")).split(" | ")
-    base = heads.index("base over time")
-    assert rows[0][base] == "" and 5.0 < float(rows[1][base]) < float(rows[1][heads.index("over time")])
+    base = heads.index("base over time [%]")
+    assert rows[0][base] == "" and 5.0 < float(rows[1][base]) < float(rows[1][heads.index("over time [%]")])
     assert rows[0][2] == "" and rows[1][2].startswith(("+", "-"))
     played = []
     monkeypatch.setattr(cli, "main", lambda argv: played.append(argv) or 0)

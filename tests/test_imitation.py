@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from metrics_file import read_metrics
 from test_train import TINY, assert_same
 from toy_env import OFFSET, ToyEnv
 
@@ -19,7 +20,6 @@ from maexp.agents.policies.load import load_chooser
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.checkpoint import find_checkpoint, load_checkpoint
 from maexp.agents.training.imitation import imitate, negative_log_likelihood
-from maexp.agents.training.logs import read_metrics
 
 pytestmark = pytest.mark.slow  # trainings
 

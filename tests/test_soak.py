@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+from metrics_file import read_metrics
 
 from maexp.agents.training.checkpoint import find_checkpoint
-from maexp.agents.training.logs import read_metrics
 
 SECONDS = float(os.environ.get("MAEXP_SOAK_SECONDS", 30))
 WORDS = [

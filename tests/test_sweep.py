@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from metrics_file import read_metrics
 
 from maexp.agents.cli import main
 from maexp.agents.commands import evaluate as command
 from maexp.agents.evaluation import comparison
 from maexp.agents.evaluation.once import keeping_episodes, play_once
 from maexp.agents.training.checkpoint import find_checkpoint
-from maexp.agents.training.logs import MetricsLog, read_metrics
+from maexp.agents.training.logs import MetricsLog
 from maexp.envs import ExplorationEnv, make_map
 
 pytestmark = pytest.mark.slow  # trainings

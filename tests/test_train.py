@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from metrics_file import read_metrics
 
 from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
 from maexp.agents.commands.train import draw_rollout
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
-from maexp.agents.training.logs import MetricsLog, read_metrics
+from maexp.agents.training.logs import MetricsLog
 from maexp.envs import make_map
 
 pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands

@@ -2,17 +2,10 @@
 
 from maexp.agents.benchmark.plan import Cell
 from maexp.agents.evaluation.evaluate import EvaluationResult, join
-from maexp.agents.tables import estimate, fixed, markdown_table
-from maexp.envs.metrics import in_reach
+from maexp.agents.measures import compared
+from maexp.agents.tables import markdown_table
 
 Played = list[tuple[Cell, EvaluationResult]]
-SHOWN = (
-    ("coverage_auc", "AUC, points", 100, 1),
-    ("coverage_step_95_censored", "to 95, steps", 1, 0),
-    ("coverage_step_99_censored", "to 99, steps", 1, 0),
-    ("collisions", "robots lost", 1, 2),
-)
-"""Metric, title, scale and digits of what is shown of a difference."""
 
 
 def subtract(one: Played, other: Played) -> dict[str, dict]:
@@ -23,9 +16,8 @@ def subtract(one: Played, other: Played) -> dict[str, dict]:
 
 
 def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:
-    """{title: +1.2 [0.3, 2.1]} of the metrics in `SHOWN` that episodes reach which end at the coverage `goal`."""
-    shown = [row for row in SHOWN if in_reach(row[0], goal)]
-    return {title: estimate(found[metric], fixed(digits, scale, "+")) for metric, title, scale, digits in shown}
+    """{words: +1.2 [0.3, 2.1]} of what is compared of episodes that end at the coverage `goal`."""
+    return {one.words: one.difference(found[one.metric]) for one in compared(goal)}
 
 
 def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) -> str:

@@ -12,6 +12,7 @@ from rich.text import Text
 from maexp.agents.benchmark.paper_results import paper_value
 from maexp.agents.evaluation.evaluate import EvaluationResult, join
 from maexp.agents.evaluation.evidence import Evidence, describe_evidence
+from maexp.agents.measures import MEASURES, Measure
 from maexp.agents.tables import (
     NONE,
     TableCell,
@@ -26,39 +27,7 @@ from maexp.agents.tables import (
 )
 from maexp.envs.metrics import in_reach
 
-
-@dataclass(frozen=True)
-class Row:
-    """A metric of the table: its name, which way is better (1: up, -1: down), and how it is printed."""
-
-    metric: str
-    label: str
-    unit: str
-    better: int
-    scale: float
-    digits: int
-
-    @property
-    def title(self) -> str:
-        arrow = "↑" if self.better > 0 else "↓"
-        return f"{self.label}{f' {self.unit}' if self.unit else ''} {arrow}"
-
-    def number(self, value: float) -> str:
-        return fixed(self.digits, self.scale)(value)
-
-
-ROWS = (
-    Row("exploration_ratio", "ER", "%", 1, 100, 1),
-    Row("coverage_auc", "AUC", "%", 1, 100, 1),
-    Row("coverage_step_85", "CS85", "steps", -1, 1, 0),
-    Row("coverage_step_95", "CS95", "steps", -1, 1, 0),
-    Row("coverage_step_95_censored", "to 95", "steps", -1, 1, 0),
-    Row("coverage_step_99", "CS99", "steps", -1, 1, 0),
-    Row("coverage_step_99_censored", "to 99", "steps", -1, 1, 0),
-    Row("mutual_overlap_85", "MO85", "%", -1, 100, 1),
-    Row("mutual_overlap_95", "MO95", "%", -1, 100, 1),
-    Row("reward_variance", "RV", "", -1, 1, 0),
-)
+ROWS = [one for one in MEASURES.values() if one.symbol]
 SHOWN = ("ER", "AUC", "CS85", "CS95", "to 95", "MO85")  # on the terminal, where there is room for six
 SHOWN_TO_THE_END = ("ER", "AUC", "CS95", "to 95", "CS99", "to 99")
 ORACLE = "oracle"
@@ -77,16 +46,16 @@ NOTES = (
 )
 
 
-def rows_for(goal: float) -> list[Row]:
+def rows_for(goal: float) -> list[Measure]:
     """The rows of a table of episodes that end at the coverage `goal`."""
     return [row for row in ROWS if in_reach(row.metric, goal)]
 
 
-def shown_for(goal: float) -> list[Row]:
+def shown_for(goal: float) -> list[Measure]:
     """Those that the terminal has room for."""
     rows = rows_for(goal)
-    labels = SHOWN_TO_THE_END if any(row.label == "CS99" for row in rows) else SHOWN
-    return [row for row in rows if row.label in labels]
+    labels = SHOWN_TO_THE_END if any(row.symbol == "CS99" for row in rows) else SHOWN
+    return [row for row in rows if row.symbol in labels]
 
 
 @dataclass
@@ -131,16 +100,16 @@ def _mean(values: np.ndarray) -> float:
     return float(kept.mean()) if len(kept) else float("nan")
 
 
-def best(means: dict[str, float | None], row: Row) -> set[str]:
+def best(means: dict[str, float | None], row: Measure) -> set[str]:
     """Names with the best mean as printed: several where they tie, none where there is no value or only one name."""
-    printed = {name: float(row.number(one)) for name, one in means.items() if one is not None and one == one}
+    printed = {name: float(row.write(one)) for name, one in means.items() if one is not None and one == one}
     if len(means) < 2 or not printed:
         return set()
     top = max(row.better * one for one in printed.values())
     return {name for name, one in printed.items() if row.better * one == top}
 
 
-def best_columns(columns: list[Column], row: Row) -> set[str]:
+def best_columns(columns: list[Column], row: Measure) -> set[str]:
     """Names of the columns that are bold in a row; each set of maps is compared by itself."""
     found: set[str] = set()
     for suite in dict.fromkeys(one.suite for one in columns):
@@ -157,23 +126,23 @@ def evidence_of(columns: list[Column]) -> list[str]:
 # Parts of a cell
 
 
-def value_text(column: Column, row: Row) -> str:
+def value_text(column: Column, row: Measure) -> str:
     """68.8 ± 5.7, or - where no episode got there."""
     one = column.summary[row.metric]
-    return f"{row.number(one['mean'])} ± {row.number(one['std'])}" if one["n"] else NONE
+    return f"{row.write(one['mean'])} ± {row.write(one['std'])}" if one["n"] else NONE
 
 
-def interval_text(column: Column, row: Row) -> str:
+def interval_text(column: Column, row: Measure) -> str:
     """[67.2, 70.1], and of how many episodes where it can be fewer than all; "" where there is neither."""
     one = column.summary[row.metric]
-    counted = row.label.startswith(("CS", "MO")) or not one["n"]
-    return f"{brackets(one, row.number)} {reached(one, column.total) * counted}".strip()
+    counted = row.symbol.startswith(("CS", "MO")) or not one["n"]
+    return f"{brackets(one, row.write)} {reached(one, column.total) * counted}".strip()
 
 
-def paper_text(scenario: str, column: Column, row: Row, digits: int | None = None) -> str | None:
+def paper_text(scenario: str, column: Column, row: Measure, digits: int | None = None) -> str | None:
     """The paper's value of the same scenario and algorithm, to the digits it was printed with or to `digits`."""
     value = paper_value(scenario, column.policy, row.metric)
-    digits = (0 if row.label.startswith("CS") else 2) if digits is None else digits
+    digits = (0 if row.symbol.startswith("CS") else 2) if digits is None else digits
     return None if value is None else " ± ".join(map(fixed(digits), value))
 
 
@@ -197,7 +166,7 @@ def print_tables(tables: dict[str, list[Column]], console: Console | None = None
     console.print(Group(*(Text(one, style="dim") for one in NOTES)))
 
 
-def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
+def draw_table(scenario: str, columns: list[Column], rows: list[Measure]) -> Table:
     """The table of one scenario."""
     lines = []
     bold = {row.metric: best_columns(columns, row) for row in rows}
@@ -211,7 +180,7 @@ def draw_table(scenario: str, columns: list[Column], rows: list[Row]) -> Table:
         if any(published):
             lines.append([Text(one or NONE, style="dim") for one in ("  paper", *published)])
     title = f"{scenario}: {columns[0].total} episodes a policy"
-    return terminal_table(title, ["policy", *(row.title.replace(" steps", "") for row in rows)], lines)
+    return terminal_table(title, ["policy", *(row.heading.replace(" steps", "") for row in rows)], lines)
 
 
 def draw_overview(tables: dict[str, list[Column]]) -> Table:
@@ -226,15 +195,15 @@ def draw_overview(tables: dict[str, list[Column]]) -> Table:
             cells.append(TableCell(value_text(found, row) if found else "", name in bold).terminal())
         lines.append([name.replace(" (", "\n("), *cells])
     heads = ["policy", *(scenario.replace("_", "\n", 1) for scenario in tables)]
-    return terminal_table(f"all scenarios: {row.title}", heads, lines)
+    return terminal_table(f"all scenarios: {row.heading}", heads, lines)
 
 
-def _narrow(column: Column, row: Row) -> str:
+def _narrow(column: Column, row: Measure) -> str:
     """How many got there for CS, else the interval: there is no room for both."""
     one = column.summary[row.metric]
-    if row.label.startswith("CS") or not one["n"]:
+    if row.symbol.startswith("CS") or not one["n"]:
         return reached(one, column.total)
-    return brackets(one, row.number).strip()
+    return brackets(one, row.write).strip()
 
 
 # Files
@@ -269,7 +238,7 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
             for metric, one in column.summary.items():
                 row = rows.get(metric)
                 published = paper_value(scenario, column.policy, metric) or ("", "")
-                scale = row.scale if row else 1.0
+                scale = row.factor if row else 1.0
                 published = [value / scale if value != "" else "" for value in published]
                 numbers = [one["mean"], one["std"], *one["ci95"]]
                 seeds = " ".join(f"{seed}:{means[metric]:.6g}" for seed, means in column.seeds.items())
@@ -312,7 +281,7 @@ def table_markdown(
         rows = []
         for row in rows_for(goal):
             bold = best_columns(columns, row)
-            rows.append([row.title, *(_markdown_cell(scenario, one, row, bold) for one in columns)])
+            rows.append([row.heading, *(_markdown_cell(scenario, one, row, bold) for one in columns)])
         lines += markdown_table(["", *(one.name for one in columns)], rows)
         if scenario in (below or {}):
             lines += ["", below[scenario]]
@@ -320,7 +289,7 @@ def table_markdown(
     return "\n\n".join([*parts, *NOTES]) + "\n"
 
 
-def _markdown_cell(scenario: str, column: Column, row: Row, bold: set[str]) -> str:
+def _markdown_cell(scenario: str, column: Column, row: Measure, bold: set[str]) -> str:
     published = paper_text(scenario, column, row)
     below = filter(None, (interval_text(column, row), published and f"paper {published}"))
     return TableCell(value_text(column, row), column.name in bold, tuple(below)).markdown()
@@ -343,7 +312,7 @@ def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float 
             bold = best_columns(columns, row)
             cells = [one and TableCell(value_text(one, row), one.name in bold).latex() for one in have]
             intervals = [one and latex_small(interval_text(one, row)) for one in have]
-            lines += [latex_row([head, latex_text(row.title), *cells]), latex_row(["", "", *intervals])]
+            lines += [latex_row([head, latex_text(row.heading), *cells]), latex_row(["", "", *intervals])]
             if published:
                 texts = [one and paper_text(scenario, one, row) for one in have]
                 papers = [one and latex_small(TableCell(one).latex()) for one in texts]

@@ -218,7 +218,7 @@ def compare_with(baseline: Baseline, results: list[EvaluationResult], where: Pat
     """Print and write how far the results are from an earlier evaluation; the file's name."""
     changes = baseline.changes(results)
     write_json(where / CHANGES_FILE, changes | {"baseline": {"folder": str(baseline.folder), "run": baseline.run}})
-    for sentence in describe_changes(changes, baseline.folder):
+    for sentence in describe_changes(changes, baseline.folder, results[0].success_coverage):
         print(sentence)
     return CHANGES_FILE
 

@@ -10,22 +10,15 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.comparison import DECIDES
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.results import FORMAT, result_names
 from maexp.agents.files import short, write_text
-from maexp.agents.tables import brackets, fixed
+from maexp.agents.measures import compared
 
 EPISODES_FILE, CHANGES_FILE = "episodes.csv", "changes.json"
 KEY = ("policy", "num_robots", "map")  # columns before those of the metrics
 ALIKE = ("scenario", "maps", "seed", "episodes", "steps")
 """Of `run` in results.json: two runs with the same can be paired."""
-SHOWN = {
-    DECIDES: ("points of coverage over time", 100.0, 1),
-    "coverage_step_95_censored": ("steps to 95 %", 1.0, 0),
-    "collisions": ("robots lost", 1.0, 2),
-}
-"""Metric -> what a sentence calls it, its factor and digits."""
 
 
 @dataclass
@@ -109,17 +102,11 @@ def load_baseline(path: str) -> Baseline:
     return Baseline(folder, run, results)
 
 
-def describe_changes(changes: dict[str, dict], folder: Path) -> list[str]:
-    """A sentence for each result: how far it is from the baseline."""
-    return [f"{name} less {short(folder)}: {', '.join(_amounts(found))}." for name, found in changes.items()]
-
-
-def _amounts(found: dict[str, dict]) -> list[str]:
-    words = []
-    for metric, (what, factor, digits) in SHOWN.items():
-        one, write = found[metric], fixed(digits, factor, "+")
-        words.append(f"{write(one['mean'])} {what}{brackets(one, write)}")
-    return words
+def describe_changes(changes: dict[str, dict], folder: Path, goal: float) -> list[str]:
+    """A sentence for each result of episodes that end at the coverage `goal`: how far it is from the baseline."""
+    told = compared(goal)
+    amounts = {name: [one.describe_difference(found[one.metric]) for one in told] for name, found in changes.items()}
+    return [f"{name} less {short(folder)}: {', '.join(one)}." for name, one in amounts.items()]
 
 
 def _on(result: EvaluationResult, place: str) -> EvaluationResult:

@@ -10,12 +10,11 @@ from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.evidence import verdict
 from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import result_names
+from maexp.agents.measures import compared
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import EpisodeSettings
-from maexp.agents.tables import POINTS, brackets
 from maexp.envs import ExplorationEnv
-from maexp.envs.metrics import in_reach
 
 CHOOSING = 64  # episodes on validation maps that tell which classical planner is the best
 DECIDES = "coverage_auc"
@@ -102,13 +101,8 @@ def find_typical(one: EvaluationResult, other: EvaluationResult | None, among: i
 
 
 def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
-    auc = found[DECIDES]
-    points = f"{POINTS(auc['mean'])} points of coverage over time{brackets(auc, POINTS)}"
-    later = ", ".join(_later(found, mark) for mark in (95, 99) if mark == 95 or in_reach(f"_{mark}", goal))
+    apart = ", ".join(
+        one.describe_difference(found[one.metric]) for one in compared(goal) if one.metric != "collisions"
+    )
     name = name.replace("trained", "The trained team", 1)
-    return f"{name} {verdict(auc)} {rival}: {points}, {later}."
-
-
-def _later(found: dict[str, dict], mark: int) -> str:
-    steps = found[f"coverage_step_{mark}_censored"]
-    return f"{steps['mean']:+.0f} steps to {mark} %{brackets(steps, '{:+.0f}'.format)}"
+    return f"{name} {verdict(found[DECIDES])} {rival}: {apart}."

@@ -8,25 +8,27 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from maexp.agents.evaluation.figures import COLOURS, LOOK, STYLES, finish, panels, reach, save
+from maexp.agents.measures import MEASURES
 from maexp.envs.metrics import LEAST_DISTINCT, has_interval, in_reach, label_copies, resample_weights, resampled_means
 
-# metric, title, unit, scale factor
 METRICS = (
-    ("exploration_ratio", "Coverage at the end", "%", 100),
-    ("coverage_auc", "Mean coverage over the episode", "%", 100),
-    ("success_rate", "Success rate", "%", 100),
-    ("coverage_step_85", "Time to 85 % coverage", "local steps of 0.1 s", 1),
-    ("coverage_step_95", "Time to 95 % coverage", "local steps of 0.1 s", 1),
-    ("coverage_step_95_censored", "Time to 95 % or the limit", "local steps of 0.1 s", 1),
-    ("coverage_step_99", "Time to 99 % coverage", "local steps of 0.1 s", 1),
-    ("coverage_step_99_censored", "Time to 99 % or the limit", "local steps of 0.1 s", 1),
-    ("mutual_overlap_85", "Overlap at 85 % coverage", "%", 100),
-    ("mutual_overlap_95", "Overlap at 95 % coverage", "%", 100),
-    ("collisions", "Collisions", "robots per episode", 1),
-    ("path_length", "Path of a robot", "m per episode", 1),
-    ("longest_path", "Longest path in a team", "m per episode", 1),
-    ("reward_variance", "Spread of reward over robots", "reward, unscaled", 1),
+    "exploration_ratio",
+    "coverage_auc",
+    "success_rate",
+    "coverage_step_85",
+    "coverage_step_95",
+    "coverage_step_95_censored",
+    "coverage_step_99",
+    "coverage_step_99_censored",
+    "mutual_overlap_85",
+    "mutual_overlap_95",
+    "collisions",
+    "path_length",
+    "longest_path",
+    "reward_variance",
 )
+UNITS = {"steps": "local steps of 0.1 s"}
+"""As axes have room for them."""
 
 SHADES = (COLOURS[0], "#A6CEE3")  # of neighbouring shares: dark and light, in grey, too
 
@@ -114,21 +116,20 @@ def draw_summary(summary, path) -> Path:
     """
     if isinstance(summary, str | Path):
         summary = json.loads(Path(summary).read_text())
-    known = {metric for metric, *_ in METRICS}
-    policies = {name: one for name, one in summary.items() if isinstance(one, dict) and known & one.keys()}
+    policies = {name: one for name, one in summary.items() if isinstance(one, dict) and one.keys() & {*METRICS}}
     goal = summary.get("run", {}).get("success_coverage", 1.0)
-    shown = [row for row in METRICS if any(_mean(one, row[0]) is not None for one in policies.values())]
-    shown = [row for row in shown if in_reach(row[0], goal)]
+    shown = [name for name in METRICS if any(_mean(one, name) is not None for one in policies.values())]
+    shown = [MEASURES[name] for name in shown if in_reach(name, goal)]
     if not shown:
         raise ValueError(
             f"the summary has no metric that can be drawn; found {', '.join(map(str, summary)) or 'nothing'}"
         )
     with rc_context(LOOK):
         figure, axes = panels(len(shown), height=2.1 + 0.1 * len(policies))
-        for ax, (metric, title, unit, factor) in zip(axes, shown, strict=True):
-            _draw_bars(ax, policies, metric, factor)
-            ax.set_title(title, loc="left")
-            ax.set_xlabel(unit)
+        for ax, one in zip(axes, shown, strict=True):
+            _draw_bars(ax, policies, one.metric, one.factor)
+            ax.set_title(one.title, loc="left")
+            ax.set_xlabel(UNITS.get(one.unit, one.unit))
         return save(figure, path)
 
 

@@ -8,27 +8,29 @@ from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.evidence import describe_evidence
 from maexp.agents.evaluation.headroom import headroom_shares
 from maexp.agents.files import write_json
+from maexp.agents.measures import MEASURES
 from maexp.agents.settings.verbs import EpisodeSettings
-from maexp.agents.tables import NONE, estimate, fixed, print_table, reached
+from maexp.agents.tables import NONE, estimate, print_table, reached
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.metrics import in_reach
 
 FORMAT = "maexp-results-1"
-COLUMNS = {
-    "exploration_ratio": "coverage",
-    "coverage_auc": "over time",
-    "coverage_step_85": "85 % at step",
-    "coverage_step_95": "95 % at step",
-    "coverage_step_95_censored": "95 % censored",
-    "coverage_step_99": "99 % at step",
-    "coverage_step_99_censored": "99 % censored",
-    "mutual_overlap_85": "overlap",
-    "success_rate": "success",
-    "collisions": "collisions",
-    "path_length": "path [m]",
-    "base_coverage_auc": "base over time",
-    "worst_coverage_auc": "worst over time",
-}
+COLUMNS = (
+    "exploration_ratio",
+    "coverage_auc",
+    "coverage_step_85",
+    "coverage_step_95",
+    "coverage_step_95_censored",
+    "coverage_step_99",
+    "coverage_step_99_censored",
+    "mutual_overlap_85",
+    "success_rate",
+    "collisions",
+    "path_length",
+    "base_coverage_auc",
+    "worst_coverage_auc",
+)
+"""Metrics of the table."""
 
 
 def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
@@ -124,7 +126,7 @@ def print_summaries(
         total = summary["exploration_ratio"]["n"]
         metrics = (_cell(metric, summary[metric], total) for metric in columns)
         cells.append([name, *(tell(summary) for tell in more.values()), *metrics])
-    print_table(title, ["policy", *more, *(COLUMNS[one] for one in columns)], cells)
+    print_table(title, ["policy", *more, *(MEASURES[one].column for one in columns)], cells)
 
 
 def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:
@@ -135,7 +137,7 @@ def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:
 def _cell(metric: str, value: dict, total: int) -> str:
     if not value["n"]:
         return f"{NONE} {reached(value, total)}"
-    write = fixed(0 if metric.startswith(("coverage_step", "path")) else 3)
+    write = MEASURES[metric].plain
     if metric == "exploration_ratio":
         return estimate(value, write)
     text = write(value["mean"])

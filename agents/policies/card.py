@@ -5,16 +5,17 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError
-from maexp.agents.tables import brackets, estimate, fixed, markdown_table
+from maexp.agents.measures import MEASURES
+from maexp.agents.tables import estimate, markdown_table
 
-SHOWN = {
-    "exploration_ratio": "coverage",
-    "coverage_auc": "over time",
-    "coverage_step_85_censored": "85 % at step",
-    "coverage_step_95_censored": "95 % at step",
-    "success_rate": "success",
-    "collisions": "collisions",
-}
+SHOWN = (
+    "exploration_ratio",
+    "coverage_auc",
+    "coverage_step_85_censored",
+    "coverage_step_95_censored",
+    "success_rate",
+    "collisions",
+)
 RESULTS = ("results.json", "summary.json")  # of maexp evaluate, of maexp train
 NEXT = "coverage_auc"  # differences are told in it
 
@@ -80,14 +81,19 @@ def describe_results(file: Path) -> list[str]:
     try:
         content = json.loads(file.read_text())
         run = content["run"]
-        rows = {name: values for name, values in content.items() if next(iter(SHOWN)) in values}
+        rows = {name: values for name, values in content.items() if SHOWN[0] in values}
         teams = f"teams of {run['num_robots'][0]}, " if len(run["num_robots"]) == 1 else ""
         lines = [
             f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval:",
             "",
         ]
         cells = [[name, *(_cell(values.get(one)) for one in SHOWN)] for name, values in rows.items()]
-        return [*lines, *markdown_table(["policy", *SHOWN.values()], cells), "", *_differences(content)]
+        return [
+            *lines,
+            *markdown_table(["policy", *(MEASURES[one].column for one in SHOWN)], cells),
+            "",
+            *_differences(content),
+        ]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"{file} is not the results of an evaluation ({type(error).__name__}: {reason}).") from error
@@ -107,11 +113,10 @@ def _differences(content: dict[str, Any]) -> list[str]:
         for name, rivals in content.get("difference", {}).items():
             label = next((one for one in (f"{best} N={size}", best) if one in rivals), None)
             if label is not None:
-                found = rivals[label][NEXT]
-                points = fixed(2, 100.0, "+")
+                apart = MEASURES[NEXT].describe_difference(rivals[label][NEXT], digits=2)
                 sentences += [
                     f"{name} less {label}, the best classical planner on the validation maps, on the same episodes: "
-                    f"{points(found['mean'])} points of coverage over time{brackets(found, points)}.",
+                    f"{apart}.",
                     "",
                 ]
     return sentences

@@ -99,12 +99,6 @@ def _keep_rows(path: Path, kept: int) -> list[str] | None:
     return columns
 
 
-def read_metrics(path: Path) -> list[dict[str, float]]:
-    """The rows of a metrics.csv as numbers."""
-    with open(path, newline="") as file:
-        return [{name: float(value or "nan") for name, value in row.items()} for row in csv.DictReader(file)]
-
-
 def check_logger(settings: LoggerSettings) -> None:
     """Raise UserError for a logger that is unknown or not installed."""
     for name in settings.backends:
