@@ -89,13 +89,12 @@ def test_own_training_loop():
     assert moved and all(state["step"] == 2 for state in moved.values())
 
 
-@pytest.mark.parametrize("page", ["pettingzoo", "gymnasium"])
-def test_other_interfaces(page, capsys):
-    pytest.importorskip(page, reason=f"THE EXTRA maexp[{page}] IS NOT INSTALLED: its page is not tested")
-    (code,) = blocks(f"docs/{page}.md", "python")
-    names = run_block(code, f"docs/{page}.md")
+@pytest.mark.parametrize(("block", "library"), enumerate(["pettingzoo", "gymnasium"]))
+def test_other_interfaces(block, library, capsys):
+    pytest.importorskip(library, reason=f"THE EXTRA maexp[{library}] IS NOT INSTALLED: its example is not tested")
+    names = run_block(blocks("docs/adapters.md", "python")[block], "docs/adapters.md")
     told = capsys.readouterr().out
-    if page == "pettingzoo":
+    if library == "pettingzoo":
         assert names["picture"].shape[1:] == (512, 3) and "% of the place seen" in told and not names["env"].agents
     else:
         assert names["observations"]["map"].shape == (4, 3, PICTURE_CHANNELS, 125, 125)

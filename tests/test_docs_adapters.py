@@ -16,7 +16,7 @@ def test_stable_baselines_learns_on_targets(tmp_path, monkeypatch, capsys):
     for name in ("supersuit", "stable_baselines3", "sb3_contrib"):
         pytest.importorskip(name, reason=MISSING)
     monkeypatch.chdir(tmp_path)
-    recipe, player, _ = blocks(PAGE, "python")
+    recipe, player, _ = blocks(PAGE, "python")[2:]
     names = run_block(recipe, PAGE)
     model, agents = names["model"], names["agents"]
     assert model.num_timesteps == 180 and agents.num_envs == 6

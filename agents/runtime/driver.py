@@ -46,7 +46,7 @@ class DriverSettings:
     period: float = setting(2.0, "between two decisions [s]")
     radar_range: float | None = setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
     robot_radius: tuple[float, ...] = setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
-    clearance_factor: float = setting(2.0, "radii that ways keep from obstacles twice over, where there is room")
+    clearance_factor: float = setting(2.0, "where there is room, ways keep twice this many radii from obstacles")
     occupied: float = setting(65.0, "cells with so many percent and more are obstacles")
     bounded: bool = setting(False, "the map shows the whole place")
     patience: float = setting(10.0, "how long a robot may stand still on its way [s]")

@@ -39,10 +39,10 @@ class Plan:
         names: keys of the poses, or 0 to N - 1.
         goals: float64 [N, 2]; where a robot stands if it has nowhere to go, NaN if its pose is not known.
         active: bool [N], robots that have somewhere to go: their goals lie on known free ground that they get to.
-        waits: bool [N], robots that are to stop where they are: others have the targets that are left.
+        waits: bool [N], robots that are to stop where they are: others have the remaining targets.
         ways: float64 [k, 2] each, corners of the way from a robot to its goal; k = 0 for robots that stay.
-        targets: float64 [K, 2], all places that were chosen from, for drawing.
-        done: nothing is left that a robot could get to and see more from.
+        targets: float64 [K, 2], all candidates, for drawing.
+        done: no robot can reach a place from which it would see more.
         notes: what was ignored or given up, a sentence each.
     """
 
@@ -65,7 +65,7 @@ class TeamPlanner:
         radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
         robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list;
             None: as the policy was trained, 0.3 m for planners.
-        clearance_factor: radii that ways keep from obstacles twice over where there is room.
+        clearance_factor: where there is room, ways keep twice this many radii from obstacles.
         occupied: cells of the grid with this value and above are obstacles, 1 to 100.
         bounded: the grid shows the whole place; else the unknown lies beyond its edge.
         least_area: targets with less unknown area in sight do not count [m^2]; None: what the smallest robot covers.
@@ -76,7 +76,7 @@ class TeamPlanner:
         distinct: robots go to different targets, farther apart than their bodies; else each goes where it likes best.
         spare: what robots do for which no target is left then: "wait" where they are, or drive "home" to where they
             were first seen.
-        seed: of choices at random.
+        seed: of random choices.
     """
 
     def __init__(
