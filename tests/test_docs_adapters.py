@@ -1,8 +1,10 @@
 """The page on other libraries: its recipes run, and Stable-Baselines3 takes what is there."""
 
+import runpy
+
 import numpy as np
 import pytest
-from test_docs import blocks, run_block
+from test_docs import EXAMPLES, blocks, run_block
 
 from maexp.agents import make_env
 
@@ -16,8 +18,7 @@ def test_stable_baselines_learns_on_targets(tmp_path, monkeypatch, capsys):
     for name in ("supersuit", "stable_baselines3", "sb3_contrib"):
         pytest.importorskip(name, reason=MISSING)
     monkeypatch.chdir(tmp_path)
-    recipe, player, _ = blocks(PAGE, "python")[2:]
-    names = run_block(recipe, PAGE)
+    names = runpy.run_path(str(EXAMPLES / "sb3_train.py"))
     model, agents = names["model"], names["agents"]
     assert model.num_timesteps == 180 and agents.num_envs == 6
     rollout = model.rollout_buffer
@@ -28,7 +29,7 @@ def test_stable_baselines_learns_on_targets(tmp_path, monkeypatch, capsys):
     poses = agents.reset()["pose"].reshape(2, 3, 4)
     assert not np.array_equal(*poses), "the two teams play episodes of their own"
     env = make_env("scenario=maze_small", "num_envs=2")
-    after = env.rollout(3, run_block(player, PAGE)["make"](env))
+    after = env.rollout(3, runpy.run_path(str(EXAMPLES / "sb3_team.py"))["make"](env))
     shown, chosen = after["agents", "observation", "targets_mask"], after["agents", "action", "target"]
     assert shown.gather(-1, chosen.unsqueeze(-1)).all(), "what was learned plays in the platform"
 

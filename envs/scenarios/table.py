@@ -87,7 +87,7 @@ _ROWS = [
     ),
     Scenario(
         "random_obstacles_adaptive",
-        summary="the same with half the points in open ground: density varies over the map",
+        summary="the same with points 2 m apart in open ground: a fifth fewer",
         **_RANDOM,
         build=partial(build_adaptive, scenario="random_obstacles_adaptive", resolution=1.0, near=2.0),
     ),
