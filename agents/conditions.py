@@ -37,6 +37,7 @@ CONDITIONS = {
     "signal": ("comm=signal",),
     "ir2": IR2,
     "ir2_noise": (*IR2, "comm.noise=13"),
+    "messages": ("comm.bandwidth=1000", "comm.delay=1"),
     "faults": ("faults.probability=0.5",),
     "radar": RADAR,
     "odometry": ODOMETRY,
@@ -56,6 +57,7 @@ METRICS = (
     "told_step_95_censored",
     "mutual_overlap_85",
     "connected",
+    "bytes_sent",
     "odometry_error",
     "collisions",
 )

@@ -32,7 +32,7 @@ class Measure:
 
     @property
     def factor(self) -> float:
-        return 100.0 if self.unit == "%" else 1.0
+        return {"%": 100.0, "kB": 1e-3}.get(self.unit, 1.0)
 
     @property
     def write(self) -> Write:
@@ -106,6 +106,7 @@ MEASURES = {
         Measure("worst_coverage_auc", "worst over time", "Coverage of the robot that knows least", "%", 1, 1),
         Measure("told_step_95_censored", "told 95 %", "Time until all know 95 % or the limit", "steps", 0),
         Measure("connected", "connected", "Steps in which a robot is connected", "%", 0, 1),
+        Measure("bytes_sent", "sent", "What all radios send", "kB", 0),
         Measure("odometry_error", "off", "Distance from where robots believe to be", "m", 2),
     )
 }

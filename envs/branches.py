@@ -6,6 +6,7 @@ A batch of branches holds `copies` of some teams of an env side by side: branch 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,11 @@ NOT_COPIED = (
     "worst_sum",
     "told_step",
     "connected",
+    "learned",
+    "learned_count",
+    "offered",
+    "underway",
+    "cells_sent",
     "evidence_free",
     "evidence_boundary",
     "odometry_error",
@@ -53,7 +59,9 @@ def branch_env(
     from maexp.envs.environment import ExplorationEnv
 
     limited = env.settings.limited if comm is None else comm.limited
-    comm = replace(comm or env.settings.comm, strategy="opportunistic")  # branches do what they are told
+    comm = comm or env.settings.comm
+    # Branches do what they are told, and messages there need neither room nor time.
+    comm = replace(comm, strategy="opportunistic", bandwidth=math.inf, delay=0.0)
     settings = replace(
         env.settings,
         num_envs=count,

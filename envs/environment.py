@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from maexp.envs.bank import MapBank, build_bank
 from maexp.envs.config import (
+    CELL_BYTES,
     STARTS,
     EnvSettings,
 )
@@ -285,6 +286,7 @@ class ExplorationEnv(EnvBase):
 
         info = tell("worst_coverage", s["known_weight"][:, :robots].amin(1), s["worst_sum"])
         info["told_step_95"] = s["told_step"].unsqueeze(-1).clone()
+        info["bytes_sent"] = CELL_BYTES * s["cells_sent"].unsqueeze(-1)
         info["connected"] = s["connected"] / steps.clamp_min(1).unsqueeze(-1)
         if self.comm_config.has_base:
             info |= tell("base_coverage", s["known_weight"][:, robots], s["base_sum"])

@@ -41,8 +41,9 @@ def episode_metrics(
         ``reward_variance`` is the population standard deviation over robots of the episode's reward without
         the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m],
         ``longest_path`` the way of the robot that drove farthest. Where communication is limited: `RADIO`,
-        ``connected`` and ``told_step_95``; where robots may fail: ``failed``, how many have at the end; where
-        odometry drifts: ``odometry_error`` [m], how far robots then are from where they believe to be, on average.
+        ``connected``, ``told_step_95`` and ``bytes_sent``, by all radios; where robots may fail: ``failed``, how many
+        have at the end; where odometry drifts: ``odometry_error`` [m], how far robots then are from where they believe
+        to be, on average.
         Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
@@ -63,6 +64,7 @@ def episode_metrics(
         metrics["odometry_error"] = info["odometry_error"].mean(axis=1)
     if "connected" in info:
         metrics["connected"] = info["connected"].mean(axis=1)
+        metrics["bytes_sent"] = info["bytes_sent"][:, 0]
         steps = info["told_step_95"][:, 0]
         metrics["told_step_95"] = np.where(steps >= 0, steps, np.nan)
         if limit is not None:

@@ -136,6 +136,9 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         comm_range=min(comm.range, 1e30),
         line_of_sight=comm.line_of_sight,
         loss=comm.loss,
+        messages=comm.messages,
+        message_cells=comm.message_cells,
+        message_delay=comm.message_steps,
         signal=comm.signal,
         base_x=base[0],
         base_y=base[1],
@@ -175,6 +178,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         base_station=settings.comm.has_base,
         sensing=not perfect_radars(settings),
         drifts=settings.odometry.some,
+        messages=settings.comm.messages,
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robot),
     )
 

@@ -34,9 +34,10 @@ INFO_RADIO = {
     "worst_coverage": torch.float32,
     "worst_coverage_auc": torch.float32,
     "told_step_95": torch.int32,
+    "bytes_sent": torch.int64,
 }
-"""Entries of shape [E, 1] where communication is limited: of the robot that knows least at each moment, and the local
-step after which all radios knew 95 %."""
+"""Entries of shape [E, 1] where communication is limited: of the robot that knows least at each moment, the local step
+after which all radios knew 95 %, and what radios have sent."""
 INFO_BASE = {"base_coverage": torch.float32, "base_coverage_auc": torch.float32}
 """The same where there is a base station."""
 INFO_COUNTED = {"counted_coverage": torch.float32}

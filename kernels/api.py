@@ -179,6 +179,7 @@ def merge_maps(seen: torch.Tensor, comm: torch.Tensor) -> torch.Tensor:
     values = {"active": wp.from_torch(active), "hears": wp.from_torch(hears), "seen": words, "told": told}
     values |= {"known": wp.from_torch(known), "lanes": lanes, "maps": Maps(), "map_id": values["active"]}
     values |= {"weighed": 0, "known_weight": wp.from_torch(torch.zeros_like(active).view(-1, 1))}
+    values["cells_sent"] = wp.from_torch(torch.zeros_like(active, dtype=torch.int64))
     dim = (seen.shape[0], lanes)
     launch_named(launch_on(words.device), merge._share_points, dim, values)
     return unpack_flags(known, robots)

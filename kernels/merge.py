@@ -13,6 +13,7 @@ import warp as wp
 from maexp.kernels.geometry import segment_distance
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.messages import pass_messages
 from maexp.kernels.radio import radio_at, receive_signals
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, floor_within
@@ -193,6 +194,32 @@ def _hear_robots(
             hears[e, i, w] = hears[e, i, w] | (1 << (other % ROBOTS_PER_WORD))
 
 
+@wp.func
+def count_tellers(
+    e: int,
+    j: int,
+    last: wp.uint32,
+    hears: wp.array3d(dtype=wp.int32),
+    tells: wp.array2d(dtype=wp.int32),  # [word, point]
+) -> int:
+    """Radios that tell of a point: somebody who hears them does not know it."""
+    words = tells.shape[0]
+    tellers = int(0)
+    for v in range(words):
+        bits = int(0)
+        for w in range(words):
+            missing = ~wp.uint32(tells[w, j])
+            if w == words - 1:
+                missing = missing & last
+            while missing != wp.uint32(0):
+                below = missing - wp.uint32(1)
+                listener = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~missing))
+                bits = bits | (hears[e, listener, v] & tells[v, j])
+                missing = missing & below
+        tellers += wp.bit_count(bits)
+    return tellers
+
+
 @wp.kernel
 def _share_points(
     # Map:
@@ -208,6 +235,7 @@ def _share_points(
     # State in and out:
     known: wp.array3d(dtype=wp.int32),  # [env, word, point]
     known_weight: wp.array2d(dtype=wp.int32),  # [env, radio]
+    cells_sent: wp.array(dtype=wp.int64),  # [env]
     # Scratch out:
     told: wp.array3d(dtype=wp.int32),  # [env, word, point]
 ):
@@ -224,6 +252,7 @@ def _share_points(
     sees = seen[e]
     knows = known[e]
     tells = told[e]
+    sent = int(0)
     for j in range(lane, seen.shape[2], lanes):
         anyone = int(0)
         for w in range(words):
@@ -233,6 +262,7 @@ def _share_points(
         if anyone != 0:
             for w in range(words):
                 tells[w, j] = sees[w, j] | knows[w, j]
+            heard = int(0)
             for w in range(words):
                 result = tells[w, j]
                 missing = ~wp.uint32(result)
@@ -244,6 +274,7 @@ def _share_points(
                     for v in range(words):
                         if (hears[e, w * ROBOTS_PER_WORD + bit, v] & tells[v, j]) != 0:
                             result = result | (1 << bit)
+                            heard = 1
                     missing = missing & below
                 news = wp.uint32(result & ~knows[w, j])
                 knows[w, j] = result
@@ -252,6 +283,9 @@ def _share_points(
                     radio = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~news))
                     wp.atomic_add(known_weight, e, radio, maps.free_weight[maps.free_begin[map_id[e]] + j])
                     news = news & below
+            if heard != 0:
+                sent += count_tellers(e, j, last, hears, tells)
+    wp.atomic_add(cells_sent, e, wp.int64(sent))
 
 
 def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
@@ -266,6 +300,9 @@ def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
         return
     shard.call(launch, _hear_robots, shard.radios, active=running)
     receive_signals(launch, shard, running)
+    if shard.settings.messages:
+        pass_messages(launch, shard, running)
+        return
     for what in ("free", "boundary"):
         seen, known, told = (getattr(shard.view, f"{kind}_{what}") for kind in ("seen", "known", "told"))
         given = {"seen": seen, "known": known, "told": told, "lanes": lanes_on(shard.device, 1024)}

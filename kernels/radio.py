@@ -169,6 +169,7 @@ def _place_base(
     # State out:
     base: wp.array(dtype=wp.vec3),  # [env]
     known_weight: wp.array2d(dtype=wp.int32),  # [env, radio]
+    cells_sent: wp.array(dtype=wp.int64),  # [env]
     base_sum: wp.array(dtype=wp.int64),  # [env]
     worst_sum: wp.array(dtype=wp.int64),  # [env]
     told_step: wp.array(dtype=wp.int32),  # [env]
@@ -185,6 +186,7 @@ def _place_base(
         known_weight[e, k] = 0
     for i in range(connected.shape[1]):
         connected[e, i] = 0
+    cells_sent[e] = wp.int64(0)
     base_sum[e] = wp.int64(0)
     worst_sum[e] = wp.int64(0)
     told_step[e] = -1

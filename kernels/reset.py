@@ -9,6 +9,7 @@ import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.messages import forget_messages
 from maexp.kernels.sensing import forget_returns
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, point_xy
@@ -295,6 +296,7 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     for one in flags:
         shard.call(launch, _clear_flags, (*one.shape[:2], lanes), flags=one, lanes=lanes)
     forget_returns(launch, shard)
+    forget_messages(launch, shard)
     shard.call(launch, _clear_env, shard.shape[0])
     shard.call(launch, _place_team, shard.shape[0])
     shard.call(launch, _clear_robots)

@@ -34,6 +34,9 @@ class Settings:
     comm_range: float  # [m]
     line_of_sight: bool  # whether walls block communication
     loss: float  # probability that two radios miss each other in a local step
+    messages: bool  # whether messages take room or time
+    message_cells: int  # points that a radio sends in a local step
+    message_delay: int  # local steps until a message arrives
     signal: bool  # whether radios hear what arrives of a signal
     base_x: float  # where the base station is [m]; inf: where robot 0 starts
     base_y: float

@@ -29,6 +29,8 @@ AXES = {
     "A": ("robot", "as N where radars miss returns, else 1"),
     "C": ("free", "as F where radars miss returns, else 1"),
     "I": ("boundary", "as B where radars miss returns, else 1"),
+    "X": ("radio", "as U where messages take room or time, else 1"),
+    "Y": ("point", "points of the largest map where messages take room or time, else 1"),
     "R": ("term", "terms of the reward"),
     "M": ("mark", "coverages of `reward.MARKS`: 85, 95 and 99 %"),
     "T": ("step", "local steps that a trajectory remembers; step t stands at t % T"),
@@ -88,6 +90,13 @@ STATE = {
     "evidence_boundary": Field(wp.uint8, "E A I", "", "the same of boundary points"),
     "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it"),
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
+    "learned": Field(wp.int32, "E X Y", "", "points in the order in which the radio learned of them; boundary points"
+        " are numbered after the map's free ones"),
+    "learned_count": Field(wp.int32, "E X", "", "how many those are"),
+    "offered": Field(wp.int32, "E X X", "", "[i, j]: how many of those radio i has sent radio j, or need not"),
+    "underway": Field(wp.uint8, "E X Y", "steps", "until a message that tells the radio of the point arrives, and 1;"
+        " 0: none does"),
+    "cells_sent": Field(wp.int64, "E", "", "points that radios have told others of, where communication is limited"),
     "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited"),
     "hears": Field(wp.int32, "E U W", "", "the same in bits, of all radios that radio i hears"),
     "base": Field(wp.vec3, "E", "m", "where the base station is, or would be, z = 0"),
@@ -176,6 +185,7 @@ def axis_sizes(
     base_station: bool = False,
     sensing: bool = False,
     drifts: bool = False,
+    messages: bool = False,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     radios = num_robots + base_station
@@ -194,6 +204,8 @@ def axis_sizes(
         "A": num_robots if sensing else 1,
         "C": max(free, 1) if sensing else 1,
         "I": max(boundary, 1) if sensing else 1,
+        "X": radios if messages else 1,
+        "Y": max(free + boundary, 1) if messages else 1,
         "V": max(visible, 1),
         "K": max(occluders, 1),
         "O": max(nearby, 1),

@@ -122,6 +122,10 @@ def setups() -> dict:
         "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "oracle"),
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
         "signals": (dict(planner=wavefront, comm=base, done="everyone", num_robots=6), "cost_utility"),
+        "messages": (
+            dict(planner=wavefront, comm=CommConfig(range=9.0, base_station=True, bandwidth=400.0, delay=0.2)),
+            "voronoi",
+        ),
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
         "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
         "odometry": (

@@ -67,6 +67,16 @@ def test_radios_agree(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_messages_agree(device):
+    """What waits and what is under way: sums of points, the same on both."""
+    comm = CommConfig(range=12.0, bandwidth=1000.0, delay=0.3, base_station=True)
+    here, there = (play(one, "wavefront", comm=comm)["info"] for one in ("cpu", device))
+    for name in ("base_coverage", "worst_coverage_auc", "bytes_sent"):
+        torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
+    assert (here["bytes_sent"][-1] > 1000).all() and here["bytes_sent"].max() <= 30 * 4 * 100
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_failures_agree(device):
     """Who fails when is drawn from the same keys."""
     faults = FaultsConfig(probability=0.7, duration=0.8)

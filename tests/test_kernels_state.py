@@ -26,7 +26,7 @@ FIELDS = STATE | SCRATCH
 PLANNERS = ("dwa", "wavefront", "direct")
 
 
-def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=None) -> ExplorationEnv:
+def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=None, delay=0.2) -> ExplorationEnv:
     return ExplorationEnv(
         worlds or [room(22, 19)],
         num_envs=envs,
@@ -34,7 +34,7 @@ def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=Non
         local_steps=3,
         num_threads=1,
         planner=PlannerConfig(name=planner),
-        comm=CommConfig(range=9.0, signal=True) if limited else None,
+        comm=CommConfig(range=9.0, signal=True, delay=delay) if limited else None,
         observation=ObservationConfig(map="known"),
         faults=FaultsConfig(probability=0.5) if limited else None,
         radar=RadarConfig(evidence=2) if limited else None,
@@ -61,8 +61,9 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
 
 @pytest.fixture(scope="module")
 def met() -> list[tuple]:
-    """The launches of every planner, with perfect and with limited communication."""
-    return [one for planner in PLANNERS for limited in (False, True) for one in launches_of(make(planner, limited))]
+    """The launches of every planner, with perfect and with limited communication, messages late or not."""
+    envs = [make(planner, limited) for planner in PLANNERS for limited in (False, True)]
+    return [one for env in (*envs, make("dwa", True, delay=0.0)) for one in launches_of(env)]
 
 
 @pytest.mark.parametrize("robots, limited, envs", [(1, False, 5), (3, True, 4), (35, True, 2), (34, False, 3)])
@@ -81,6 +82,7 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
         "H": words if limited else 1,
         "P": free if limited else 1,
         "Q": boundary if limited else 1,
+        "X": robots if limited else 1,
         "S": robots,
         "M": 3,
         "1": 1,

@@ -3,7 +3,7 @@
 Imports neither torch nor Warp.
 """
 
-from .comm import CELLS_OF_RADAR, STRATEGIES, CommConfig
+from .comm import CELL_BYTES, CELLS_OF_RADAR, STRATEGIES, CommConfig
 from .env import DONE, GROUPS, STARTS, EnvSettings
 from .faults import FaultsConfig
 from .group import Group, supplied
@@ -19,6 +19,7 @@ from .targets import TargetsConfig
 __all__ = [
     "BODY",
     "CELLS_OF_RADAR",
+    "CELL_BYTES",
     "CLEARANCE",
     "DONE",
     "GROUPS",

@@ -9,6 +9,9 @@ from maexp.envs.fields import setting, words_of
 
 from .group import Group
 
+CELL_BYTES = 4  # of a message that tell of a cell: its number and what it is
+STEP = 0.1  # of the simulation [s]
+LONGEST_DELAY = 25.0  # of a message [s]
 SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
 CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
@@ -18,9 +21,10 @@ class CommConfig(Group):
     """Who hears whom (docs/conditions.md).
 
     Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
-    (`maexp.kernels.radio`). ``strategy`` is what robots do to tell others what they know, whatever their policy
-    (`maexp.envs.strategy`): nothing but to talk when they meet (``opportunistic``), or to report or meet every
-    ``period`` decisions. A base station is a radio with a map of its own.
+    (`maexp.kernels.radio`). Messages may take room and time (`maexp.kernels.messages`). ``strategy`` is what robots do
+    to tell others what they know, whatever their policy (`maexp.envs.strategy`): nothing but to talk when they meet
+    (``opportunistic``), or to report or meet every ``period`` decisions. A base station is a radio with a map of its
+    own.
     """
 
     group = "comm"
@@ -37,6 +41,14 @@ class CommConfig(Group):
         0.0, "greatest fading of each part of the loss, drawn for every pair and moment", unit="dB", low=0
     )
     loss: float = setting(0.0, "probability that two radios miss each other in a step of 0.1 s", low=0, high=1)
+    bandwidth: float = setting(
+        math.inf,
+        "of a radio; what does not fit waits, what it learned first is sent first",
+        unit="B/s",
+        low=CELL_BYTES / STEP,
+        infinite=True,
+    )
+    delay: float = setting(0.0, "until a message arrives", unit="s", low=0, high=LONGEST_DELAY)
     base_station: bool | tuple[float, float] = setting(
         False, "true: a radio with a map of its own where robot 0 starts; or a place [x, y]", unit="m"
     )
@@ -48,7 +60,23 @@ class CommConfig(Group):
     @property
     def limited(self) -> bool:
         """Whether robots may know different things."""
-        return self.line_of_sight or math.isfinite(self.range) or self.signal or self.loss > 0.0 or self.has_base
+        parted = self.line_of_sight or math.isfinite(self.range) or self.signal or self.loss > 0.0
+        return parted or self.messages or self.has_base
+
+    @property
+    def messages(self) -> bool:
+        """Whether messages take room or time."""
+        return math.isfinite(self.bandwidth) or self.message_steps > 0
+
+    @property
+    def message_cells(self) -> int:
+        """Cells that a radio sends in a step."""
+        return int(min(self.bandwidth * STEP / CELL_BYTES + 1e-6, 1e9))
+
+    @property
+    def message_steps(self) -> int:
+        """Steps until a message arrives."""
+        return round(self.delay / STEP)
 
     @property
     def has_base(self) -> bool:
