@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.headroom import headroom_shares
+from maexp.agents.evaluation.headroom import describe_shares, headroom_shares
 
 
 def result(policy: str, *auc: float, size: int = 3) -> EvaluationResult:
@@ -23,6 +23,10 @@ def test_a_share_is_a_lead_by_that_of_the_search_that_cheats():
     assert found["mine"]["mean"] == pytest.approx(0.2) and found["mine"]["ci95"] == pytest.approx([0.2, 0.2])
     assert found["worse"]["mean"] == pytest.approx(-0.25) and found["worse"]["n"] == 5
     assert found["worse"]["ci95"][0] < -0.25 < found["worse"]["ci95"][1]
+    first = describe_shares(results[:3], ["cost_utility", "clairvoyant", "mine"])
+    assert first == [
+        "mine wins 20 % [20, 20] of the headroom, the lead of clairvoyant over cost_utility in coverage over time."
+    ]
 
 
 def test_no_share_where_there_is_no_clear_headroom():

@@ -32,6 +32,16 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
     return found
 
 
+def describe_shares(results: list[EvaluationResult], names: list[str]) -> list[str]:
+    """A sentence for each share."""
+    found = {name: [100 * x for x in (one["mean"], *one["ci95"])] for name, one in headroom_shares(results, names).items()}
+    return [
+        f"{name} wins {mean:.0f} % [{low:.0f}, {high:.0f}] of the headroom, the lead of {CEILING} over {BASE} in coverage "
+        "over time."
+        for name, (mean, low, high) in found.items()
+    ]
+
+
 def _shares(others: dict[str, EvaluationResult], base: EvaluationResult, ceiling: EvaluationResult) -> dict[str, dict]:
     headroom, found = _lead(ceiling, base), {}
     for name, one in others.items():

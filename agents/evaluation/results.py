@@ -6,7 +6,7 @@ from pathlib import Path
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.evidence import describe_evidence
-from maexp.agents.evaluation.headroom import headroom_shares
+from maexp.agents.evaluation.headroom import describe_shares, headroom_shares
 from maexp.agents.files import write_json
 from maexp.agents.measures import MEASURES
 from maexp.agents.settings.verbs import EpisodeSettings
@@ -90,7 +90,8 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
     whole = [one for one in results if not one.place]
     named = zip(result_names(whole), whole, strict=True)
     evidence = [one.evidence._replace(policy=name) for name, one in named]
-    for sentence in [*describe_evidence(evidence), *describe_starts(whole)]:
+    shares = describe_shares(whole, result_names(whole))
+    for sentence in [*describe_evidence(evidence), *describe_starts(whole), *shares]:
         print(sentence)
 
 
