@@ -34,12 +34,12 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
 
 def describe_shares(results: list[EvaluationResult], names: list[str]) -> list[str]:
     """A sentence for each share."""
-    found = {name: [100 * x for x in (one["mean"], *one["ci95"])] for name, one in headroom_shares(results, names).items()}
-    return [
-        f"{name} wins {mean:.0f} % [{low:.0f}, {high:.0f}] of the headroom, the lead of {CEILING} over {BASE} in coverage "
-        "over time."
-        for name, (mean, low, high) in found.items()
-    ]
+    sentences = []
+    for name, one in headroom_shares(results, names).items():
+        mean, low, high = (f"{100 * share:.0f}" for share in (one["mean"], *one["ci95"]))
+        lead = f"the lead of {CEILING} over {BASE} in coverage over time"
+        sentences.append(f"{name} wins {mean} % [{low}, {high}] of the headroom, {lead}.")
+    return sentences
 
 
 def _shares(others: dict[str, EvaluationResult], base: EvaluationResult, ceiling: EvaluationResult) -> dict[str, dict]:
