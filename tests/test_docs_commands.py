@@ -78,8 +78,6 @@ NOT_OURS = (
     "python3 -m venv",
     "sphinx-build ",
     "ray ",
-    "cat ",
-    "sbatch ",
     "python -m tests.",
     "MAEXP_",
     "python -m maexp.agents.runtime",
