@@ -13,7 +13,7 @@ torch.set_num_threads(1)
 wp.config.quiet = True
 if os.environ.get("MAEXP_WARP_MODE"):  # `.ci/run` repeats the kernel tests with "debug" (bounds checks)
     wp.config.mode = os.environ["MAEXP_WARP_MODE"]
-settings.register_profile("long")  # `--hypothesis-profile=long`: hours of fuzzing by hand (docs/reliability.md)
+settings.register_profile("long")  # `--hypothesis-profile=long`: hours of fuzzing by hand (CONTRIBUTING.md)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -1,1 +1,1 @@
-"""Recorded episodes that guard behaviour: `python -m tests.golden.record` records them anew (docs/reliability.md)."""
+"""Recorded episodes that guard behaviour: `python -m tests.golden.record` records them anew (CONTRIBUTING.md)."""
