@@ -75,11 +75,8 @@ ELSEWHERE = ("hydra/launcher=", "hydra.launcher.", "collector.ray_address=")
 WORKERS = ("num_envs=4", "collector.workers=2", "total_frames=16")  # stronger than SMALLER: a team for each worker
 NOT_OURS = (
     "pip ",
-    "python3 -m venv",
     "sphinx-build ",
     "ray ",
-    "python -m tests.",
-    "MAEXP_",
     "python -m maexp.agents.runtime",
     "python -m build",
 )

@@ -63,19 +63,18 @@ class TeamPlanner:
         policy: one of the classical planners, `maexp.agents.runtime.CHOICES`, a trained policy that ships, by its name
             (`shipped_names()`), or the folder of another one.
         radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
-        robot_radius: distance that a robot's centre keeps from obstacles [m]; one for all, or {name: radius} or a list;
+        robot_radius: distance that a robot's centre keeps from obstacles [m]: one for all, {name: radius} or a list;
             None: as the policy was trained, 0.3 m for planners.
         clearance_factor: where there is room, ways keep twice this many radii from obstacles.
         occupied: cells of the grid with this value and above are obstacles, 1 to 100.
-        bounded: the grid shows the whole place; else the unknown lies beyond its edge.
-        least_area: targets with less unknown area in sight do not count [m^2]; None: what the smallest robot covers.
-        patience: how long a robot may stand still on its way, or beside a target that stays [s].
-        pause: how long a target is given up for the first time; longer every time, the third for good [s].
-        max_speed, max_accel, seconds: of the robots [m/s, m/s^2], and between two calls [s]; only trained policies look
-            at them; None: as the policy was trained.
-        distinct: robots go to different targets, farther apart than their bodies; else each goes where it likes best.
-        spare: what robots do for which no target is left then: "wait" where they are, or drive "home" to where they
-            were first seen.
+        bounded: the grid shows the whole place; otherwise the unknown continues beyond its edge.
+        least_area: targets with less unknown area in sight are left out [m^2]; None: what the smallest robot covers.
+        patience: how long a robot may stand still on its way, or beside a target that remains [s].
+        pause: how long a target is given up [s]; the second time for twice as long, the third time for good.
+        max_speed, max_accel, seconds: limits of the robots [m/s, m/s^2], and the time between two calls [s]; only
+            trained policies use them; None: as the policy was trained.
+        distinct: robots go to different targets, farther apart than their bodies; otherwise each takes its best.
+        spare: what robots without a target do: "wait" where they are, or drive "home" to where they were first seen.
         seed: of random choices.
     """
 
@@ -153,8 +152,7 @@ class TeamPlanner:
             now: time of the call [s]; None: a clock's.
 
         Raises:
-            ValueError: an argument is not what it should be at all. What is merely missing or strange is ignored,
-                and `Plan.notes` says so.
+            ValueError: an argument cannot be used. Odd cells and poses are ignored, and `Plan.notes` says so.
         """
         notes: list[str] = []
         now = time.monotonic() if now is None else _finite("now", now)
