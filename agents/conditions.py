@@ -40,6 +40,7 @@ CONDITIONS = {
     "messages": ("comm.bandwidth=1000", "comm.delay=1"),
     "faults": ("faults.probability=0.5",),
     "radar": RADAR,
+    "false_alarm": ("radar.false_alarm=0.2",),
     "odometry": ODOMETRY,
     "base": BASE,
     "base_return": (*BASE, "comm.strategy=return_to_base"),

@@ -45,6 +45,7 @@ NOT_COPIED = (
     "cells_sent",
     "evidence_free",
     "evidence_boundary",
+    "false_walls",
     "odometry_error",
     "pose_estimate",
     "center_estimate",
@@ -80,7 +81,7 @@ def branch_env(
 
 def perfect(radar: RadarConfig) -> RadarConfig:
     """A radar that misses nothing, alike in all else."""
-    return replace(radar, missed=0.0, noise=0.0, evidence=1)
+    return replace(radar, missed=0.0, noise=0.0, false_alarm=0.0, evidence=1)
 
 
 class Branches:

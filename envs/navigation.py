@@ -82,7 +82,8 @@ class Navigation:
         self.arrays |= {name: wp.from_torch(sim.map_tensors[name], dtype=wp.vec2) for name in ("lower", "upper")}
         prefix = "known" if limited else "viewers"
         flags = [wp.from_torch(self._state[f"{prefix}_{points}"]) for points in ("free", "boundary")]
-        self.known_grids = KnownGrids(sim.maps, self.grids, self.arrays["map_id"], *flags, self.rows, cells)
+        false = wp.from_torch(self._state["false_walls"]) if sim.settings.false_alarms else None
+        self.known_grids = KnownGrids(sim.maps, self.grids, self.arrays["map_id"], *flags, self.rows, cells, false)
         threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("collision_threshold", "clearance"))
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)

@@ -98,11 +98,17 @@ def perfect_radars(settings: EnvSettings) -> bool:
     return all(one.perfect for one in settings.radar)
 
 
+def false_alarms(settings: EnvSettings) -> bool:
+    """Whether robots may take free ground for walls."""
+    return any(one.false_alarm > 0.0 for one in settings.radar)
+
+
 def radar_sensing(settings: EnvSettings, bank: MapBank) -> Sensing:
     """What radars miss, as the kernels read it."""
     chance = [[return_chance(one.missed, one.noise, m.resolution) for one in settings.radar] for m in bank.maps]
     sensing, device = Sensing(), str(settings.device)
     sensing.chance = wp.array(chance, dtype=wp.float32, device=device)
+    sensing.false_alarm = wp.array([one.false_alarm for one in settings.radar], dtype=wp.float32, device=device)
     sensing.needed = wp.array([one.evidence for one in settings.radar], dtype=wp.int32, device=device)
     return sensing
 
@@ -145,6 +151,7 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         faults=faults.some,
         fault_probability=faults.probability,
         fault_steps=max(1, round(min(faults.duration, 1e8) / DT)),
+        false_alarms=false_alarms(settings),
         drifts=odometry.some,
         odometry_drift=odometry.drift,
         odometry_turn=odometry.turn,
@@ -179,6 +186,7 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         sensing=not perfect_radars(settings),
         drifts=settings.odometry.some,
         messages=settings.comm.messages,
+        false_alarms=false_alarms(settings),
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robot),
     )
 
@@ -212,7 +220,7 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         "cell": cells,
         "slot": news_capacity(cells),
         "word": max(-(-width // 32) * height for width, height in shapes),
-        "point": bank.max_free + bank.max_boundary,
+        "point": bank.max_free * (1 + false_alarms(settings)) + bank.max_boundary,
         "ring": 2,
         "source": 1,
         "end": 2,

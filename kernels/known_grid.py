@@ -4,8 +4,9 @@ Rows: `rows_per_env` consecutive rows belong to one env, one row where knowledge
 where communication is limited. Cells are numbered ``iy * width + ix`` with the width of the env's map.
 
 Painting enters what has become known since the last time, and lists the cells that changed.
-Knowledge only grows within an episode. A row where less is known than was painted (a new episode, a state that was
-loaded), or whose env has another map, is cleared and painted anew: nobody has to say so.
+Knowledge only grows within an episode, but for false walls. A row where less is known than was painted (a new episode,
+a state that was loaded, a false wall that is none), or whose env has another map, is cleared and painted anew: nobody
+has to say so.
 """
 
 import warp as wp
@@ -265,6 +266,7 @@ class KnownGrids:
         maps, grids: static data of the maps.
         map_id: int32 [E], the map of each env.
         free_flags, boundary_flags: int32 [E, W, points], bit i % 32 of word i // 32 for robot i.
+        false_flags: the same of free points that are taken for walls; None: none ever are.
         rows_per_env: 1 (the team's knowledge) or the number of robots (each robot's own).
         cells: cells of the largest grid.
 
@@ -280,13 +282,17 @@ class KnownGrids:
         boundary_flags: wp.array,
         rows_per_env: int,
         cells: int,
+        false_flags: wp.array | None = None,
     ):
+        self.false_flags = false_flags
         self.maps, self.grids, self.map_id = maps, grids, map_id
         self.free_flags, self.boundary_flags = free_flags, boundary_flags
         self.rows_per_env = rows_per_env
         self.lanes = lanes_on(map_id.device, 256)
         rows, device = map_id.shape[0] * rows_per_env, map_id.device
         points = free_flags.shape[2] + boundary_flags.shape[2]
+        if false_flags is not None:
+            points += false_flags.shape[2]
         words, slots = wall_capacity(grids), news_capacity(cells)
         sizes = {"row": rows, "cell": cells, "word": words, "point": points, "slot": slots}
         vars(self).update(make_arrays(KNOWN, sizes, device))
@@ -301,7 +307,7 @@ class KnownGrids:
         self._paint_layers(launch, again=1)
 
     def _paint_layers(self, launch: Launch, again: int) -> None:
-        """Paint obstacles, then free points."""
+        """Paint obstacles, then free points, and over them what is taken for walls."""
         maps, grids = self.maps, self.grids
         obstacles = {
             "point_begin": maps.boundary_begin,
@@ -317,7 +323,11 @@ class KnownGrids:
             "value": wp.uint8(FREE),
             "shift": 0,
         }
-        for layer in (obstacles, free):
+        layers = [obstacles, free]
+        if self.false_flags is not None:
+            shift = self.free_flags.shape[2] + self.boundary_flags.shape[2]
+            layers.append(free | {"flags": self.false_flags, "value": wp.uint8(OBSTACLE), "shift": shift})
+        for layer in layers:
             given = vars(self) | layer | {"again": again}
             launch_named(launch, _paint_points, (self.known.shape[0], self.lanes), given)
 

@@ -292,6 +292,8 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     flags = [s.seen_free, s.seen_boundary, s.viewers_free, s.viewers_boundary]
     if shard.settings.limited:
         flags += [s.known_free, s.known_boundary]
+    if shard.settings.false_alarms:
+        flags.append(s.false_walls)
     lanes = lanes_on(shard.device, 1024)
     for one in flags:
         shard.call(launch, _clear_flags, (*one.shape[:2], lanes), flags=one, lanes=lanes)

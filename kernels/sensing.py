@@ -1,8 +1,14 @@
-"""Radars that miss returns: what a robot sees of the points in its view in a local step, and when it knows them.
+"""Radars that miss returns or give false ones: what a robot sees of the points in its view in a local step, and when it
+knows them.
 
 A point in view gives a return with the probability `return_chance`, drawn by (seed, env, episode, step, robot, point).
 A robot knows a point once it has had as many returns of it as `radar.evidence` asks for. Each counts its own: what it
 tells others is what it knows.
+
+A free point in view gives a false return with the probability `radar.false_alarm`, drawn before the other: it looks
+like a wall. True and false returns cancel each other. A robot takes a point for a wall once so many more were false,
+until they cancel or it knows the point, by itself or from others. It tells nobody of false walls; where all know the
+same, they stand in the map of all.
 """
 
 import math
@@ -22,6 +28,7 @@ if TYPE_CHECKING:
 wp.set_module_options(MODULE_OPTIONS)
 
 COUNTED = 128  # beside the returns of a boundary point: looked at in this local step
+FALSE = 128  # beside those of a free point: they were false
 
 
 @wp.struct
@@ -30,6 +37,7 @@ class Sensing:
 
     chance: wp.array2d(dtype=wp.float32)  # [map, robot], `return_chance`
     needed: wp.array(dtype=wp.int32)  # [robot], returns after which a robot knows a point
+    false_alarm: wp.array(dtype=wp.float32)  # [robot], probability of a false return
 
 
 def return_chance(missed: float, noise: float, spacing: float) -> float:
@@ -54,6 +62,16 @@ def gives_return(
     return chance >= 1.0 or keyed_uniform(seed, env_id, episode, step, -1 - i * points - point) < chance
 
 
+@wp.func
+def weigh_return(evidence: int, true: bool) -> int:
+    """The evidence for a free point after one more return: so many true ones, or `FALSE` and so many false ones."""
+    balance = evidence
+    if evidence >= FALSE:
+        balance = FALSE - evidence
+    balance += wp.where(true, 1, -1)
+    return wp.where(balance >= 0, balance, FALSE - balance)
+
+
 @wp.kernel
 def _sense_points(
     # Map:
@@ -76,6 +94,7 @@ def _sense_points(
     evidence_free: wp.array3d(dtype=wp.uint8),  # [env, robot, free]
     evidence_boundary: wp.array3d(dtype=wp.uint8),  # [env, robot, boundary]
     seen_boundary: wp.array3d(dtype=wp.int32),  # [env, word, boundary]
+    false_walls: wp.array3d(dtype=wp.int32),  # [env, word, free]
     viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
     viewers_boundary: wp.array3d(dtype=wp.int32),  # [env, 1, boundary]
     # Scratch in and out:
@@ -83,7 +102,7 @@ def _sense_points(
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Mark the boundary points in view of robot (e, i) that it knows now, as `visibility._scan_boundary` does, and
-    leave in the list of visible free points those that give a return and are known.
+    leave in the list of visible free points those that give a true return and are known.
 
     A boundary point is in view where a free point is that it touches, whether or not that gives a return itself.
     """
@@ -94,6 +113,7 @@ def _sense_points(
     step = local_step[e] + ahead
     chance = sensing.chance[m, i]
     needed = sensing.needed[i]
+    false_alarm = sensing.false_alarm[i]
     radius = robots.radar_range[e, i]
     origin = center[e, i]
     word = i / ROBOTS_PER_WORD
@@ -122,11 +142,20 @@ def _sense_points(
         for n in range(maps.neighbour_begin[first + j], maps.neighbour_begin[first + j + 1]):
             near = maps.neighbour[n]
             evidence_boundary[e, i, near] = wp.uint8(int(evidence_boundary[e, i, near]) % COUNTED)
-        known = gives_return(chance, seed[0], env_id[e], episode[e], step, i, j, points)
-        if known and (seen_free[e, word, j] & bit) == 0:
-            found = int(evidence_free[e, i, j]) + 1
-            evidence_free[e, i, j] = wp.uint8(found)
-            known = found >= needed
+        wrong = bool(False)
+        if false_alarm > 0.0:
+            draw = -1 - (center.shape[1] + i) * points - j
+            wrong = keyed_uniform(seed[0], env_id[e], episode[e], step, draw) < false_alarm
+        known = not wrong and gives_return(chance, seed[0], env_id[e], episode[e], step, i, j, points)
+        if (wrong or known) and (seen_free[e, word, j] & bit) == 0:
+            found = weigh_return(int(evidence_free[e, i, j]), known)
+            if found <= FALSE + needed:
+                evidence_free[e, i, j] = wp.uint8(found)
+            if wrong and found >= FALSE + needed:
+                wp.atomic_or(false_walls, e, word, j, bit)
+            if false_alarm > 0.0 and found == 0:
+                wp.atomic_and(false_walls, e, word, j, ~bit)
+            known = known and found < FALSE and found >= needed
         if known:
             visible[e, i, kept] = j
             kept += 1
@@ -150,10 +179,43 @@ def _forget_returns(
             evidence[e, i, j] = wp.uint8(0)
 
 
+@wp.kernel
+def _settle_walls(
+    # Settings:
+    limited: int,
+    lanes: int,
+    # State in:
+    active: wp.array(dtype=wp.int32),  # [env]
+    viewers_free: wp.array3d(dtype=wp.int32),  # [env, 1, free]
+    known_free: wp.array3d(dtype=wp.int32),  # [env, word, free]
+    # State in and out:
+    false_walls: wp.array3d(dtype=wp.int32),  # [env, word, free]
+):
+    """What is known to be free is no wall: to a robot, or where all know the same to all."""
+    e, lane = wp.tid()
+    if active[e] == 0:
+        return
+    for word in range(false_walls.shape[1]):
+        for j in range(lane, false_walls.shape[2], lanes):
+            walls = false_walls[e, word, j]
+            if walls != 0:
+                if limited != 0:
+                    false_walls[e, word, j] = walls & ~known_free[e, word, j]
+                elif viewers_free[e, 0, j] != 0:
+                    false_walls[e, word, j] = 0
+
+
 def sense(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
     """What radars that miss returns make of what is in view, where ``running`` [env] is set; ``ahead``: 0 in the scan
     of a reset, 1 in that of a local step."""
     shard.call(launch, _sense_points, active=running, ahead=ahead, sensing=shard.sim.sensing)
+
+
+def settle_walls(launch: Launch, shard: "Shard", running: wp.array) -> None:
+    """Take back false walls of what has become known, where ``running`` [env] is set."""
+    if shard.settings.false_alarms:
+        lanes = lanes_on(shard.device, 1024)
+        shard.call(launch, _settle_walls, (shard.shape[0], lanes), active=running, lanes=lanes)
 
 
 def forget_returns(launch: Launch, shard: "Shard") -> None:

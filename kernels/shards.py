@@ -77,6 +77,11 @@ class Shard:
         return getattr(self.view, f"{prefix}_{what}")
 
     @property
+    def false_walls(self) -> wp.array | None:
+        """Flags of free points that robots take for walls, if any may."""
+        return self.view.false_walls if self.settings.false_alarms else None
+
+    @property
     def believed(self) -> dict[str, wp.array]:
         """Poses and centres as robots believe them to be, for kernels that plan ways and observe."""
         return self._as_drifting("estimate", "pose", "center")

@@ -43,6 +43,7 @@ class Settings:
     faults: bool  # whether robots may fail
     fault_probability: float  # of each robot in an episode
     fault_steps: int  # how long that lasts
+    false_alarms: bool  # whether radars take free ground for walls
     drifts: bool  # whether odometry does
     odometry_drift: float  # [m/sqrt(m)]
     odometry_turn: float  # [rad/sqrt(m)]

@@ -29,6 +29,8 @@ AXES = {
     "A": ("robot", "as N where radars miss returns, else 1"),
     "C": ("free", "as F where radars miss returns, else 1"),
     "I": ("boundary", "as B where radars miss returns, else 1"),
+    "L": ("word", "as W where radars give false returns, else 1"),
+    "Z": ("free", "as F where radars give false returns, else 1"),
     "X": ("radio", "as U where messages take room or time, else 1"),
     "Y": ("point", "points of the largest map where messages take room or time, else 1"),
     "R": ("term", "terms of the reward"),
@@ -86,8 +88,9 @@ STATE = {
         " `VIEWER_NOW` for each that sees it now"),
     "viewers_boundary": Field(wp.int32, "E 1 B", "", "robots that have ever scanned the point"),
     "evidence_free": Field(wp.uint8, "E A C", "",
-        "returns of the free point that the robot has had, until it knows it"),
+        "returns of the free point that the robot has had, until it knows it; `sensing.FALSE` and more: false ones"),
     "evidence_boundary": Field(wp.uint8, "E A I", "", "the same of boundary points"),
+    "false_walls": Field(wp.int32, "E L Z", "", "bit of every robot that takes the free point for a wall"),
     "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it"),
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
     "learned": Field(wp.int32, "E X Y", "", "points in the order in which the radio learned of them; boundary points"
@@ -186,6 +189,7 @@ def axis_sizes(
     sensing: bool = False,
     drifts: bool = False,
     messages: bool = False,
+    false_alarms: bool = False,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     radios = num_robots + base_station
@@ -204,6 +208,8 @@ def axis_sizes(
         "A": num_robots if sensing else 1,
         "C": max(free, 1) if sensing else 1,
         "I": max(boundary, 1) if sensing else 1,
+        "L": words if false_alarms else 1,
+        "Z": max(free, 1) if false_alarms else 1,
         "X": radios if messages else 1,
         "Y": max(free + boundary, 1) if messages else 1,
         "V": max(visible, 1),

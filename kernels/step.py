@@ -17,6 +17,7 @@ from maexp.kernels.planner import plan
 from maexp.kernels.radio import note_links, place_base
 from maexp.kernels.reset import place_teams, start_episodes
 from maexp.kernels.reward import close_step, reward_robots
+from maexp.kernels.sensing import settle_walls
 from maexp.kernels.shards import Shard
 from maexp.kernels.visibility import scan
 from maexp.kernels.wavefront import find_paths, pick_waypoints
@@ -35,6 +36,7 @@ def local_step(launch: Launch, shard: Shard) -> None:
     scan(launch, shard, active, ahead=1)
     merge_scan(launch, shard, active)
     share_maps(launch, shard, active)
+    settle_walls(launch, shard, active)
     note_links(launch, shard)
     reward_robots(launch, shard)
     record_track(launch, shard, active, ahead=1)
@@ -61,6 +63,7 @@ def reset(launch: Launch, shard: Shard) -> None:
     scan(launch, shard, mask, ahead=0)
     merge_scan(launch, shard, mask)
     share_maps(launch, shard, mask)
+    settle_walls(launch, shard, mask)
     record_track(launch, shard, mask, ahead=0)
     start_episodes(launch, shard)
 

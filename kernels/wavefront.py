@@ -291,6 +291,7 @@ class Wavefront:
             shard.known("boundary"),
             robots if limited else 1,
             sim.nav_cells,
+            shard.false_walls,
         )
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)

@@ -128,6 +128,10 @@ def setups() -> dict:
         ),
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
         "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
+        "false alarms": (
+            dict(planner=wavefront, comm=near, radar=RadarConfig(missed=0.5, false_alarm=0.2)),
+            "cost_utility",
+        ),
         "odometry": (
             dict(planner=wavefront, odometry=OdometryConfig(drift=0.2, turn=0.1, jump=0.5, jump_rate=1.0)),
             "hungarian",

@@ -73,7 +73,7 @@ def test_messages_agree(device):
     here, there = (play(one, "wavefront", comm=comm)["info"] for one in ("cpu", device))
     for name in ("base_coverage", "worst_coverage_auc", "bytes_sent"):
         torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
-    assert (here["bytes_sent"][-1] > 1000).all() and here["bytes_sent"].max() <= 30 * 4 * 100
+    assert 0 < here["bytes_sent"][-1].min() and here["bytes_sent"].max() <= 31 * 4 * 100  # steps, radios, bytes
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -87,7 +87,7 @@ def test_failures_agree(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_missed_returns_agree(device):
     """Which returns come is drawn from the same keys."""
-    radar = RadarConfig(missed=0.4, noise=0.4, evidence=2)
+    radar = RadarConfig(missed=0.4, noise=0.4, evidence=2, false_alarm=0.1)
     here, there = (play(one, "wavefront", radar=radar)["info"] for one in ("cpu", device))
     torch.testing.assert_close(there["coverage"], here["coverage"], rtol=1e-3, atol=2e-3)
     first = play("cpu", "wavefront")["info", "coverage"][0]

@@ -24,13 +24,21 @@ class Growing:
     def __init__(self, rows_per_env: int, through_unknown: bool):
         self.scene = Scene(4, ROBOTS, rows_per_env, share=0.0)
         self.rows_per_env, self.through_unknown = rows_per_env, through_unknown
+        self.false: wp.array | None = None
         self.known = self.grids()
         self.masks = self.masks_of(self.known)
 
     def grids(self) -> KnownGrids:
         old = self.scene.known
         return KnownGrids(
-            old.maps, old.grids, old.map_id, old.free_flags, old.boundary_flags, old.rows_per_env, self.scene.cells
+            old.maps,
+            old.grids,
+            old.map_id,
+            old.free_flags,
+            old.boundary_flags,
+            old.rows_per_env,
+            self.scene.cells,
+            self.false,
         )
 
     def masks_of(self, known: KnownGrids) -> PassableGrids:
@@ -79,6 +87,25 @@ def test_what_becomes_known_is_entered_as_if_painted_anew(rows_per_env, through_
     assert (growing.known.news_count.numpy().reshape(3, -1) < 0).any(1).tolist() == [False, True, False]
     growing.show(rng, 0.08, keep=True)
     growing.check()
+
+
+@pytest.mark.parametrize("rows_per_env", [1, ROBOTS])
+def test_false_walls_come_and_go(rows_per_env):
+    rng, growing = np.random.default_rng(10), Growing(rows_per_env, True)
+    flags = growing.known.free_flags
+    growing.false = wp.zeros(flags.shape, dtype=wp.int32, device="cpu")
+    growing.known = growing.grids()
+    growing.masks = growing.masks_of(growing.known)
+    walls = [np.zeros_like(one) for one in growing.scene.free]
+    growing.check()
+    for gone in (0.0, 0.0, 0.5, 0.0, 1.0):
+        growing.show(rng, 0.05, keep=True)
+        some = [rng.random(one.shape) < 0.03 for one in walls]
+        walls = [(one & (rng.random(one.shape) >= gone)) | more for one, more in zip(walls, some, strict=True)]
+        growing.false.assign(flag_words(walls, 1, flags.shape[2]))
+        growing.check()
+        assert (growing.known.news_count.numpy() < 0).any() == (gone > 0.0)
+    assert (growing.known.known.numpy() == OBSTACLE).any()
 
 
 def test_another_map_is_painted_anew():

@@ -1,4 +1,4 @@
-"""Radars that miss returns: the kernel against its definition, and what robots make of it."""
+"""Radars that miss returns or give false ones: the kernel against its definition, and what robots make of it."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,10 @@ from oracle import radar, sensing
 from worlds import act, play_alike, room
 
 from maexp.agents.policies import POLICIES
+from maexp.agents.policies.foreign import TeamSight
 from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig, RadarConfig
 from maexp.kernels import unpack_flags
+from maexp.kernels.constants import OBSTACLE
 from maexp.kernels.types import VIEWER_NOW
 
 pytestmark = pytest.mark.kernels
@@ -16,8 +18,8 @@ pytestmark = pytest.mark.kernels
 WORLDS = [room(24, 17), room(19, 22, "rotated", spacing=0.8)]
 RADARS = [
     RadarConfig(range=6.0, missed=0.3, noise=0.3, evidence=2),
-    RadarConfig(range=7.0, missed=0.6),
-    RadarConfig(range=5.0, evidence=3),
+    RadarConfig(range=7.0, missed=0.6, false_alarm=0.2),
+    RadarConfig(range=5.0, evidence=3, false_alarm=0.3),
 ]
 PERFECT = [RadarConfig(range=one.range) for one in RADARS]
 
@@ -45,6 +47,7 @@ def scans(radars, steps: int = 4) -> list:
         "visible_count",
         "seen_free",
         "seen_boundary",
+        "false_walls",
         "viewers_free",
         "viewers_boundary",
         "center",
@@ -67,7 +70,7 @@ def test_what_is_seen_is_that_of_the_definition():
     """Every scan of two teams on two maps: returns, evidence, what is known, who has seen it and who sees it now."""
     env, *true = scans(PERFECT)
     _, *found = scans(RADARS)
-    maps, dropped, waited = env.simulation.map_tensors, 0, 0
+    maps, dropped, waited, walled = env.simulation.map_tensors, 0, 0, 0
     for e in range(2):
         m = int(true[0]["map_id"][e])
         free, boundary = (
@@ -84,6 +87,9 @@ def test_what_is_seen_is_that_of_the_definition():
                 points,
                 sensing.chance(one.missed, one.noise, spacing),
                 one.evidence,
+                one.false_alarm,
+                len(free),
+                len(RADARS),
             )
             for i, one in enumerate(RADARS)
         ]
@@ -108,6 +114,10 @@ def test_what_is_seen_is_that_of_the_definition():
                 waited += sum(one > 0 and j not in looker.known for j, one in enumerate(looker.returns))
                 seen.append(set(listed))
             known = [sum(j in one.known for one in lookers) for j in range(points)]
+            for i, looker in enumerate(lookers):
+                walls = {j for j in looker.walls if not known[j]}
+                assert bits(now["false_walls"][e], i, len(free)) == walls
+                walled += len(walls)
             assert now["viewers_free"][e, 0, : len(free)].tolist() == known[: len(free)]
             assert now["viewers_boundary"][e, 0, : len(boundary)].tolist() == known[len(free) :]
             assert int(now["covered"][e]) == sum(map(bool, known[: len(free)]))
@@ -115,7 +125,7 @@ def test_what_is_seen_is_that_of_the_definition():
                 for i, mine in enumerate(seen):
                     others = set().union(*(one for k, one in enumerate(seen) if k != i))
                     assert int(now["overlap"][e, i]) == len(mine & others)
-    assert dropped > 1000 and waited > 100
+    assert dropped > 1000 and waited > 100 and walled > 30
 
 
 def test_the_share_of_returns():
@@ -145,13 +155,13 @@ def test_episodes_start_without_evidence():
     fresh = make(RADARS)
     fresh.set_episodes(torch.tensor([8, 9]))
     fresh.reset()
-    for name in ("evidence_free", "evidence_boundary", "seen_free", "seen_boundary"):
+    for name in ("evidence_free", "evidence_boundary", "seen_free", "seen_boundary", "false_walls"):
         assert torch.equal(env.simulation.tensors[name], fresh.simulation.tensors[name]), name
     assert env.simulation.tensors["evidence_free"].any()
 
 
 def test_they_repeat_in_any_batch_from_a_saved_state_and_in_a_copy():
-    names = ("pose", "seen_free", "evidence_free", "evidence_boundary")
+    names = ("pose", "seen_free", "evidence_free", "evidence_boundary", "false_walls")
     assert len([*play_alike(make(RADARS, envs=1), make(RADARS, envs=3), 6, names)]) == 6
 
 
@@ -167,6 +177,41 @@ def test_teams_explore_all_the_same(name, comm):
     assert (td["info", "coverage"] > 0.1).all() and first.max() < td["info", "coverage"].max()
 
 
+@pytest.mark.parametrize("comm", [CommConfig(), CommConfig(range=6.0)])
+def test_false_walls_stand_in_the_grids_until_they_are_found_out(comm):
+    """A robot's own, or those of all where all know the same; and none that it knows to be free ground."""
+    env = make([RadarConfig(range=6.0, missed=0.8, false_alarm=0.3)] * 3, comm=comm, local_steps=1)
+    sight, s, cells = TeamSight(env), env.simulation.tensors, env.simulation.nav_grids.free_cell.numpy()
+    begin, counts, gone = env.simulation.map_tensors["free_begin"].tolist(), [], 0
+    generator, before = torch.Generator().manual_seed(2), [set(), set()]
+    env.reset()
+    for _ in range(12):
+        env.step(act(env, generator))
+        sight.look()
+        found = sight.known_grids.known.numpy()
+        for e in range(2):
+            m, rows = int(s["map_id"][e]), 1 if sight.rows == 1 else 3
+            count = begin[m + 1] - begin[m]
+            free = known_to(env, e, count)
+            own = [bits(s["false_walls"][e], i, count) for i in range(3)]
+            walls = [set.union(*own)] if rows == 1 else own
+            for row in range(rows):
+                assert not walls[row] & free[row]
+                states = found[e * rows + row, cells[begin[m] + np.array(sorted(walls[row]), int)]]
+                assert (states == OBSTACLE).all()
+            counts.append(len(walls[0]))
+            gone += len(before[e] - walls[0])
+            before[e] = walls[0]
+    assert max(counts) > 5 and gone > 20
+
+
+def known_to(env: ExplorationEnv, e: int, count: int) -> list[set[int]]:
+    """Free points that each robot knows, or all where all know the same."""
+    if env.settings.limited:
+        return [bits(env.simulation.tensors["known_free"][e], i, count) for i in range(3)]
+    return [set(env.simulation.tensors["viewers_free"][e, 0, :count].nonzero().ravel().tolist())]
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -174,6 +219,8 @@ def test_teams_explore_all_the_same(name, comm):
         (dict(missed=-0.1), "radar.missed=-0.1"),
         (dict(noise=float("nan")), "radar.noise=nan"),
         (dict(noise=50.0), "radar.noise=50 m leaves fewer than one return in 100 on map"),
+        (dict(false_alarm=0.5), "radar.false_alarm=0.5 must be a number from 0 to 0.4"),
+        (dict(false_alarm=-0.1), "radar.false_alarm=-0.1"),
         (dict(evidence=0), "radar.evidence=0 must be"),
         (dict(evidence=101), "radar.evidence=101 must be a whole number from 1 to 100"),
         (dict(evidence=1.5), "radar.evidence=1.5"),

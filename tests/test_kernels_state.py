@@ -37,7 +37,7 @@ def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=Non
         comm=CommConfig(range=9.0, signal=True, delay=delay) if limited else None,
         observation=ObservationConfig(map="known"),
         faults=FaultsConfig(probability=0.5) if limited else None,
-        radar=RadarConfig(evidence=2) if limited else None,
+        radar=RadarConfig(evidence=2, false_alarm=0.1) if limited else None,
         odometry=OdometryConfig(drift=0.1) if limited else None,
     )
 
@@ -82,6 +82,8 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
         "H": words if limited else 1,
         "P": free if limited else 1,
         "Q": boundary if limited else 1,
+        "L": words if limited else 1,
+        "Z": free if limited else 1,
         "X": robots if limited else 1,
         "S": robots,
         "M": 3,

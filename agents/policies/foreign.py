@@ -72,7 +72,8 @@ class TeamSight:
         map_id, free, boundary = (
             wp.from_torch(sim.tensors[name]) for name in ("map_id", f"{kind}_free", f"{kind}_boundary")
         )
-        self.known_grids = KnownGrids(sim.maps, grids, map_id, free, boundary, self.rows, cells)
+        false = wp.from_torch(sim.tensors["false_walls"]) if sim.settings.false_alarms else None
+        self.known_grids = KnownGrids(sim.maps, grids, map_id, free, boundary, self.rows, cells, false)
         finish_filling(env.device)
         self.launch = launch_on(env.device)
         width, height, cell, origin = (getattr(grids, one).numpy() for one in ("width", "height", "cell", "origin"))

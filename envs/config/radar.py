@@ -9,6 +9,7 @@ from maexp.envs.fields import setting
 from .group import Group
 
 MOST_MISSED = 0.99  # of a radar's returns
+MOST_FALSE = 0.4  # of a free point's returns: walls that are none must be found out
 MOST_EVIDENCE = 100  # returns that a robot may ask for before it knows a point
 
 
@@ -33,9 +34,15 @@ class RadarConfig(Group):
     noise: float = setting(
         0.0, "standard deviation of a range; returns off by half the points' spacing are dropped", unit="m", low=0
     )
+    false_alarm: float = setting(
+        0.0,
+        "probability that a free point in view looks like a wall in a step of 0.1 s",
+        low=0,
+        high=MOST_FALSE,
+    )
     evidence: int = setting(1, "returns of a point after which a robot knows it", low=1, high=MOST_EVIDENCE)
 
     @property
     def perfect(self) -> bool:
         """Whether a robot knows at once all that is in view."""
-        return self.missed == 0.0 and self.noise == 0.0 and self.evidence == 1
+        return self.missed == 0.0 and self.noise == 0.0 and self.false_alarm == 0.0 and self.evidence == 1
