@@ -33,7 +33,10 @@ def write_file(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 
 def short(path: Path) -> str:
     """The path as one would type it here."""
-    here = Path.cwd()
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # somebody has removed the folder that we are in
+        return str(path)
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
 
 

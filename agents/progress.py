@@ -42,6 +42,10 @@ class Progress:
         """`count` more units are done."""
         self.show(self.done + count)
 
+    def tell(self, sentence: str) -> None:
+        """Print something beside the bar."""
+        self.console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+
     def show(self, done: int, note: str = "") -> None:
         """`done` units are done in all."""
         self.done = done

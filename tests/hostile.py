@@ -1,11 +1,15 @@
 """Policies of the arena that do what they should not, in every second episode; else their robots stay."""
 
 import os
+import shutil
 import struct
 import sys
 import time
 
+import msgpack
 import numpy as np
+
+from maexp.agents.policies import wire
 
 
 class Stays:
@@ -96,28 +100,49 @@ class Huge(Stays):
         return super().fault(observation)
 
 
-class Noise(Stays):
+class Says(Stays):
+    """Writes `message` to every file that is open, and nothing more."""
+
+    message = b""
+
     def fault(self, observation):
         for number in range(3, 30):
             try:
-                os.write(number, struct.pack("<I", 20) + bytes(range(200, 220)))
+                rest = self.message
+                while rest:
+                    rest = rest[os.write(number, rest) :]
             except OSError:
                 pass
         time.sleep(1000)
 
 
-class Twice(Stays):
+class Noise(Says):
+    message = struct.pack("<I", 20) + bytes(range(200, 220))
+
+
+class Twice(Says):
     """Answers before it is asked."""
 
-    def fault(self, observation):
-        from maexp.agents.policies import wire
+    message = 2 * wire.pack({"type": "goals", "goals": [[0.0, 0.0]] * 3})
 
-        for number in range(3, 30):
-            try:
-                os.write(number, 2 * wire.pack({"type": "goals", "goals": [[0.0, 0.0]] * self.count}))
-            except OSError:
-                pass
-        time.sleep(1000)
+
+class Deep(Says):
+    """Lists in lists, so deep that Python cannot print them."""
+
+    message = b"\x82" + b"".join(map(msgpack.packb, ("type", "error", "message"))) + b"\x91" * 1010 + b"\x01"
+    message = struct.pack("<I", len(message)) + message
+
+
+class Novel(Says):
+    """As an array of words of one length this takes 200 GiB."""
+
+    message = wire.pack({"type": "goals", "goals": ["x" * 900_000] + [""] * 60_000})
+
+
+class Paints(Says):
+    """Words that would do something to a terminal."""
+
+    message = wire.pack({"type": "error", "message": "\x1b[2J\x07\u202e" + "å\n" * 300_000})
 
 
 class Deaf(Stays):
@@ -135,11 +160,30 @@ class Forks(Stays):
         for _ in range(5):
             child = os.fork()
             if child == 0:
+                self.hide()
                 time.sleep(1000)
                 os._exit(0)
             with open(os.environ["HOSTILE_CHILDREN"], "a") as file:
                 file.write(f"{child}\n")
         os._exit(0)
+
+    def hide(self):
+        pass
+
+
+class Daemons(Forks):
+    """Children that leave its session."""
+
+    def hide(self):
+        os.setsid()
+
+
+class Deletes(Stays):
+    """The folder that it and the run are in."""
+
+    def fault(self, observation):
+        shutil.rmtree(os.getcwd())
+        raise RuntimeError("gone")
 
 
 class BadReset(Stays):

@@ -176,14 +176,24 @@ def silent(link):
     threading.Event().wait(5.0)
 
 
+def replies(message: bytes):
+    """Once it is asked."""
+
+    def reply(link):
+        link.recv(2**20)
+        link.sendall(message)
+
+    return reply
+
+
 @pytest.mark.parametrize(
     ("reply", "told"),
     [
         (silent, "it gave no answer in 1 s"),
         (lambda link: None, "it closed the connection"),
         (lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"), "garbage|unasked|without being asked"),
-        (lambda link: link.sendall(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
-        (lambda link: link.sendall(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
+        (replies(wire.HEAD.pack(2**30) + b"x" * 2**20), "a message of 1,073,741,824 bytes"),
+        (replies(wire.pack({"type": "hello", "version": 2})), "it must speak version 1"),
     ],
 )
 def test_who_is_no_policy_is_told_before_anything_is_played(reply, told, monkeypatch):

@@ -70,7 +70,11 @@ FAULTS = {
     "Huge": "it answered garbage (a message of 1,073,741,824 bytes)",
     "Noise": "it answered garbage (a message that is no",
     "Deaf": "it closed its input or output",
-    "Forks": "it ",
+    "Forks": "it ended with status 0",
+    "Daemons": "it ended with status 0",
+    "Deep": "it answered garbage (a message that holds more than",
+    "Novel": "it answered garbage (a message that holds more than",
+    "Paints": "it gave up: ",
     "BadReset": "it gave up: RuntimeError in hostile.py, line",
 }
 
@@ -98,7 +102,8 @@ def test_a_fault_costs_its_episode_and_nothing_else(kind, tmp_path, monkeypatch)
     lost_after = 0 if kind == "BadReset" else 1
     steps = [20 * (lost_after if one else STEPS) for one in bad]
     assert final["local_steps"][:, 0].tolist() == steps
-    if kind == "Forks":
+    assert all(one.isprintable() and len(one) < 500 for one in reasons)
+    if kind in ("Forks", "Daemons"):
         children = [int(line) for line in (tmp_path / "children").read_text().split()]
         assert len(children) == 5 * sum(bad) and not [one for one in children if alive(one)]
 
@@ -373,6 +378,15 @@ def test_the_processor_time_is_that_of_the_process():
         assert 0.29 < guest.seconds < 0.5
         (answer,) = ask_all([(guest, {"type": "x", "spin": 30.0, "sleep": 0.0})], 0.2, 60.0)
         assert isinstance(answer, Lost) and "thought for more than 0.2 s" in str(answer)
+    finally:
+        guest.kill()
+
+
+def test_where_memory_runs_out_the_policy_is_ended_and_not_the_run():
+    guest = Process(["sleep", "60"])
+    try:
+        assert Path(f"/proc/{guest.process.pid}/oom_score_adj").read_text() == "1000\n"
+        assert int(Path("/proc/self/oom_score_adj").read_text()) < 1000
     finally:
         guest.kill()
 

@@ -100,6 +100,34 @@ def test_pairs_are_compared_with_copies_counted_once(board):
     assert np.isnan(site.describe_suite(copied)["better"][0][1]["ci95"]).all(), "two distinct episodes are no evidence"
 
 
+def test_a_note_stands_on_the_page_and_in_the_tables(board, tmp_path, capsys):
+    out, row = tmp_path / "site", board / "small" / "random.json"
+    assert main(["leaderboard", str(board), f"out={out}"]) == 0
+    assert main(["leaderboard", str(row), f"out={out}", "note=one | dice\n</script> a robot"]) == 0
+    assert [one.get("note") for one in read_all(out)] == [None, "one | dice </script> a robot"]
+    assert "- `random`: one \\| dice &lt;/script&gt; a robot\n" in (out / "README.md").read_text()
+    assert "one | dice \\u003c/script>" in (out / "index.html").read_text()
+    content = json.loads(row.read_text())
+    (out / "small" / "random.json").write_text(json.dumps(content | {"note": 3}))
+    assert main(["leaderboard", f"out={out}"]) == 2
+    assert "note is of another kind" in capsys.readouterr().err
+
+
+def test_who_is_replaced_is_told_and_another_policy_is_not(board, tmp_path, capsys):
+    out, row = tmp_path / "site", json.loads((board / "small" / "random.json").read_text())
+    assert main(["leaderboard", str(board), f"out={out}"]) == 0
+    capsys.readouterr()
+    assert main(["leaderboard", str(board), f"out={out}"]) == 0
+    assert "is replaced" not in capsys.readouterr().out, "the same rows"
+    for policy, status in (("random", 0), ("a/b", 0), ("a b", 2)):
+        path = tmp_path / "row.json"
+        path.write_text(json.dumps(row | {"policy": policy, "decisions": {}}))
+        assert main(["leaderboard", str(path), f"out={out}"]) == status
+        told = capsys.readouterr()
+        assert ("random on small was there already, with score 0." in told.out) == (policy == "random")
+    assert "a b would replace a/b" in told.err and len(read_all(out)) == 3
+
+
 def test_rows_stay_and_join(small, runs, board, tmp_path, capsys):
     out = tmp_path / "site"
     assert main(["leaderboard", str(runs[1]), f"out={out}", f"suite={small}", "verify=false"]) == 0

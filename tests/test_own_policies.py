@@ -157,9 +157,10 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
         ("my_robots:beyond", "wrote region 64, of 64 there are"),
         ("my_robots:not_finite", "wrote a offset that is NaN or infinite"),
         ("my_robots:divides", r"policy my_robots.divides raised ZeroDivisionError in my_robots.py, line \d+"),
-        ("my_robots", "policy=my_robots is unknown: choose one of .*or module:function of your own"),
+        ("my_robots", "policy=my_robots is a module: name its class or function, as policy=my_robots:NAME"),
+        ("their_robots", "policy=their_robots is unknown: choose one of .*or module:function of your own"),
         (".", "policy=. is a folder without a policy: it holds neither the contract.json of maexp export nor"),
-        ("my_robots.py", "policy=my_robots.py is a file and no checkpoint"),
+        ("my_robots.py", "policy=my_robots.py is a module: name its class or function, as policy=my_robots:NAME"),
         ("x" * 5000, "policy=x+ is unknown"),
     ],
 )

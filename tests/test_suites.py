@@ -3,6 +3,11 @@
 import json
 import re
 import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -188,18 +193,39 @@ def edit_json(change):
     return edit
 
 
-def edit_actions(change):
+def edit_actions(change, name: str = "maze_small-0003"):
     """Changes the arrays of a file of actions, and the checksum that `results.json` gives for it."""
 
-    def edit(where: Path) -> None:
-        path = where / "actions" / "maze_small-0003.npz"
+    def change_file(where: Path) -> None:
+        path = where / "actions" / f"{name}.npz"
         with np.load(path) as file:
             arrays = dict(file)
         change(arrays)
         np.savez_compressed(path, **arrays)
+
+    return edit_files(change_file)
+
+
+def edit_files(change):
+    """Changes files of actions, and the checksums that `results.json` gives for them."""
+
+    def edit(where: Path) -> None:
+        change(where)
         edit_json(lambda content: content["files"].update(folder.list_files(where)))(where)
 
     return edit
+
+
+def pick(episodes: list[int]):
+    """What a file has of these episodes, in this order."""
+    return lambda arrays: arrays.update({name: one[episodes] for name, one in arrays.items()})
+
+
+def swap_files(where: Path) -> None:
+    one, other = (where / "actions" / f"{part}-0000.npz" for part in ("maze_small", "indoor_small"))
+    kept = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(kept)
 
 
 def other_action(arrays: dict) -> None:
@@ -284,6 +310,32 @@ EDITS = {
         lambda where: shutil.copy(where / "actions" / "maze_small-0000.npz", where / "actions" / "x.npz"),
         "actions/x.npz",
         "not in both",
+    ),
+    "a file more, which is told": (
+        edit_files(lambda where: shutil.copy(where / "actions" / "maze_small-0000.npz", where / "actions" / "x.npz")),
+        "actions/x.npz",
+        "no episode of the suite is in it",
+    ),
+    "two episodes in each other's place": (
+        edit_actions(pick([1, 0, 2]), "maze_small-0000"),
+        "actions/maze_small-0000.npz",
+        "episode 0: ",
+    ),
+    "two files in each other's place": (edit_files(swap_files), "actions/maze_small-0000.npz", "episode 0: map"),
+    "an episode more": (
+        edit_actions(pick([0, 0])),
+        "actions/maze_small-0003.npz",
+        "holds episodes after the last, 3",
+    ),
+    "a seed that is none": (
+        edit_json(lambda one: one["suite"].update(seed="x", frozen_maps=False)),
+        "results.json",
+        "an entry is missing or of another kind",
+    ),
+    "a seed below 0": (
+        edit_json(lambda one: one["suite"].update(seed=-1, frozen_maps=False)),
+        "results.json",
+        "an entry is missing or of another kind",
     ),
     "no JSON": (lambda where: (where / "results.json").write_text("{"), "results.json", "is missing, damaged"),
     "an entry of another kind": (edit_json(lambda one: one.update(episodes=3)), "results.json", "episodes"),
@@ -441,7 +493,8 @@ def test_a_hostile_policy_loses_its_episodes_and_the_rest_is_played_and_verified
     monkeypatch.chdir(Path(__file__).resolve().parent)
     where = tmp_path / "run"
     assert main(["suite", "run", str(small), "policy=hostile:Exits", "workers=2", f"hydra.run.dir={where}"]) == 0
-    assert "ended early" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "ended early" in out and err.count("ended early: it ended with status 3.\n") == 1, "told at once, and once"
     content = json.loads((where / "results.json").read_text())
     for part in content["episodes"].values():
         lost = {int(number) for number in part["lost"]}
@@ -450,3 +503,50 @@ def test_a_hostile_policy_loses_its_episodes_and_the_rest_is_played_and_verified
     assert 0 < sum(len(part["lost"]) for part in content["episodes"].values()) < 8
     assert json.loads((where / "run.json").read_text())["settings"]["num_envs"] == 2
     assert verify(where, str(small))["verified"]
+
+
+def test_a_policy_that_deletes_the_folder_it_is_in_does_not_end_the_run(small, tmp_path, monkeypatch, capsys):
+    here = tmp_path / "here"
+    here.mkdir()
+    shutil.copy(Path(__file__).with_name("hostile.py"), here)
+    monkeypatch.chdir(here)
+    where = tmp_path / "run"
+    assert main(["suite", "run", str(small), "policy=hostile:Deletes", "workers=1", f"hydra.run.dir={where}"]) == 0
+    assert not here.exists() and "it gave up: RuntimeError in hostile.py" in capsys.readouterr().out
+    monkeypatch.chdir(tmp_path)
+    assert verify(where, str(small))["verified"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, small, tmp_path):
+    """As a cluster does it, or a terminal that is closed."""
+    words = ["suite", "run", str(small), "policy=hostile:Sleeps", "workers=2", f"hydra.run.dir={tmp_path / 'run'}"]
+    run = subprocess.Popen(
+        [sys.executable, "-c", "import sys; from maexp.agents.cli import main; sys.exit(main())", *words],
+        cwd=Path(__file__).parent,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        end = time.monotonic() + 120
+        while len(guests := find_guests(run.pid)) < 2:
+            assert time.monotonic() < end and run.poll() is None
+            time.sleep(0.05)
+        run.send_signal(number)
+        told = run.communicate(timeout=60)[1]
+    finally:
+        run.kill()
+        run.wait()
+    assert run.returncode == 130 and "Go on with: maexp suite run resume=" in told
+    assert not [one for one in guests if Path(f"/proc/{one}").exists()]
+
+
+def find_guests(parent: int) -> list[int]:
+    """Processes of policies that `parent` has started."""
+    found = []
+    for one in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            mine = int((one / "stat").read_text().rpartition(")")[2].split()[1]) == parent
+            if mine and b"maexp.agents.policies.guest" in (one / "cmdline").read_bytes():
+                found.append(int(one.name))
+    return found

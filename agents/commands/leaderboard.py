@@ -68,12 +68,25 @@ def run(cfg: LeaderboardSettings, where: None, overrides: list[str]) -> int:
 
     out = Path(cfg.out).expanduser()
     for row in _read_all(cfg):
+        row |= {} if cfg.note is None else {"note": " ".join(str(cfg.note).split())}
+        path = out / rows.file_of(row)
+        if path.exists() and (before := rows.read_row(path)) != row:
+            _tell_replaced(path, before, row)
         rows.write_row(out, row)  # at once: what is done stays, should a later place be damaged
     kept = [rows.read_row(one) for one in rows.find_rows(out)]
     written = site.write_site(out, kept)
     suites = len(site.group(kept))
     print(f"{len(kept)} rows on {suites} suite{'s' * (suites != 1)}. Written: {', '.join(map(short, written))}")
     return 0
+
+
+def _tell_replaced(path: Path, before: dict, row: dict) -> None:
+    """Say what a row takes the place of; UserError where that is another policy's."""
+    if before["policy"] != row["policy"]:
+        told = f"{row['policy']} would replace {before['policy']} in {short(path)}"
+        raise UserError(f"{told}: give it another name with maexp suite run ... name=NAME.")
+    suite, scores = row["suite"]["name"], [f"{one['score']['mean']:.3f}" for one in (before, row)]
+    print(f"{row['policy']} on {suite} was there already, with score {scores[0]}, and is replaced: now {scores[1]}.")
 
 
 def _read_all(cfg: LeaderboardSettings) -> Iterator[dict]:

@@ -2,9 +2,11 @@
 
 import json
 import math
+import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -134,8 +136,10 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
             write_text(where / files.RUN, files.dump(content) + "\n")
         try:
             total = len(suite.parts) * suite.episodes
-            with Progress(f"{player.name} on {suite.name}", total) as progress:
-                playing = SuiteRun(suite, player, where, seed, settings["num_envs"], device, progress.advance)
+            with _ending(), Progress(f"{player.name} on {suite.name}", total) as progress:
+                playing = SuiteRun(
+                    suite, player, where, seed, settings["num_envs"], device, progress.advance, progress.tell
+                )
                 results = playing.play()
         except KeyboardInterrupt:
             again = command(*words.split(), f"resume={short(where)}")
@@ -148,6 +152,22 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
     print(f"Written to {short(where)}: {files.RESULTS}, {files.ACTIONS}/, profile.png, {files.RUN}")
     print(f"Next: {command('suite', 'verify', short(where))}")
     return 0
+
+
+@contextmanager
+def _ending() -> Iterator[None]:
+    """A cluster or terminal that ends the run stops it as Ctrl-C does: no process of a policy stays behind."""
+
+    def stop(*_) -> None:
+        raise KeyboardInterrupt
+
+    wanted = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) != signal.SIG_IGN]  # nohup
+    before = {number: signal.signal(number, stop) for number in wanted}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _check_same_suite(where: Path, suite: Suite) -> None:

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import select
 import socket
-import subprocess
 import sys
 from threading import Thread
 
-from maexp.agents.policies.process import Guest, Lost, command_of, end
+from maexp.agents.policies.process import Guest, Lost, Session, command_of
 
 SOCKET = "socket:"
 REACH = 10.0  # seconds that connecting may take
@@ -53,29 +52,29 @@ class Connection(Guest):
 def serve(host: str, port: int, command: list[str]) -> None:
     """Start `command` for everybody who connects, with the connection as its input and output, until interrupted."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    running: set[subprocess.Popen] = set()
+    running: set[Session] = set()
     with socket.create_server((host, port), family=family) as server:
         print(f"listening at {host}, port {server.getsockname()[1]}", flush=True)
         try:
             while True:
                 link, _ = server.accept()
                 link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                process = subprocess.Popen(command, stdin=link, stdout=link, start_new_session=True)
+                process = Session(command, stdin=link, stdout=link)
                 running.add(process)
                 Thread(target=_attend, args=(link, process, running), daemon=True).start()
         finally:
             for process in list(running):
-                end(process)
+                process.end()
 
 
-def _attend(link: socket.socket, process: subprocess.Popen, running: set[subprocess.Popen]) -> None:
+def _attend(link: socket.socket, process: Session, running: set[Session]) -> None:
     """Have done with a process as soon as it has ended, or nobody listens to it."""
     with link:
         watch = select.poll()
         watch.register(link, CLOSED)
         while process.poll() is None and not watch.poll(POLL_MS):
             pass
-        end(process)
+        process.end()
         running.discard(process)
 
 

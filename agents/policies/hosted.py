@@ -89,7 +89,7 @@ class HostedPolicy:
             try:
                 goals[team] = read_goals(answer.get("goals"), self.env.num_robots)
             except ValueError as error:
-                self._lose(team, f"it {error}")
+                self._lose(team, Lost(f"it {error}"))
         region, offset = self.sight.to_action(goals)
         state["agents", "action", "region"], state["agents", "action", "offset"] = region, offset
         state["lost"] = torch.tensor([bool(one) for one in self.reasons], device=self.env.device).unsqueeze(-1)
@@ -101,12 +101,13 @@ class HostedPolicy:
             try:
                 self.guests[team] = self.make_guest()
             except Lost as lost:
-                self._lose(team, str(lost))
+                self._lose(team, lost)
         hello = {"type": "hello", "version": wire.VERSION}
         there = {team: hello for team in teams if self.guests[team] is not None}
         for team, answer in self._ask(there, "hello", START, START).items():
             if answer.get("version") != wire.VERSION:
-                self._lose(team, f"it speaks version {answer.get('version')!r}, and this is {wire.VERSION}")
+                version = repr(answer.get("version"))[:40]
+                self._lose(team, Lost(f"it speaks version {version}, and this is {wire.VERSION}"))
 
     def _ask(
         self, questions: dict[int, dict], wanted: str, limit: float | None = None, patience: float | None = None
@@ -118,15 +119,15 @@ class HostedPolicy:
         good = {}
         for team, answer in zip(asked, answers, strict=True):
             if isinstance(answer, Lost):
-                self._lose(team, str(answer))
+                self._lose(team, answer)
             elif answer["type"] != wanted:
-                self._lose(team, f"it answered {answer['type'][:40]!r} where {wanted!r} was asked for")
+                self._lose(team, Lost(f"it answered {answer['type'][:40]!r} where {wanted!r} was asked for"))
             else:
                 good[team] = answer
         return good
 
-    def _lose(self, team: int, reason: str) -> None:
-        self.reasons[team] = " ".join(reason.split())
+    def _lose(self, team: int, why: Lost) -> None:
+        self.reasons[team] = str(why)
         if self.guests[team] is not None:
             self.guests[team].kill()
         self.guests[team] = None

@@ -29,8 +29,16 @@ def describe_unknown(word: str, setting: str) -> str:
             f"{setting}={word} is a folder without a policy: it holds neither the {CONTRACT} of maexp export nor the "
             "checkpoints of maexp train."
         )
+    if module := _module_of(word):
+        return f"{setting}={word} is a module: name its class or function, as {setting}={module}:NAME."
     if os.path.exists(word):
         return f"{setting}={word} is a file and no checkpoint: give a run's folder, or that of an exported policy."
     advice = advise(word[:100], [*NAMES, *plug_ins(), *shipped_names()])
     more = "" if advice.endswith("?") else ", a run, or module:function of your own."
     return f"{setting}={word[:100]} is unknown: {advice}{more}"
+
+
+def _module_of(word: str) -> str:
+    """The module in this folder that a word without a class means; "" for none."""
+    name = word.removesuffix(".py")
+    return name if name.isidentifier() and os.path.isfile(f"{name}.py") else ""

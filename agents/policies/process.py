@@ -13,7 +13,10 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, BinaryIO
+from uuid import uuid4
 
 from maexp.agents.policies import wire
 
@@ -22,6 +25,9 @@ POLL = 0.02  # seconds between two looks at the clocks of processes that think
 GRACE = 2.0  # seconds that a process whose pipes are closed may take to end
 TAIL = 2_000  # bytes kept of what a process says on its standard error
 CHUNK = 2**16
+MOST_REASON = 400  # characters
+MARK = "MAEXP_GUEST"  # variable of the environment by which a process and all that it started are known
+ROUNDS = 100
 
 
 def command_of(word: str) -> list[str]:
@@ -39,7 +45,43 @@ def command_of(word: str) -> list[str]:
 
 
 class Lost(Exception):
-    """A process that cannot be gone on with; says why."""
+    """A process that cannot be gone on with; says why in a line that can be printed, whatever the process wrote."""
+
+    def __str__(self) -> str:
+        words = " ".join(super().__str__().split())[:MOST_REASON]
+        return "".join(one if one.isprintable() else "?" for one in words)
+
+
+class Session(subprocess.Popen):
+    """A process that leads a session; `end` ends it with all that it started."""
+
+    def __init__(self, command: list[str], **files: Any):
+        self.mark = f"{MARK}={uuid4().hex}"
+        name, _, value = self.mark.partition("=")
+        super().__init__(command, start_new_session=True, env=os.environ | {name: value}, **files)
+        with suppress(OSError):  # where memory runs out, Linux ends it, and not the run
+            Path(f"/proc/{self.pid}/oom_score_adj").write_text("1000")
+
+    def end(self) -> None:
+        """End all of the session, then those that left it: who was started by it has its environment."""
+        try:
+            os.killpg(self.pid, signal.SIGKILL)
+        except (ProcessLookupError, PermissionError):
+            pass
+        self.wait()
+        for _ in range(ROUNDS):  # some may start others meanwhile
+            left = [one for one in Path("/proc").glob("[0-9]*") if self._started(one)]
+            for one in left:
+                with suppress(ProcessLookupError, PermissionError):
+                    os.kill(int(one.name), signal.SIGKILL)
+            if not left:
+                break
+
+    def _started(self, process: Path) -> bool:
+        try:
+            return self.mark.encode() in (process / "environ").read_bytes().split(b"\0")
+        except OSError:  # it has ended, or is somebody else's
+            return False
 
 
 class Guest:
@@ -149,17 +191,11 @@ class Process(Guest):
 
     def __init__(self, command: list[str]):
         try:
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                bufsize=0,
-                start_new_session=True,
-            )
+            pipe = subprocess.PIPE
+            self.process = Session(command, stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0)
         except (OSError, ValueError) as error:
             raise Lost(f"{command[0]} cannot be started ({getattr(error, 'strerror', None) or error})") from error
-        self.spoken, self.said, self.spent = self.process.stderr, bytearray(), 0.0
+        self.spoken, self.said, self.spent, self.ended = self.process.stderr, bytearray(), 0.0, False
         super().__init__(self.process.stdin, self.process.stdout)
 
     def spent_seconds(self) -> float:
@@ -180,6 +216,13 @@ class Process(Guest):
         self.said = (self.said + part)[-TAIL:]
         return bool(part)
 
+    def check_clocks(self, limit: float, patience: float) -> None:
+        """A process that has ended gives no answer, even where others that it started hold its pipes open."""
+        if self.ended:  # at the last look: what it left in the pipe has been read since
+            raise Lost(self.last_words())
+        self.ended = self.process.poll() is not None
+        super().check_clocks(limit, patience)
+
     def last_words(self) -> str:
         """How a process that has closed its pipes ended, and the last line that it said."""
         try:
@@ -193,17 +236,8 @@ class Process(Guest):
 
     def kill(self) -> None:
         """End it, too."""
-        end(self.process)
+        self.process.end()
         super().kill()
-
-
-def end(process: subprocess.Popen) -> None:
-    """End a process that leads a session, and those that it started and did not hide."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except (ProcessLookupError, PermissionError):
-        pass
-    process.wait()
 
 
 def ask_all(

@@ -26,6 +26,7 @@ VERSION = 1
 HEAD = struct.Struct("<I")
 MOST_ANSWER = 2**20  # bytes of an answer; goals of 64 robots take two thousand
 MOST_NUMBERS = 2**16  # in an answer
+DEPTH = 4  # of an answer: map, lists of lists of numbers
 KINDS = ("int8", "int16", "int32", "int64", "uint8", "bool", "float32", "float64")
 
 
@@ -54,7 +55,18 @@ def unpack(body: bytes) -> dict[str, Any]:
         raise ValueError(f"is no msgpack ({type(error).__name__}: {' '.join(str(error).split())[:120]})") from error
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         raise ValueError("is no map with a type")
+    if not _is_plain(message):
+        raise ValueError(f"holds more than numbers, words and lists of numbers, or nests deeper than {DEPTH}")
     return message
+
+
+def _is_plain(value: Any, depth: int = DEPTH) -> bool:
+    """Whether a value can be printed and made an array: of lists of words NumPy makes gigabytes."""
+    if isinstance(value, dict):
+        return depth > 0 and all(_is_plain(one, depth - 1) for one in value.values())
+    if isinstance(value, list):
+        return depth > 0 and all(not isinstance(one, str | bytes) and _is_plain(one, depth - 1) for one in value)
+    return True
 
 
 def read(stream: BinaryIO) -> dict[str, Any] | None:

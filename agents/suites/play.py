@@ -104,7 +104,7 @@ class Recorder:
         acted = self.policy(state)
         share = (time.process_time() - begin) / playing
         own = acted.get("decision_seconds", None)
-        self.seconds.append(np.full(self.env.num_envs, share) if own is None else own.reshape(-1).numpy().copy())
+        self.seconds.append(np.full(self.env.num_envs, share) if own is None else own.reshape(-1).cpu().numpy().copy())
         return acted
 
     def _note(self) -> None:

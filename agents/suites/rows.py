@@ -195,6 +195,8 @@ def _check_numbers(row: dict[str, Any]) -> None:
     """Raise ValueError where parts do not fit, or the score does not follow from the episodes."""
     if row["format"] != FORMAT:
         raise ValueError(f"format {row['format']}")
+    if not isinstance(row.get("note", ""), str):
+        raise ValueError("note is of another kind")
     parts = row["parts"]
     if not set(parts) == set(row["films"]) == set(row["reference"]["parts"]):
         raise ValueError("parts, films and reference are not of the same parts")

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ class SuiteRun:
         num_envs: teams at once
         device: of the simulation
         advance: called with the number of episodes that are done
+        tell: called with a sentence when an episode ends early for the first time
     """
 
     suite: Suite
@@ -34,6 +35,8 @@ class SuiteRun:
     num_envs: int
     device: Any
     advance: Callable[[int], None] = lambda count: None
+    tell: Callable[[str], None] = lambda sentence: None
+    told: bool = field(default=False, init=False)
 
     def play(self) -> dict[str, Any]:
         """Play what is left, write `results.json`, and return its content."""
@@ -87,8 +90,15 @@ class SuiteRun:
                             policy = stack.enter_context(self.player.open(env))
                     played.append(play_batch(suite, env, policy, first))
                     folder.write_batch(self.where, suite, name, played[-1])
+                    self._tell_lost(name, played[-1])
                 self.advance(len(played[-1].decisions))
         return played, sums(part, maps, self.seed)
+
+    def _tell_lost(self, part: str, batch: Batch) -> None:
+        lost = [k for k, reason in enumerate(batch.reasons.tolist()) if reason]
+        if lost and not self.told:
+            self.told = True
+            self.tell(f"{part}, episode {batch.first + lost[0]} ended early: {batch.reasons[lost[0]]}.")
 
     def _read(self, name: str, first: int) -> Batch:
         """A batch that was played before."""

@@ -75,8 +75,17 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     ]
     cells = []
     for number, row in enumerate(rows, 1):
-        name = html.escape(row["policy"]).replace("|", "\\|").replace("`", "'")
+        name = _escaped(row["policy"])
         score = score_cells(row["score"], row["score"]["normalised"], row["reference"]["difference"])
         cells.append([str(number), f"`{name}`", *score, "yes" if row["verified"] else "no"])
     title = f"## {suite['name']}, version {suite['version']}"
-    return [title, "", *markdown_table([*heads, "verified"], cells), ""]
+    told: dict[str, list[str]] = {}
+    for row in rows:
+        told.setdefault(row.get("note", ""), []).append(f"`{_escaped(row['policy'])}`")
+    notes = [f"- {', '.join(names)}: {_escaped(note)}" for note, names in told.items() if note]
+    return [title, "", *markdown_table([*heads, "verified"], cells), "", *notes, *[""] * bool(notes)]
+
+
+def _escaped(text: str) -> str:
+    """For Markdown: on one line, no HTML, no end of a cell or of code."""
+    return " ".join(html.escape(text).replace("|", "\\|").replace("`", "'").split())

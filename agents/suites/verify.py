@@ -53,7 +53,7 @@ def verify(where: Path, file: str | None = None, advance: Callable[[int], None] 
             _check_numbers(where, suite, stated, found, advance)
     except UserError as error:
         found.add(folder.RESULTS, str(error))
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         found.add(folder.RESULTS, f"an entry is missing or of another kind ({type(error).__name__}: {error})")
     return report | {"verified": not found, "differences": list(found[:FEW]), "number_of_differences": len(found)}
 
@@ -88,6 +88,10 @@ def _check_numbers(where: Path, suite: Suite, stated: dict, found: Findings, adv
         batches[name] = _replay_part(where, suite, name, seed, stated, found, advance)
     if not all(sum(len(one.decisions) for one in several) == suite.episodes for several in batches.values()):
         return  # what is missing has been named, and no score follows from the rest
+    played = {_name_of(where, part, one) for part, several in batches.items() for one in several}
+    for name in stated["files"]:
+        if name not in played:
+            found.add(name, "no episode of the suite is in it")
     compare(found, folder.RESULTS, "episodes", stated["episodes"], folder.describe_episodes(suite, batches), 0.0)
     rivals = read_frozen(suite) if seed is None else play_rivals(suite, seed)["results"]
     summary = summarise_suite(suite, folder.to_results(stated["policy"], suite, batches), rivals)
@@ -112,6 +116,9 @@ def _replay_part(
             found.add(str(folder.batch_file(where, name, first).relative_to(where)), str(error))
             return played
         count = len(noted.decisions)
+        if first + count > suite.episodes:
+            found.add(_name_of(where, name, noted), f"it holds episodes after the last, {suite.episodes - 1}")
+            return played
         if env is None or env.num_envs < count:
             env = build_env(part, maps, count, suite.key(seed), ObservationConfig(pictures=False), device="cpu")
         again = replay_batch(suite, env, noted)
@@ -123,9 +130,14 @@ def _replay_part(
     return played
 
 
+def _name_of(where: Path, part: str, batch: Batch) -> str:
+    """The file of a batch, as `results.json` names it."""
+    return str(folder.batch_file(where, part, batch.first).relative_to(where))
+
+
 def _compare_batches(where: Path, noted: Batch, again: Batch, part: str, found: Findings) -> None:
     """Bit for bit: what the file of actions says came of them, and what did."""
-    file = str(folder.batch_file(where, part, noted.first).relative_to(where))
+    file = _name_of(where, part, noted)
     pairs = {"decisions": (noted.decisions, again.decisions), "map": (noted.maps, again.maps)}
     pairs |= {name: (values, again.metrics[name]) for name, values in noted.metrics.items()}
     for name, (stated, computed) in pairs.items():
