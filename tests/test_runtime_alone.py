@@ -35,7 +35,8 @@ def test_torch_is_not_there(alone):
 
 
 def test_the_page(alone):
-    (code,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "deploy.md").read_text(), re.MULTILINE | re.DOTALL)
+    page = (ROOT / "docs" / "deploy.md").read_text()
+    code = "".join(re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
     done = alone("-c", code + "\nassert plan.active.all() and not plan.notes, plan")
     assert done.returncode == 0 and done.stdout.startswith("left [") and "right [" in done.stdout, done.stderr
 

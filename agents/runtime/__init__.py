@@ -2,6 +2,7 @@
 
 from .choices import CHOICES
 from .planner import Plan, TeamPlanner
+from .robot import RobotPlanner, Word
 from .shipped import shipped_names
 
-__all__ = ["CHOICES", "Plan", "TeamPlanner", "shipped_names"]
+__all__ = ["CHOICES", "Plan", "RobotPlanner", "TeamPlanner", "Word", "shipped_names"]

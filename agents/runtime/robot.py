@@ -1,0 +1,121 @@
+"""Goals for one robot of a team without a central planner: each robot plans by itself, with what it has heard."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .frames import Grid, merge_grids
+from .planner import Plan, TeamPlanner
+
+
+@dataclass(frozen=True)
+class Word:
+    """What a robot tells of itself.
+
+    Attributes:
+        name: its name.
+        pose: x, y [m] and yaw [rad] in the frame that all robots share.
+        speed: [m/s]
+        time: of the pose, by a clock that all robots share [s].
+        grid: what it knows, its own and heard; None: the caller merges grids.
+    """
+
+    name: Hashable
+    pose: tuple[float, ...]
+    speed: float
+    time: float
+    grid: Grid | None = None
+
+
+class RobotPlanner:
+    """Chooses where one robot should go next.
+
+    It plans for itself and for the mates that it has heard, at their last words, and follows its own row of that plan.
+    So robots that hear each other and know the same choose what one `TeamPlanner` chooses for them, without a word
+    about goals; who hears nobody plays alone. Where they know different things, two may go to one place.
+
+    Args:
+        name: of the robot; the robots' names must sort, for all plan for the team in the same order.
+        policy, settings: of `TeamPlanner`, the same for all robots.
+        memory: a mate counts so long after its last word [s]; what it told of the map stays.
+    """
+
+    def __init__(self, name: Hashable, policy: Any = "cost_utility", *, memory: float = 10.0, **settings: Any):
+        if not memory > 0.0:
+            raise ValueError(f"memory={memory!r} must be a number of seconds above 0")
+        self.name, self.memory = name, memory
+        self.team = TeamPlanner(policy, **settings)
+        self.heard: dict[Hashable, Word] = {}
+        self.grids: dict[Hashable, Grid] = {}
+        self._word: Word | None = None
+
+    def reset(self) -> None:
+        """Forget the past: mates, their maps, what was given up."""
+        self.team.reset()
+        self.heard, self.grids, self._word = {}, {}, None
+
+    def hear(self, word: Word) -> None:
+        """Take in a mate's word; one that is older than its last changes nothing.
+
+        Raises:
+            ValueError: it comes from a robot of this one's name.
+        """
+        if word.name == self.name:
+            raise ValueError(f"a word from {word.name!r} came to {self.name!r}: give each robot a name of its own")
+        last = self.heard.get(word.name)
+        if last is None or word.time >= last.time:
+            self.heard[word.name] = word
+            if word.grid is not None:
+                self.grids[word.name] = word.grid
+
+    def word(self) -> Word | None:
+        """What this robot tells others: of its last plan's pose and grid; None before the first."""
+        return self._word
+
+    def plan(
+        self, grid, resolution: float, origin, pose, *, speed: float = 0.0, now: float, share: bool = False, **more: Any
+    ) -> Plan:
+        """A plan of one row, this robot's.
+
+        Args:
+            grid, resolution, origin: as for `TeamPlanner.plan`.
+            pose: x, y and, if known, yaw of this robot, or None.
+            speed: its speed [m/s].
+            now: the time, by the clock of all robots [s].
+            share: whether grids that were heard join this one, and its word holds what came of it; else the caller
+                merges them.
+            more: other arguments of `TeamPlanner.plan`.
+
+        Raises:
+            ValueError: as `TeamPlanner.plan`.
+        """
+        if share:
+            yaw = float(origin[2]) if len(origin) > 2 else 0.0
+            own = Grid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
+            own = merge_grids([own, *self.grids.values()])
+            grid, resolution, origin = own.values, own.resolution, own.origin
+        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory}
+        names = sorted([self.name, *words])
+        poses = {name: pose if name == self.name else words[name].pose for name in names}
+        speeds = [speed if name == self.name else words[name].speed for name in names]
+        plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, **more)
+        if pose is not None:
+            self._word = Word(self.name, tuple(map(float, pose)), speed, now, own if share else None)
+        return _row(plan, names.index(self.name))
+
+
+def _row(plan: Plan, row: int) -> Plan:
+    """One robot's part of a plan; it is done when the team is."""
+    one = slice(row, row + 1)
+    return replace(
+        plan,
+        names=plan.names[one],
+        goals=plan.goals[one],
+        active=plan.active[one],
+        waits=plan.waits[one],
+        ways=plan.ways[one],
+    )

@@ -1,0 +1,123 @@
+"""A planner on each robot: with what it has heard it chooses as a planner of the team does, else it plays alone."""
+
+import numpy as np
+import pytest
+from test_runtime_watch import CELL, SETTINGS, World
+
+from maexp.agents.runtime import CHOICES, RobotPlanner, TeamPlanner, Word
+from maexp.agents.runtime.frames import Grid
+
+NAMES = ("a", "b")
+
+
+def robots(policy: str = "cost_utility", **settings) -> dict[str, RobotPlanner]:
+    return {name: RobotPlanner(name, policy, **SETTINGS | settings) for name in NAMES}
+
+
+def decide(world: World, each: dict[str, RobotPlanner], share: bool = False) -> list:
+    """A plan of each robot, at its place; grids as all robots have seen them together."""
+    return [
+        planner.plan(world.grid(), CELL, (0.0, 0.0), tuple(at), now=world.now, share=share)
+        for planner, at in zip(each.values(), world.at, strict=True)
+    ]
+
+
+def tell(each: dict[str, RobotPlanner]) -> None:
+    """All hear all."""
+    for speaker in each.values():
+        for listener in each.values():
+            if listener is not speaker and speaker.word() is not None:
+                listener.hear(speaker.word())
+
+
+@pytest.mark.parametrize("policy", list(CHOICES))
+def test_robots_that_hear_each_other_choose_as_the_team_does(policy):
+    """Twenty decisions of a team that drives: the same goals and ways, and they are apart."""
+    world, each, team = World(), robots(policy), TeamPlanner(policy, **SETTINGS)
+    for _ in range(20):
+        for planner, at in zip(each.values(), world.at, strict=True):  # where they are now, before they decide
+            for other in each.values():
+                if other is not planner:
+                    other.hear(word(planner.name, at, world.now))
+        found = decide(world, each)
+        wanted = team.plan(world.grid(), CELL, (0.0, 0.0), dict(zip(NAMES, world.at, strict=True)), now=world.now)
+        for k, plan in enumerate(found):
+            assert plan.names == (NAMES[k],) and plan.active.tolist() == [wanted.active[k]]
+            np.testing.assert_array_equal(plan.goals[0], wanted.goals[k])
+            np.testing.assert_array_equal(plan.ways[0], wanted.ways[k])
+        assert not wanted.active.all() or np.linalg.norm(wanted.goals[0] - wanted.goals[1]) >= 0.4
+        world.drive(wanted)
+
+
+def word(name: str, at, time: float, grid: Grid | None = None) -> Word:
+    return Word(name, (float(at[0]), float(at[1]), 0.0), 0.0, time, grid)
+
+
+def test_who_hears_nobody_plays_alone():
+    """Its own pose is all it knows: two such robots side by side go to one place."""
+    world, each = World(), robots("nearest_frontier")
+    world.at[1] = world.at[0] + (0.1, 0.0)
+    alone = [TeamPlanner("nearest_frontier", **SETTINGS) for _ in NAMES]
+    same = 0
+    for _ in range(10):
+        found = decide(world, each)
+        for k, (plan, planner) in enumerate(zip(found, alone, strict=True)):
+            wanted = planner.plan(world.grid(), CELL, (0.0, 0.0), {NAMES[k]: world.at[k]}, now=world.now)
+            np.testing.assert_array_equal(plan.goals, wanted.goals)
+        same += bool(np.array_equal(found[0].goals, found[1].goals))
+        world.now += 1.0
+    assert same > 5
+
+
+def test_words_and_grids_go_together():
+    """Each has seen its own half; after a word both know both, and choose as the team does on the merged grid."""
+    world, each = World(), robots()
+    halves = [world.grid(), world.grid()]
+    world.at[1] = (13.0, 8.0)
+    world.look()
+    halves[1] = np.where(halves[0] >= 0, -1, world.grid())
+    origin, team = (0.0, 0.0), TeamPlanner("cost_utility", **SETTINGS)
+    for _ in range(2):
+        found = [
+            one.plan(half, CELL, origin, tuple(at), now=0.0, share=True)
+            for one, half, at in zip(each.values(), halves, world.at, strict=True)
+        ]
+        tell(each)
+    wanted = team.plan(world.grid(), CELL, origin, dict(zip(NAMES, world.at, strict=True)), now=0.0)
+    np.testing.assert_array_equal(np.concatenate([one.goals for one in found]), wanted.goals)
+    assert (each["a"].word().grid.values >= 0).sum() == (world.grid() >= 0).sum() > (halves[0] >= 0).sum()
+
+
+def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
+    world, planner = World(), RobotPlanner("a", memory=5.0, **SETTINGS)
+    known = Grid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
+    planner.hear(word("b", world.at[1], 0.0, known))
+    planner.hear(word("b", (5.0, 5.0), -1.0))
+    assert planner.heard["b"].pose[0] == world.at[1][0], "an older word"
+    asked, ask = [], planner.team.plan
+
+    def note(grid, resolution, origin, poses, **more):
+        asked.append(list(poses))
+        return ask(grid, resolution, origin, poses, **more)
+
+    monkeypatch.setattr(planner.team, "plan", note)
+    for now in (5.0, 5.1):
+        assert planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=now, share=True).done
+    assert asked == [["a", "b"], ["a"]]
+    planner.reset()
+    assert not planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=0.0, share=True).done
+
+
+def test_a_robot_without_a_pose_says_nothing_and_stays():
+    planner = RobotPlanner("a", **SETTINGS)
+    plan = planner.plan(World().grid(), CELL, (0.0, 0.0), None, now=0.0)
+    assert planner.word() is None and not plan.active.any() and "has no pose" in plan.notes[0]
+
+
+def test_bad_input_is_named():
+    with pytest.raises(ValueError, match="memory=0 must be"):
+        RobotPlanner("a", memory=0)
+    with pytest.raises(ValueError, match="a word from 'a' came to 'a'"):
+        RobotPlanner("a").hear(word("a", (0.0, 0.0), 0.0))
+    with pytest.raises(ValueError, match="choose|unknown"):
+        RobotPlanner("a", spare="away")
