@@ -17,7 +17,7 @@ from test_hosted import ENVS, EXAMPLES, STEPS, alive, play_hosted
 
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
-from maexp.agents.policies import hosted, wire
+from maexp.agents.policies import connection, hosted, wire
 from maexp.agents.policies.connection import address_of
 from maexp.agents.policies.foreign import as_policy
 from maexp.agents.policies.hosted import HostedPolicy, guest_of
@@ -150,6 +150,39 @@ def test_what_plays_elsewhere_ends_with_its_connection(tmp_path):
         assert alive(number)
         guest.kill()
         wait_for(lambda: not alive(number))
+
+
+def test_a_listener_that_is_told_to_end_leaves_nobody_behind(tmp_path):
+    """As `docker stop` and service managers tell it."""
+    script = tmp_path / "sleeps"
+    script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/number\nexec sleep 1000\n")
+    script.chmod(0o755)
+    place = f"127.0.0.1:{free_port()}"
+    command = [sys.executable, "-m", "maexp.agents.policies.connection", place, f"exec:{script}"]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        port = int(server.stdout.readline().split()[-1])
+        with socket.create_connection(("127.0.0.1", port)):
+            wait_for(lambda: (tmp_path / "number").exists() and (tmp_path / "number").read_text().strip())
+            server.send_signal(signal.SIGTERM)
+            assert server.wait(20) == 0
+        assert not alive(int((tmp_path / "number").read_text()))
+    finally:
+        server.kill()
+        server.wait()
+        server.stdout.close()
+
+
+def test_a_program_that_is_not_there_is_told_before_anybody_connects(capsys, monkeypatch):
+    monkeypatch.setattr(connection.signal, "signal", lambda *_: None)
+    assert connection.main([f"127.0.0.1:{free_port()}", "exec:/no/such/program"]) == 2
+    assert "/no/such/program is no program" in capsys.readouterr().err
+
+
+def free_port() -> int:
+    """Of this machine."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
 
 
 def wait_for(what, seconds: float = 20.0) -> None:

@@ -177,6 +177,20 @@ def test_goals_that_are_none_are_told(served):
     assert any("/robot2/goal_pose: x=nan" in one for one in served.told)
 
 
+def test_who_sends_nonsense_without_end_is_told_for_a_while_and_cannot_paint_the_terminal(served):
+    env, policy, robots = served()
+    with policy:
+        env.reset()
+        policy.sight.look()
+        policy._begin()
+        for count in range(6):
+            for k in range(10):
+                robots.send("robot1", 1.0, 1.0, frame=f"\x1b[2J{count}{k}" + "x" * 1000)
+            policy.robots[0].listen(0, 0, policy._refuse)
+    told = [one for one in served.told if "a goal in the frame" in one]
+    assert 0 < len(told) < 30 and all(one.isprintable() and len(one) < 500 for one in told)
+
+
 def test_a_clock_that_waits_runs_on_and_then_goes_on_with_what_there_is(served):
     env, policy, robots = served()
     with policy:
@@ -522,6 +536,17 @@ def test_a_team_tells_that_nobody_navigates(alone):
     robots.publish()
     step_until(made, lambda: len(told) >= 2)
     assert any("a: nobody offers /a/navigate_to_pose yet" in one for one in told) and not made.driver.goals
+
+
+@pytest.mark.parametrize("text", ["garbage", "[1]", '{"robots": ["a"]}', '{"begins": 0, "robots": 3}'])
+def test_an_episode_that_is_none_ends_no_team(text, alone):
+    robots, made = Publishers(), team(offsets=(0.0,) * 6, period=0.2)
+    writer = robots.wire.writer(EPISODE)
+    writer.write(writer.make(data=text))
+    step_until(made, lambda: made.told)
+    assert made.told == [f"{EPISODE}: what came is no episode of an arena"] and made.driver.episode is None
+    robots.publish()
+    step_until(made, lambda: made.course.plans)
 
 
 def test_maps_that_are_not_aligned_are_refused(alone):

@@ -8,6 +8,8 @@ reaches the port can have it think. HOST is an address of this machine, 0.0.0.0 
 from __future__ import annotations
 
 import select
+import shutil
+import signal
 import socket
 import sys
 from threading import Thread
@@ -79,10 +81,18 @@ def _attend(link: socket.socket, process: Session, running: set[Session]) -> Non
 
 
 def main(words: list[str]) -> int:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C or SIGTERM."""
+
+    def stop(*_) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
     try:
         where, word = words
-        serve(*address_of(where), command_of(word))
+        command = command_of(word)
+        if shutil.which(command[0]) is None:
+            raise ValueError(f"{command[0]} is no program")
+        serve(*address_of(where), command)
     except (OSError, ValueError) as error:
         print(f"usage: python -m maexp.agents.policies.connection HOST:PORT WORD ({error})", file=sys.stderr)
         return 2

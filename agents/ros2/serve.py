@@ -43,6 +43,7 @@ GAP = 10 * SECOND  # between two episodes, so that nobody believes poses of the 
 SETTLE = 1.0  # seconds that slow readers are waited for
 PROGRESS = 5  # ticks between two feedbacks of navigate_to_pose
 MOVES, PATIENCE = 0.5, 10 * SECOND  # a goal is given up where a robot moves less in this time [m, ns]; nav2's defaults
+MOST_TOLD = 20  # goals that were refused
 WORD = "ros2"
 """What results say instead of a policy's name on the command line."""
 
@@ -333,9 +334,10 @@ class Ros2Policy:
         return float(np.linalg.norm(robot.goal - at)) > self.near
 
     def _refuse(self, sentence: str) -> None:
-        if sentence not in self.said:
+        """Told once, and no more after `MOST_TOLD`; what others wrote does nothing to a terminal."""
+        if sentence not in self.said and len(self.said) < MOST_TOLD:
             self.said.add(sentence)
-            self.serving.tell(sentence)
+            self.serving.tell("".join(one if one.isprintable() else "?" for one in sentence[:300]))
 
     def _now(self) -> int:
         """What the clock shows now [ns]."""

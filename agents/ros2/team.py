@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from maexp.agents.ros2.goals import SENDERS
 from maexp.agents.runtime.driver import Decision, TeamDriver
 
 POLL = 0.1  # seconds between two looks where nothing comes
+NUMBERS = ("begins", "radar_range", "robot_radius", "max_speed", "max_accel", "seconds", "decision_seconds", "seed")
+"""Of an episode that an arena tells of: what is read of it here, and by `maexp.agents.runtime`."""
 
 
 @dataclass
@@ -90,7 +93,7 @@ class Ros2Team:
         """
         self.wire.wait(POLL)
         maps = self._take_maps()  # first: what belongs to them has come before
-        told = [json.loads(message.data) for message in self.episode.take()]
+        told = [one for message in self.episode.take() if (one := self._read_episode(message.data)) is not None]
         if told and told[-1].get("over"):
             return True
         if told:
@@ -133,6 +136,20 @@ class Ros2Team:
                 self.driver.take_odometry(robot, message)
         for message in self.clock.take():
             self.time = read_nanoseconds(message.clock)
+
+    def _read_episode(self, text: str) -> dict[str, Any] | None:
+        """What an arena tells; None: it is something else, which is told."""
+        try:
+            found = json.loads(text)
+            if found.get("over"):
+                return found
+            named = isinstance(found["robots"], list) and all(isinstance(one, str) for one in found["robots"])
+            if named and all(type(found[name]) in (int, float) and math.isfinite(found[name]) for name in NUMBERS):
+                return found
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+            pass
+        self.tell(f"{EPISODE}: what came is no episode of an arena")
+        return None
 
     def _begin(self, episode: dict[str, Any]) -> None:
         """Another episode of the arena."""
