@@ -18,7 +18,8 @@ from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.sensing import Sensing, return_chance
-from maexp.kernels.simulation import Settings, Simulation
+from maexp.kernels.shards import Settings
+from maexp.kernels.simulation import Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
 from maexp.kernels.types import DT, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
 from maexp.kernels.wavefront import grid_bytes

@@ -1,17 +1,13 @@
 """Collisions: by distance of centres, or by oriented footprints. A collided robot stops for good."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.geometry import rectangle_distance, rectangles_gap
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Maps, point_xy, row_range, row_span
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -101,6 +97,6 @@ def _detect_collisions(
         slip[e, i] = 0.0
 
 
-def detect_collisions(launch: Launch, shard: "Shard") -> None:
+def detect_collisions(launch: Launch, shard: Shard) -> None:
     """Stop the robots that collide in this local step."""
     shard.call(launch, _detect_collisions)

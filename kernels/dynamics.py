@@ -4,16 +4,12 @@ A pose is ``(x, y, v, theta)`` of the reference point [m, m, m/s, rad]: the rear
 car, the body's centre otherwise. ``slip`` is the sideways speed of an omnidirectional robot [m/s].
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import PI
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -130,6 +126,6 @@ def _move_robots(
     center[e, i] = wp.vec3(pose[e, i][0] + offset * ahead[0], pose[e, i][1] + offset * ahead[1], 0.0)
 
 
-def move_robots(launch: Launch, shard: "Shard") -> None:
+def move_robots(launch: Launch, shard: Shard) -> None:
     """Move the robots by one local step."""
     shard.call(launch, _move_robots)

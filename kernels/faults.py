@@ -4,16 +4,12 @@ A robot fails at the moment that is given for it, or with a probability at one d
 depends on (seed, env, episode, robot) alone, so nothing has to be remembered.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -64,8 +60,7 @@ def _fail_robots(
         control[e, i] = wp.vec2(0.0, 0.0)
 
 
-def fail_robots(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def fail_robots(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Stop the robots that have failed, in the envs where ``running`` [env] is set, if any may fail."""
     if shard.settings.faults:
-        given = {"active": running, "fault_at": shard.sim.fault_at}
-        shard.call(launch, _fail_robots, **given)
+        shard.call(launch, _fail_robots, active=running)

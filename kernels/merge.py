@@ -6,8 +6,6 @@ Flags live in words of 32 radios, ``[env, word, point]``: ``seen`` holds everyth
 large team. All sums are integers: weights are spacing squared in the map's unit, 1 on maps of even density.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.geometry import segment_distance
@@ -15,11 +13,9 @@ from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.messages import pass_messages
 from maexp.kernels.radio import radio_at, receive_signals
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps, floor_within
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -288,13 +284,13 @@ def _share_points(
     wp.atomic_add(cells_sent, e, wp.int64(sent))
 
 
-def merge_scan(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def merge_scan(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Count what is new and what overlaps, and add the scan to the team's map, where ``running`` [env] is set."""
     shard.call(launch, _count_points, active=running)
     shard.call(launch, _merge_scan, active=running)
 
 
-def share_maps(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def share_maps(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Let radios hear from others, where communication is limited and ``running`` [env] is set."""
     if not shard.settings.limited:
         return

@@ -9,16 +9,12 @@ Left out: what it takes to tell which points one knows, where one is and where o
 disturb each other; headers. Two that send the same point in the same step both count.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -210,13 +206,13 @@ def _forget_messages(
         underway[e, i, point] = wp.uint8(0)
 
 
-def forget_messages(launch: Launch, shard: "Shard") -> None:
+def forget_messages(launch: Launch, shard: Shard) -> None:
     """Nothing is on its way in the envs of ``mask``."""
     if shard.settings.messages:
         shard.call(launch, _forget_messages, shard.radios)
 
 
-def pass_messages(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def pass_messages(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Let radios send and hear of points, where ``running`` [env] is set."""
     for kernel in (_note_own, _send, _arrive):
         shard.call(launch, kernel, shard.radios, active=running)

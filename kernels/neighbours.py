@@ -1,16 +1,12 @@
 """Who is near whom in a local step: looked up once, for planner, collisions and radar."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots, curvature, heading_change
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import HALF, point_xy, within
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -78,7 +74,7 @@ def _list_near(
     near_count[e, i] = count
 
 
-def list_near(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def list_near(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Who is near whom, and which way robots face, in the envs where ``running`` [env] is set."""
     shard.call(launch, _face_robots, active=running)
     shard.call(launch, _list_near, active=running)

@@ -4,14 +4,13 @@ Picture: a square frame around the extent, x along the first axis, flattened to 
 Which points a pixel shows is fixed per map (`Maps.pixel_point`, and the other way `Maps.point_pixel`).
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.geometry import rectangle_distance
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     CHANNEL_EXPLORED,
@@ -30,9 +29,6 @@ from maexp.kernels.types import (
     Maps,
     point_xy,
 )
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -326,12 +322,12 @@ def _observe_pose(
         grid[e, i, 3, r] = (y - last[1]) / side
 
 
-def record_track(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+def record_track(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> None:
     """Note where the robots are, where ``running`` [env] is set: in the step being finished (1) or at its start (0)."""
     shard.call(launch, _record_track, active=running, ahead=ahead, **shard.believed)
 
 
-def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: torch.Tensor) -> None:
+def draw_pictures(launch: Launch, shard: Shard, picture: torch.Tensor, team: torch.Tensor) -> None:
     """Pictures of the envs of ``mask``.
 
     Args:
@@ -352,7 +348,7 @@ def draw_pictures(launch: Launch, shard: "Shard", picture: torch.Tensor, team: t
     shard.call(launch, _draw_robots, picture=given["picture"])
 
 
-def observe_pose(launch: Launch, shard: "Shard", pose: torch.Tensor, grid: torch.Tensor) -> None:
+def observe_pose(launch: Launch, shard: Shard, pose: torch.Tensor, grid: torch.Tensor) -> None:
     """Poses and region offsets.
 
     Args:

@@ -9,18 +9,14 @@ A robot plans its way by where it believes to be, and drives it by what its rada
 far from it as they are, and only the place that it drives to is off by the error.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots, wrap_angle
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import PI, Maps, point_xy
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -150,20 +146,20 @@ def _take_aim(
     waypoint_aim[e, i] = place_from(center[e, i], center_estimate[e, i], turn, waypoint[e, i])
 
 
-def drift_odometry(launch: Launch, shard: "Shard") -> None:
+def drift_odometry(launch: Launch, shard: Shard) -> None:
     """Let the robots' estimates drift, if they do, by the way that they drive next."""
     if shard.settings.drifts:
         shard.call(launch, _drift_odometry)
 
 
-def estimate_poses(launch: Launch, shard: "Shard", running: wp.array, begins: int) -> None:
+def estimate_poses(launch: Launch, shard: Shard, running: wp.array, begins: int) -> None:
     """Where robots believe to be, if that drifts, in the envs where ``running`` [env] is set; ``begins``: 1 at a
     reset."""
     if shard.settings.drifts:
         shard.call(launch, _estimate_poses, active=running, begins=begins)
 
 
-def take_aim(launch: Launch, shard: "Shard") -> None:
+def take_aim(launch: Launch, shard: Shard) -> None:
     """Where robots drive that are elsewhere than they believe (`Shard.aims`), once their waypoints are set."""
     if shard.settings.drifts:
         shard.call(launch, _take_aim)

@@ -5,20 +5,15 @@ than twice its clearance. So the waypoint is drawn nearer until DWA drives no fa
 clearance shrinks where the path itself is narrower.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import point_xy
 from maexp.kernels.ways import PATH_CELLS, path_slot
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
-    from maexp.kernels.wavefront import Wavefront
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -227,32 +222,12 @@ def _hold_back(
         waypoint[e, i] = at + way * (length / full)
 
 
-def fit_clearance(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
+def fit_clearance(launch: Launch, shard: Shard) -> None:
     """Fit the clearance that DWA is to keep to the paths."""
-    known, paths = wavefront.known, wavefront.paths
-    shard.call(
-        launch,
-        _fit_clearance,
-        grids=known.grids,
-        walls=known.walls,
-        rows_per_env=known.rows_per_env,
-        path=paths.path,
-        path_total=paths.path_total,
-        path_used=paths.path_used,
-        clearance=wavefront.narrowed.clearance,
-        **shard.believed,
-    )
+    shard.call(launch, _fit_clearance, **shard.wavefront.values, **shard.believed)
 
 
-def hold_back(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
+def hold_back(launch: Launch, shard: Shard) -> None:
     """Draw waypoints nearer, so that robots can brake."""
-    known, settings = wavefront.known, shard.settings
-    shard.call(
-        launch,
-        _hold_back,
-        grids=known.grids,
-        walls=known.walls,
-        rows_per_env=known.rows_per_env,
-        lead_time=settings.horizon * settings.dt,
-        **shard.aims,
-    )
+    lead_time = shard.settings.horizon * shard.settings.dt
+    shard.call(launch, _hold_back, lead_time=lead_time, **shard.wavefront.values, **shard.aims)

@@ -1,18 +1,16 @@
 """Local planners: goals from actions, direct controls from the policy, and which planner drives."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dwa import _plan_dwa
 from maexp.kernels.dynamics import Robots, turn_limit
 from maexp.kernels.launches import Launch
 from maexp.kernels.odometry import take_aim
+from maexp.kernels.pace import fit_clearance, hold_back
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.stopping import hold_turns
 from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -70,13 +68,13 @@ def _set_goal(
     waypoint[e, i] = wp.vec2(x, y)
 
 
-def set_goals(launch: Launch, shard: "Shard") -> None:
+def set_goals(launch: Launch, shard: Shard) -> None:
     """Turn the policy's regions and offsets into goals."""
     if shard.settings.planner != "direct":
         shard.call(launch, _set_goal)
 
 
-def plan(launch: Launch, shard: "Shard") -> None:
+def plan(launch: Launch, shard: Shard) -> None:
     """How to go: controls of every robot. Under `wavefront` DWA drives to its waypoints with its clearances."""
     if shard.settings.planner == "direct":
         shard.call(launch, _plan_direct)
@@ -88,3 +86,24 @@ def plan(launch: Launch, shard: "Shard") -> None:
         robots = shard.wavefront.narrowed
     boundary, waypoint = shard.known("boundary"), shard.aims["waypoint"]
     shard.call(launch, _plan_dwa, robots=robots, known_boundary=boundary, waypoint=waypoint)
+
+
+def find_paths(launch: Launch, shard: Shard) -> None:
+    """Bring maps and paths up to date, if the planner is `wavefront`: every `replan_steps` local steps."""
+    if shard.wavefront is not None:
+        s, own = shard.view, shard.wavefront
+        own.known.paint(launch)
+        own.passable.paint(launch)
+        own.paths.find(launch, s.active, s.collided, shard.believed["center"], s.goal, s.waypoint)
+
+
+def pick_waypoints(launch: Launch, shard: Shard) -> None:
+    """Bring `waypoint` and the clearances up to date, if the planner is `wavefront`: every local step."""
+    if shard.wavefront is not None:
+        s, own = shard.view, shard.wavefront
+        center = shard.believed["center"]
+        own.paths.pick(launch, s.active, s.collided, center, s.goal, shard.robots.radar_range, s.waypoint)
+        fit_clearance(launch, shard)
+        take_aim(launch, shard)
+        hold_back(launch, shard)
+        hold_turns(launch, shard)

@@ -9,18 +9,14 @@ with ``blocked`` the cells of the line that are no free ground, and ``clear`` it
 logarithm is absent where nothing blocks, the second where no more than 35 cells are clear.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, point_xy
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -269,21 +265,19 @@ def _note_links(
         told_step[e] = local_step[e] + 1
 
 
-def place_base(launch: Launch, shard: "Shard") -> None:
+def place_base(launch: Launch, shard: Shard) -> None:
     """Put the base stations of the envs of ``mask`` in their places, where communication is limited."""
     if shard.settings.limited:
         shard.call(launch, _place_base, shard.shape[0])
 
 
-def receive_signals(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def receive_signals(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Part those whose signals do not arrive, where radios send any."""
     if shard.settings.signal:
-        sim = shard.sim
-        given = {"grids": sim.nav_grids, "open": sim.open_cells, "radio": sim.radio, "active": running}
-        shard.call(launch, _receive_signals, shard.radios, **given)
+        shard.call(launch, _receive_signals, shard.radios, active=running)
 
 
-def note_links(launch: Launch, shard: "Shard") -> None:
+def note_links(launch: Launch, shard: Shard) -> None:
     """Sum up who knows how much and who is connected, where communication is limited."""
     if shard.settings.limited:
         shard.call(launch, _note_links, shard.shape[0])

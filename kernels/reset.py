@@ -3,19 +3,15 @@
 Random numbers are keyed by (seed, env, episode), so env i plays the same episodes for any batch size.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.messages import forget_messages
 from maexp.kernels.sensing import forget_returns
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import BESIDE, ERROR_START, PI, ROOM_UNIT, START_CLEARANCE, Maps, point_xy
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -286,7 +282,7 @@ def _start_env(
         overlap[e, i] = 0
 
 
-def place_teams(launch: Launch, shard: "Shard") -> None:
+def place_teams(launch: Launch, shard: Shard) -> None:
     """Clear the envs of ``mask``, choose their maps and place their robots."""
     s = shard.view
     flags = [s.seen_free, s.seen_boundary, s.viewers_free, s.viewers_boundary]
@@ -304,6 +300,6 @@ def place_teams(launch: Launch, shard: "Shard") -> None:
     shard.call(launch, _clear_robots)
 
 
-def start_episodes(launch: Launch, shard: "Shard") -> None:
+def start_episodes(launch: Launch, shard: Shard) -> None:
     """Let the envs of ``mask`` run, once their robots have taken the first scan."""
     shard.call(launch, _start_env, shard.shape[0])

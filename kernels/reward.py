@@ -1,16 +1,12 @@
 """Reward terms, milestones and the end of an episode (docs/concepts.md; paper, section III-D)."""
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.launches import Launch
 from maexp.kernels.radio import UNION
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import Maps
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -178,11 +174,11 @@ def _close_step(
         active[e] = 0
 
 
-def reward_robots(launch: Launch, shard: "Shard") -> None:
+def reward_robots(launch: Launch, shard: Shard) -> None:
     """Add this local step's reward."""
     shard.call(launch, _reward_robots)
 
 
-def close_step(launch: Launch, shard: "Shard") -> None:
+def close_step(launch: Launch, shard: Shard) -> None:
     """Count the local step, note milestones, end episodes."""
     shard.call(launch, _close_step, shard.shape[0])

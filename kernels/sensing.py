@@ -12,18 +12,15 @@ same, they stand in the map of all.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -205,22 +202,22 @@ def _settle_walls(
                     false_walls[e, word, j] = 0
 
 
-def sense(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+def sense(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> None:
     """What radars that miss returns make of what is in view, where ``running`` [env] is set; ``ahead``: 0 in the scan
     of a reset, 1 in that of a local step."""
-    shard.call(launch, _sense_points, active=running, ahead=ahead, sensing=shard.sim.sensing)
+    shard.call(launch, _sense_points, active=running, ahead=ahead)
 
 
-def settle_walls(launch: Launch, shard: "Shard", running: wp.array) -> None:
+def settle_walls(launch: Launch, shard: Shard, running: wp.array) -> None:
     """Take back false walls of what has become known, where ``running`` [env] is set."""
     if shard.settings.false_alarms:
         lanes = lanes_on(shard.device, 1024)
         shard.call(launch, _settle_walls, (shard.shape[0], lanes), active=running, lanes=lanes)
 
 
-def forget_returns(launch: Launch, shard: "Shard") -> None:
+def forget_returns(launch: Launch, shard: Shard) -> None:
     """Clear the returns of the envs of ``mask``, if any are counted."""
-    if shard.sim.sensing is not None:
+    if shard.values["sensing"] is not None:
         lanes = lanes_on(shard.device, 1024)
         for one in (shard.view.evidence_free, shard.view.evidence_boundary):
             dim = (*one.shape[:2], lanes)

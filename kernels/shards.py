@@ -1,4 +1,4 @@
-"""Runs of envs: shards, each for a thread of its own, and blocks that fit a processor's cache.
+"""What a stage gets: settings and a shard, a run of envs; and the threads that run them.
 
 Rows of different envs never share memory. On the CPU each shard of a simulation runs in a thread of its own (native
 code releases the interpreter lock). Local steps run over smaller blocks of envs: what the kernels of a block touch
@@ -8,26 +8,56 @@ depend on neither the number of shards nor that of blocks.
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import Any
 
-import torch
 import warp as wp
 
 from maexp.kernels.launches import Launch, RecordedLaunch, lanes_on, launch_named, record, replay
-from maexp.kernels.state import memory_per_env, robots_struct, warp_views
-from maexp.kernels.wavefront import Wavefront
-
-if TYPE_CHECKING:
-    from maexp.kernels.simulation import Simulation
+from maexp.kernels.types import DT
 
 Stage = Callable[[Launch, "Shard"], None]
 """``stage(launch, shard)`` launches kernels over the envs of a shard."""
 
-BLOCK_BYTES = 2**19
-"""State and scratch of a block of envs: what they touch fits a core's own cache."""
-BLOCK_ROBOTS = 16
-"""A block holds no fewer robots, so that what a launch costs by itself stays small beside them."""
+
+@dataclass(frozen=True)
+class Settings:
+    """What a local step does. Kernels take these by their names."""
+
+    planner: str  # "dwa", "wavefront" or "direct"
+    num_accel: int  # accelerations that DWA tries
+    num_steering: int  # steering angles (yaw rates, sideways accelerations) that it tries
+    horizon: int  # local steps that it looks ahead
+    clearance_weight: float  # of its score's term for what is nearer than the clearance
+    replan_steps: int  # local steps between two searches of `wavefront`
+    footprint: bool  # collisions by oriented footprints, not by distances of centres
+    limited: bool  # whether communication is
+    comm_range: float  # [m]
+    line_of_sight: bool  # whether walls block communication
+    loss: float  # probability that two radios miss each other in a local step
+    messages: bool  # whether messages take room or time
+    message_cells: int  # points that a radio sends in a local step
+    message_delay: int  # local steps until a message arrives
+    signal: bool  # whether radios hear what arrives of a signal
+    base_x: float  # where the base station is [m]; inf: where robot 0 starts
+    base_y: float
+    faults: bool  # whether robots may fail
+    fault_probability: float  # of each robot in an episode
+    fault_steps: int  # how long that lasts
+    false_alarms: bool  # whether radars take free ground for walls
+    drifts: bool  # whether odometry does
+    odometry_drift: float  # [m/sqrt(m)]
+    odometry_turn: float  # [rad/sqrt(m)]
+    odometry_jump: float  # [m]
+    odometry_jump_rate: float  # [1/s]
+    episode_steps: int  # local steps of an episode
+    done: int  # whose coverage ends an episode (`radio.UNION`)
+    draw_known: bool  # pictures show what robots know, not what they have seen
+    success_coverage: float  # share at which an episode ends
+    together: bool  # teams start in one place
+    dt: float = DT  # of a local step [s]
 
 
 class Shard:
@@ -37,39 +67,42 @@ class Shard:
         settings: what a step does.
         view: Warp arrays of state and scratch, by name.
         robots: their parameters.
+        values: all that kernels' parameters may be named after.
         shape: envs and robots of a team.
         radios: envs and radios of a team.
         lanes: threads that share the work of a robot.
+
+    Args:
+        sizes: lengths of the axes.
+        more: values that all shards have: ``maps`` and the like.
+        make_wavefront: what the planner `wavefront` keeps for a shard (`wavefront.Wavefront`).
     """
 
-    def __init__(self, sim: "Simulation", first: int, last: int):
-        self.first, self.last = first, last
-        self.sim, self.settings = sim, sim.settings
-        self.device = wp.device_from_torch(sim.device)
-        self.view = warp_views(sim.tensors, first, last)
-        self.robots = robots_struct(sim.robot_tensors, first, last)
-        self.shape = (last - first, sim.sizes["N"])
-        self.radios = (last - first, sim.sizes["U"])
-        self.lanes = lanes_on(self.device, 32)
-        numbers = {name: int(one) if isinstance(one, bool) else one for name, one in vars(sim.settings).items()}
-        self._values = (
-            numbers
-            | vars(self.view)
-            | {
-                "maps": sim.maps,
-                "num_maps": sim.num_maps,
-                "map_starts": sim.map_starts_view,
-                "weights": sim.weights,
-                "robots": self.robots,
-                "lanes": self.lanes,
-            }
-        )
+    def __init__(
+        self,
+        first: int,
+        last: int,
+        device: wp.Device,
+        settings: Settings,
+        sizes: dict[str, int],
+        view: SimpleNamespace,
+        robots: Any,
+        more: dict[str, Any],
+        make_wavefront: Callable[["Shard"], Any],
+    ):
+        self.first, self.last, self.device = first, last, device
+        self.settings, self.view, self.robots = settings, view, robots
+        self.shape, self.radios = (last - first, sizes["N"]), (last - first, sizes["U"])
+        self.lanes = lanes_on(device, 32)
+        numbers = {name: int(one) if isinstance(one, bool) else one for name, one in vars(settings).items()}
+        self.values = numbers | vars(view) | {"robots": robots, "lanes": self.lanes} | more
+        self._make_wavefront = make_wavefront
         self._recorded: dict[Stage, list[RecordedLaunch]] = {}
 
     @cached_property
-    def wavefront(self) -> Wavefront | None:
-        """The planner's grids and paths, made when first needed."""
-        return Wavefront(self.sim, self) if self.settings.planner == "wavefront" else None
+    def wavefront(self) -> Any:
+        """What the planner `wavefront` keeps, made when first needed; None under another planner."""
+        return self._make_wavefront(self) if self.settings.planner == "wavefront" else None
 
     def known(self, what: str) -> wp.array:
         """What each robot knows, not 0: flags of robots, or under perfect communication one word, the viewers."""
@@ -100,7 +133,7 @@ class Shard:
         Its parameters are named after what they get: a field of the state, a setting, ``maps``, ``robots``; what else
         they are is ``given``.
         """
-        launch_named(launch, kernel, self.shape if dim is None else dim, self._values | given)
+        launch_named(launch, kernel, self.shape if dim is None else dim, self.values | given)
 
     def record(self, stage: Stage) -> list[RecordedLaunch]:
         """The launches of a stage, recorded when first asked for."""
@@ -111,21 +144,6 @@ class Shard:
     def replay(self, stage: Stage) -> None:
         """Run a stage."""
         replay(self.record(stage))
-
-
-def split(sim: "Simulation", count: int) -> list[Shard]:
-    """The envs of a simulation in ``count`` runs of about the same length."""
-    cuts = [sim.sizes["E"] * k // count for k in range(count + 1)]
-    return [Shard(sim, a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
-
-
-def blocks_per_thread(sizes: dict[str, int], device: torch.device, threads: int) -> int:
-    """How many blocks each thread gets on average; a GPU takes all envs at once."""
-    if device.type != "cpu":
-        return 1
-    fitting = BLOCK_BYTES // sum(memory_per_env(sizes).values())
-    envs = max(fitting, -(-BLOCK_ROBOTS // sizes["N"]))
-    return max(1, sizes["E"] // (envs * threads))
 
 
 class Threads:

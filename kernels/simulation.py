@@ -1,60 +1,35 @@
 """A simulation of many teams: owns the memory, and runs the stages of `step` over shards of envs."""
 
-from dataclasses import dataclass
-
 import torch
 import warp as wp
 
 from maexp.kernels import step
 from maexp.kernels.dwa import list_curvatures
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, launch_on
-from maexp.kernels.planner import set_goals
+from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.sensing import Sensing
-from maexp.kernels.shards import Threads, blocks_per_thread, split
-from maexp.kernels.state import SCRATCH, STATE, allocate
-from maexp.kernels.types import DT, Maps
-from maexp.kernels.wavefront import find_paths, pick_waypoints
+from maexp.kernels.shards import Settings, Shard, Threads
+from maexp.kernels.state import SCRATCH, STATE, allocate, memory_per_env, robots_struct, warp_views
+from maexp.kernels.types import Maps
+from maexp.kernels.wavefront import Wavefront
+
+BLOCK_BYTES = 2**19
+"""State and scratch of a block of envs: what they touch fits a core's own cache."""
+BLOCK_ROBOTS = 16
+"""A block holds no fewer robots, so that what a launch costs by itself stays small beside them."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a local step does. Kernels take these by their names."""
-
-    planner: str  # "dwa", "wavefront" or "direct"
-    num_accel: int  # accelerations that DWA tries
-    num_steering: int  # steering angles (yaw rates, sideways accelerations) that it tries
-    horizon: int  # local steps that it looks ahead
-    clearance_weight: float  # of its score's term for what is nearer than the clearance
-    replan_steps: int  # local steps between two searches of `wavefront`
-    footprint: bool  # collisions by oriented footprints, not by distances of centres
-    limited: bool  # whether communication is
-    comm_range: float  # [m]
-    line_of_sight: bool  # whether walls block communication
-    loss: float  # probability that two radios miss each other in a local step
-    messages: bool  # whether messages take room or time
-    message_cells: int  # points that a radio sends in a local step
-    message_delay: int  # local steps until a message arrives
-    signal: bool  # whether radios hear what arrives of a signal
-    base_x: float  # where the base station is [m]; inf: where robot 0 starts
-    base_y: float
-    faults: bool  # whether robots may fail
-    fault_probability: float  # of each robot in an episode
-    fault_steps: int  # how long that lasts
-    false_alarms: bool  # whether radars take free ground for walls
-    drifts: bool  # whether odometry does
-    odometry_drift: float  # [m/sqrt(m)]
-    odometry_turn: float  # [rad/sqrt(m)]
-    odometry_jump: float  # [m]
-    odometry_jump_rate: float  # [1/s]
-    episode_steps: int  # local steps of an episode
-    done: int  # whose coverage ends an episode (`radio.UNION`)
-    draw_known: bool  # pictures show what robots know, not what they have seen
-    success_coverage: float  # share at which an episode ends
-    together: bool  # teams start in one place
-    dt: float = DT  # of a local step [s]
+def blocks_per_thread(sizes: dict[str, int], device: torch.device, threads: int) -> int:
+    """How many blocks each thread gets on average; a GPU takes all envs at once."""
+    if device.type != "cpu":
+        return 1
+    fitting = BLOCK_BYTES // sum(memory_per_env(sizes).values())
+    envs = max(fitting, -(-BLOCK_ROBOTS // sizes["N"]))
+    return max(1, sizes["E"] // (envs * threads))
 
 
 class Simulation:
@@ -102,25 +77,54 @@ class Simulation:
         self.device = torch.device(device)
         self.maps = maps_struct(maps)
         self.nav_grids, self.nav_cells = nav or (None, 0)
-        self.radio, self.fault_at, self.sensing = radio, wp.from_torch(fault_at), sensing
-        self.open_cells = None if open_cells is None else wp.from_torch(open_cells)
         self.tensors = allocate(STATE, sizes, self.device) | allocate(SCRATCH, sizes, self.device)
         self.believed = self.tensors
         if settings.drifts:
             self.believed = self.tensors | {name: self.tensors[f"{name}_estimate"] for name in ("pose", "center")}
         self.tensors["starts"].fill_(torch.inf)
         self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, device=self.device)
-        self.map_starts_view = wp.from_torch(self.map_starts, dtype=wp.vec3)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
         self.tensors["seed"].fill_(seed & 0x7FFFFFFF)
         self.tensors["episode"].fill_(-1)
         self.tensors["comm"].fill_(True)
+        self._values = {
+            "maps": self.maps,
+            "num_maps": num_maps,
+            "map_starts": wp.from_torch(self.map_starts, dtype=wp.vec3),
+            "weights": weights,
+            "radio": radio,
+            "fault_at": wp.from_torch(fault_at),
+            "sensing": sensing,
+            "grids": self.nav_grids,
+            "open": None if open_cells is None else wp.from_torch(open_cells),
+        }
         count = max(1, min(num_shards, sizes["E"]))
-        self.shards = split(self, count)
+        self.shards = self._split(count)
         per_thread = blocks_per_thread(sizes, self.device, count)
-        self.blocks = self.shards if per_thread == 1 else split(self, count * per_thread)
+        self.blocks = self.shards if per_thread == 1 else self._split(count * per_thread)
         self.threads = Threads(count)
         self._record()
+
+    def _split(self, count: int) -> list[Shard]:
+        """The envs in ``count`` runs of about the same length."""
+        cuts = [self.sizes["E"] * k // count for k in range(count + 1)]
+        return [self._shard(a, b) for a, b in zip(cuts, cuts[1:], strict=False)]
+
+    def _shard(self, first: int, last: int) -> Shard:
+        def robots() -> Robots:
+            return robots_struct(self.robot_tensors, first, last)
+
+        return Shard(
+            first,
+            last,
+            wp.device_from_torch(self.device),
+            self.settings,
+            self.sizes,
+            warp_views(self.tensors, first, last),
+            robots(),
+            self._values,
+            lambda shard: Wavefront(shard, self.maps, self.nav_grids, self.nav_cells, robots()),
+        )
 
     def _record(self) -> None:
         """Record all launches here: threads must not load kernels at the same time."""

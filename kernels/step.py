@@ -13,14 +13,13 @@ from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track
 from maexp.kernels.odometry import drift_odometry, estimate_poses
-from maexp.kernels.planner import plan
+from maexp.kernels.planner import find_paths, pick_waypoints, plan
 from maexp.kernels.radio import note_links, place_base
 from maexp.kernels.reset import place_teams, start_episodes
 from maexp.kernels.reward import close_step, reward_robots
 from maexp.kernels.sensing import settle_walls
 from maexp.kernels.shards import Shard
 from maexp.kernels.visibility import scan
-from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 
 def local_step(launch: Launch, shard: Shard) -> None:

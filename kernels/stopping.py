@@ -6,20 +6,15 @@ it, and before other robots there. Where it is too fast for the circle but not f
 the line and turns later.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import DIFFERENTIAL, Robots, wrap_angle
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
 from maexp.kernels.pace import clear_ahead, nearest_obstacle
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import PI, point_xy
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
-    from maexp.kernels.wavefront import Wavefront
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -137,15 +132,6 @@ def _hold_turns(
     waypoint[e, i] = at + length * wp.normalize(way)
 
 
-def hold_turns(launch: Launch, shard: "Shard", wavefront: "Wavefront") -> None:
+def hold_turns(launch: Launch, shard: Shard) -> None:
     """Draw the waypoints of differential drives to where they can stop on the way that they will drive."""
-    known = wavefront.known
-    shard.call(
-        launch,
-        _hold_turns,
-        grids=known.grids,
-        walls=known.walls,
-        rows_per_env=known.rows_per_env,
-        clearance=wavefront.narrowed.clearance,
-        waypoint=shard.aims["waypoint"],
-    )
+    shard.call(launch, _hold_turns, waypoint=shard.aims["waypoint"], **shard.wavefront.values)

@@ -13,14 +13,13 @@ follows what is seen, not the square of the range. In a cloud that is not ``plan
 nothing is left out.
 """
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch
 from maexp.kernels.sensing import sense
 from maexp.kernels.shadows import BINS, Sensor, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     ERROR_CAPACITY,
@@ -35,9 +34,6 @@ from maexp.kernels.types import (
     row_span,
     within,
 )
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -355,13 +351,13 @@ def _scan_boundary(
                     wp.atomic_add(viewers_boundary, e, 0, j, 1)
 
 
-def scan(launch: Launch, shard: "Shard", running: wp.array, ahead: int) -> None:
+def scan(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> None:
     """What every robot sees now, in the envs where ``running`` [env] is set; maps of an env are planar. ``ahead`` is 0
     at a reset, 1 in a local step."""
     lanes = (*shard.shape, shard.lanes)
     shard.call(launch, _collect_occluders, active=running, planar=1)
     shard.call(launch, _scan_free, lanes, active=running, planar=1)
-    if shard.sim.sensing is None:
+    if shard.values["sensing"] is None:
         shard.call(launch, _scan_boundary, lanes, active=running)
     else:
         sense(launch, shard, running, ahead)

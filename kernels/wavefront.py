@@ -11,28 +11,20 @@ A path holds its first `PATH_CELLS` cells only; the search is repeated long befo
 held never outlives a macro step: a new goal always searches anew.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import warp as wp
 
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
+from maexp.kernels.dynamics import Robots
 from maexp.kernels.fields import Field, count_bytes, make_arrays
 from maexp.kernels.geodesic import SEARCH, SKIP, DistanceSearch
 from maexp.kernels.known_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.odometry import take_aim
-from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.passable import PASSABLE, PassableGrids
+from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.state import robots_struct
-from maexp.kernels.stopping import hold_turns
-from maexp.kernels.types import point_xy
+from maexp.kernels.types import Maps, point_xy
 from maexp.kernels.ways import PATH_CELLS, in_sight, is_passable, nearest_cell, nearest_passable, path_slot, step_back
-
-if TYPE_CHECKING:
-    from maexp.kernels.shards import Shard
-    from maexp.kernels.simulation import Simulation
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -276,48 +268,30 @@ class Wavefront:
     Attributes:
         known, passable, paths: what robots know, where they fit, their ways.
         narrowed: the robots with the clearance that DWA is to keep now.
+        values: what kernels' parameters are named after.
     """
 
-    def __init__(self, sim: "Simulation", shard: "Shard"):
-        limited = shard.settings.limited
+    def __init__(self, shard: Shard, maps: Maps, grids: NavGrids, cells: int, narrowed: Robots):
+        limited, view = shard.settings.limited, shard.view
         threshold, clearance = shard.robots.collision_threshold.numpy(), shard.robots.clearance.numpy()
-        robots = threshold.shape[1]
+        rows = threshold.shape[1] if limited else 1
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
-        self.known = KnownGrids(
-            sim.maps,
-            sim.nav_grids,
-            shard.view.map_id,
-            shard.known("free"),
-            shard.known("boundary"),
-            robots if limited else 1,
-            sim.nav_cells,
-            shard.false_walls,
-        )
+        boundary = shard.known("boundary")
+        free = shard.known("free")
+        self.known = KnownGrids(maps, grids, view.map_id, free, boundary, rows, cells, shard.false_walls)
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)
-        self.narrowed = robots_struct(sim.robot_tensors, shard.first, shard.last)
+        self.narrowed = narrowed
         self.narrowed.clearance = wp.clone(shard.robots.clearance)
-
-
-def find_paths(launch: Launch, shard: "Shard") -> None:
-    """Bring maps and paths up to date, if the planner is `wavefront`: every `replan_steps` local steps."""
-    if shard.wavefront is not None:
-        s, own = shard.view, shard.wavefront
-        own.known.paint(launch)
-        own.passable.paint(launch)
-        own.paths.find(launch, s.active, s.collided, shard.believed["center"], s.goal, s.waypoint)
-
-
-def pick_waypoints(launch: Launch, shard: "Shard") -> None:
-    """Bring `waypoint` and the clearances up to date, if the planner is `wavefront`: every local step."""
-    if shard.wavefront is not None:
-        s, own = shard.view, shard.wavefront
-        center = shard.believed["center"]
-        own.paths.pick(launch, s.active, s.collided, center, s.goal, shard.robots.radar_range, s.waypoint)
-        fit_clearance(launch, shard, own)
-        take_aim(launch, shard)
-        hold_back(launch, shard, own)
-        hold_turns(launch, shard, own)
+        self.values = {
+            "grids": grids,
+            "walls": self.known.walls,
+            "rows_per_env": self.known.rows_per_env,
+            "path": self.paths.path,
+            "path_total": self.paths.path_total,
+            "path_used": self.paths.path_used,
+            "clearance": self.narrowed.clearance,
+        }
 
 
 def grid_bytes(sizes: dict[str, int]) -> int:

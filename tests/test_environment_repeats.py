@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase
 
 from maexp.envs import ExplorationEnv, PlannerConfig, make_map
-from maexp.kernels import shards as stepping
+from maexp.kernels import simulation as stepping
 
 
 @pytest.fixture(scope="module")

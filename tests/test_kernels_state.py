@@ -18,9 +18,8 @@ from maexp.envs.simulation import TRACK_LENGTH
 from maexp.envs.specs import REWARD_TERMS
 from maexp.kernels import step
 from maexp.kernels.observe import picture_shapes
-from maexp.kernels.planner import set_goals
+from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.state import AXES, SCRATCH, STATE
-from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 FIELDS = STATE | SCRATCH
 PLANNERS = ("dwa", "wavefront", "direct")

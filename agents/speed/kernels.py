@@ -33,11 +33,10 @@ from maexp.agents.tables import TableCell, print_table
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream
 from maexp.kernels.observe import picture_shapes
-from maexp.kernels.planner import set_goals
+from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.shards import Shard
 from maexp.kernels.step import local_step, observe, reset
 from maexp.kernels.types import REGIONS
-from maexp.kernels.wavefront import find_paths, pick_waypoints
 
 TEAM_SIZES = [4]
 WARM = 3  # macro steps before the moment that is measured
