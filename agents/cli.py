@@ -195,7 +195,7 @@ def run_verb(name: str, words: list[str]) -> int:
     if {"-h", "--help"} & set(flags):
         from maexp.agents.commands.help import verb_help
 
-        print(verb_help(name, verb))
+        print(verb_help(name, verb.summary, verb.examples))
         return 0
     multirun = bool({"-m", "--multirun"} & set(flags))
     _check_action(name, verb, rest)

@@ -29,7 +29,7 @@ from maexp.agents.networks.map_predictor import (
 from maexp.agents.settings.groups import ScenarioSettings
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.training import beliefs, map_predictor, predictor_score
-from maexp.agents.training.beliefs import NEVER, BeliefConfig, Episode
+from maexp.agents.training.beliefs import NEVER, BeliefConfig, BeliefEpisode
 from maexp.agents.training.map_predictor import PredictorConfig
 from maexp.agents.training.predictor_export import Guess, predictor_to_onnx
 from maexp.envs import make_map
@@ -165,7 +165,7 @@ def test_export_of_fresh_weights():
 
 
 @pytest.fixture(scope="module")
-def played() -> list[Episode]:
+def played() -> list[BeliefEpisode]:
     return beliefs.play_maps([make_map("maze_small", index) for index in (51, 52)], 2, 5, 0.3)
 
 
@@ -211,14 +211,14 @@ def test_the_last_fifth_of_plans_is_held_out(tmp_path):
     assert names["validation"] == 2 * [f"{k:02d}" for k in range(16, 20)]
 
 
-def toy_episode(wall: int = 30) -> Episode:
+def toy_episode(wall: int = 30) -> BeliefEpisode:
     """Everything is free west of a wall; a team comes to know it from the west on."""
     truth = np.zeros((40, 50), dtype=bool)
     truth[:, :wall] = True
     columns = np.broadcast_to(np.arange(50), truth.shape)
     free_at = np.where(truth, columns // 3, NEVER).astype(np.uint8)
     wall_at = np.where(columns == wall, 10, NEVER).astype(np.uint8)
-    return Episode(free_at, wall_at, truth, 8, 5.0)
+    return BeliefEpisode(free_at, wall_at, truth, 8, 5.0)
 
 
 def test_crops_count_unknown_cells_near_free_ground():

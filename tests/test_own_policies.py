@@ -15,7 +15,7 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.policies import own
 from maexp.agents.settings.overrides import make_overrides
-from maexp.agents.training.named import Player, find_player, name_players, short_name, suit_observation
+from maexp.agents.training.named import NamedPolicy, find_player, name_players, short_name, suit_observation
 from maexp.envs import ObservationConfig
 
 SMALL = ["scenario.held_out=[70,71]", "episodes=2", "num_envs=2", "scenario.macro_steps=2", "device=cpu"]
@@ -198,8 +198,8 @@ def test_names_in_tables_are_unique_and_readable(tmp_path):
             name_players(words)
 
 
-def player(name: str, **shown) -> Player:
-    return Player(name, lambda env: None, "own", **shown)
+def player(name: str, **shown) -> NamedPolicy:
+    return NamedPolicy(name, lambda env: None, "own", **shown)
 
 
 def test_an_env_shows_what_its_policies_look_at_and_no_more():

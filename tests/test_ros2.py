@@ -107,16 +107,18 @@ def test_grids_of_several_robots_are_merged():
     values = floor()
     left, right = values.copy(), values.copy()
     left[:, 40:], right[:, :30] = -1, -1
-    part = frames.Grid(right[:, 30:], 0.1, (3.0, 0.0, 0.0))
-    merged = frames.merge_grids([frames.Grid(left, 0.1, (0.0, 0.0, 0.0)), part])
+    part = frames.OccupancyGrid(right[:, 30:], 0.1, (3.0, 0.0, 0.0))
+    merged = frames.merge_grids([frames.OccupancyGrid(left, 0.1, (0.0, 0.0, 0.0)), part])
     assert np.array_equal(merged.values, values) and merged.origin == pytest.approx((0.0, 0.0, 0.0))
-    turned = frames.Grid(np.rot90(values, k=-1).copy(), 0.1, (0.0, 6.0, -np.pi / 2))  # the same seen from its side
-    again = frames.merge_grids([turned, frames.Grid(np.full((1, 1), -1, np.int8), 0.1, (0.0, 0.0, 0.0))])
+    turned = frames.OccupancyGrid(
+        np.rot90(values, k=-1).copy(), 0.1, (0.0, 6.0, -np.pi / 2)
+    )  # the same seen from its side
+    again = frames.merge_grids([turned, frames.OccupancyGrid(np.full((1, 1), -1, np.int8), 0.1, (0.0, 0.0, 0.0))])
     assert np.array_equal(again.values, values)
-    walls = frames.Grid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
-    over = frames.merge_grids([frames.Grid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
+    walls = frames.OccupancyGrid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
+    over = frames.merge_grids([frames.OccupancyGrid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
     assert (over[10:12, 10:12] == 100).all() and (over == 100).sum() == (values == 100).sum() + 4
-    alike = frames.merge_grids([frames.Grid(one, 0.07, (0.03, 0.01, 0.0)) for one in (left, right)])
+    alike = frames.merge_grids([frames.OccupancyGrid(one, 0.07, (0.03, 0.01, 0.0)) for one in (left, right)])
     assert np.array_equal(alike.values, values) and alike.origin == (0.03, 0.01, 0.0)
 
 

@@ -133,7 +133,9 @@ def test_trees_find_frontiers_as_those_of_the_kernels_do():
     ours, theirs = 0, 0
     for now in cases("indoor"):
         scene = survey(now)
-        y, x = np.divmod(grow_trees(scene, RRT_SAMPLES, 0.5 * scene.radar_range), scene.grid.width)
+        y, x = np.divmod(
+            grow_trees(scene.grid, scene.at, scene.rng, RRT_SAMPLES, 0.5 * scene.radar_range), scene.grid.width
+        )
         blocks = scene.targets.block_of(x, y)
         ours += len({tuple(one) for one in blocks.tolist()})
         theirs += int(now.nav.grow_trees(RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
@@ -167,5 +169,8 @@ def test_trees_are_those_of_plain_loops():
     scene = survey(next(iter(cases("indoor"))))
     twin = replace(scene, rng=np.random.default_rng(3))
     scene = replace(scene, rng=np.random.default_rng(3))
-    ours, theirs = grow_trees(scene, RRT_SAMPLES, 0.5 * scene.radar_range), grow_one_by_one(twin)
+    ours, theirs = (
+        grow_trees(scene.grid, scene.at, scene.rng, RRT_SAMPLES, 0.5 * scene.radar_range),
+        grow_one_by_one(twin),
+    )
     assert len(theirs) > 20 and np.array_equal(np.sort(ours), np.sort(theirs))

@@ -9,7 +9,7 @@ import pytest
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime import __main__ as runtime
 from maexp.agents.runtime.floors import make_floor, place_team, read_floor
-from maexp.agents.runtime.simulate import Floor, explore
+from maexp.agents.runtime.simulate import SimulatedFloor, explore
 
 CELL, RADIUS, REACH = 0.2, 0.3, 4.0
 
@@ -20,7 +20,7 @@ def play(policy: str, grid=None, cell: float = CELL, seconds: float = 600.0, fir
         pytest.importorskip("onnxruntime", reason="THE EXTRA maexp[runtime] IS NOT INSTALLED")
     grid = make_floor(81, room=20, door=5) if grid is None else grid
     places = place_team(grid, cell, RADIUS, 3, np.random.default_rng(1) if first is None else np.array(first))
-    floor = Floor(grid, cell, places, RADIUS, REACH, 0.6)
+    floor = SimulatedFloor(grid, cell, places, RADIUS, REACH, 0.6)
     planner = TeamPlanner(policy, radar_range=REACH, robot_radius=RADIUS, bounded=True, seconds=1.0, **settings)
     return floor, explore(floor, planner, seconds)
 
@@ -60,7 +60,7 @@ def test_real_floors(name, data_dir):
 def test_a_lidar_sees_the_first_wall_and_nothing_behind():
     grid = np.full((20, 40), 100, np.int8)
     grid[1:-1, 1:-1], grid[:, 20] = 0, 100
-    floor = Floor(grid, 0.25, np.array([[2.0, 2.5]]), 0.3, 20.0, 0.6)
+    floor = SimulatedFloor(grid, 0.25, np.array([[2.0, 2.5]]), 0.3, 20.0, 0.6)
     assert floor.seen[1:-1, 1:20].all() and floor.seen[5, 20] and not floor.seen[:, 21:].any()
     assert floor.share() == 1.0, "what lies behind walls does not count"
     assert set(np.unique(floor.known())) == {-1, 0, 100}

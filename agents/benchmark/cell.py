@@ -34,7 +34,7 @@ from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
-from maexp.agents.training.named import Player, suit_observation
+from maexp.agents.training.named import NamedPolicy, suit_observation
 from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config
 
 RUN = ("maps", "commit", "seconds")  # what the report says of how a cell was run
@@ -148,7 +148,7 @@ def play_suite(
     shutil.rmtree(folder / FOLDER)
 
 
-def show_what_it_looks_at(settings: TrainSettings, player: Player, maps: list) -> None:
+def show_what_it_looks_at(settings: TrainSettings, player: NamedPolicy, maps: list) -> None:
     """Let the env of a cell show what its policy looks at; say which maps of its training have changed."""
     if player.targets is not None:  # the cell has an env of its own
         settings.observation.targets = 0

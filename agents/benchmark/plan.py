@@ -18,7 +18,7 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
-from maexp.agents.training.named import Player, check_planner, find_player, name_players
+from maexp.agents.training.named import NamedPolicy, check_planner, find_player, name_players
 from maexp.agents.words import as_list, check_names
 from maexp.envs.scenarios import cut_last_fifth, find_scenario, split
 
@@ -149,7 +149,7 @@ def word_names(cfg: BenchmarkSettings) -> dict[str, str]:
     return name_players([word for word in words if word not in TRAININGS], "policies", TRAININGS)
 
 
-def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> Player:
+def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> NamedPolicy:
     """The policy of a cell that is not trained.
 
     Raises:

@@ -37,7 +37,7 @@ from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
 from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
-from maexp.agents.training.named import Player, check_planner, find_players, suit_observation
+from maexp.agents.training.named import NamedPolicy, check_planner, find_players, suit_observation
 from maexp.agents.training.train import write_config
 from maexp.envs import ExplorationEnv, PointCloudMap
 
@@ -129,24 +129,24 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
     return 0
 
 
-def find_teams(cfg: EvaluateSettings) -> list[Player]:
+def find_teams(cfg: EvaluateSettings) -> list[NamedPolicy]:
     """Who is evaluated: the policy of `checkpoint`, then those of `policy`."""
     trained = [] if cfg.checkpoint is None else [find_trained(cfg)]
     return trained + find_players(words_of(cfg.policy))
 
 
-def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> Player:
+def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> NamedPolicy:
     """The policy of `checkpoint`, for the settings that go with it and any team size."""
     saved = find_checkpoint(cfg.checkpoint)[1]
     check_action(saved, cfg)
     model, direct = model_settings(cfg), cfg.planner.name == "direct"
     looks = model.action == "regions"
     kind = {"kind": "checkpoint", "pictures": looks, "direct": direct, "saved": saved}
-    return Player("trained", lambda env: restore_policy(env, model, saved), **kind)
+    return NamedPolicy("trained", lambda env: restore_policy(env, model, saved), **kind)
 
 
 def evaluate_all(
-    cfg: EpisodeSettings, env: ExplorationEnv, players: list[Player], where: Path
+    cfg: EpisodeSettings, env: ExplorationEnv, players: list[NamedPolicy], where: Path
 ) -> list[EvaluationResult]:
     """Each policy on the same episodes; those that were played before are taken from `where`, and more left there."""
     results = []
@@ -166,7 +166,9 @@ def evaluate_all(
     return results
 
 
-def evaluate_places(cfg: EvaluateSettings, envs: list, players: list[Player], where: Path) -> list[EvaluationResult]:
+def evaluate_places(
+    cfg: EvaluateSettings, envs: list, players: list[NamedPolicy], where: Path
+) -> list[EvaluationResult]:
     """Each policy on the same episodes in each of several places, and in all of them together."""
     parts = [evaluate_all(cfg, env, players, where / str(number)) for number, env in enumerate(envs)]
     if len(envs) == 1:
@@ -178,7 +180,7 @@ def evaluate_places(cfg: EvaluateSettings, envs: list, players: list[Player], wh
 
 
 def film_all(
-    cfg: EvaluateSettings, env: ExplorationEnv, maps: list[PointCloudMap], players: list[Player], where: Path
+    cfg: EvaluateSettings, env: ExplorationEnv, maps: list[PointCloudMap], players: list[NamedPolicy], where: Path
 ) -> list[Path]:
     """A film of each policy in the first `render_envs` of the episodes, and the episodes as files."""
     films = []
@@ -245,7 +247,7 @@ def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSui
     return words + ", for each team size" * (len({one.num_robots for one in results}) > 1)
 
 
-def draw_ends(cfg: EvaluateSettings, maps: list, player: Player, path: Path) -> None:
+def draw_ends(cfg: EvaluateSettings, maps: list, player: NamedPolicy, path: Path) -> None:
     """The last moment of the first few episodes of a policy, side by side."""
     from maexp.envs.render import draw_teams
     from maexp.envs.viewing.show import write_picture

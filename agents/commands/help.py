@@ -1,24 +1,21 @@
 """`maexp VERB --help`: examples, settings and the choices of each group."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import OmegaConf
 
 from maexp.agents.settings.compose import compose_config, group_choices, groups
 
-if TYPE_CHECKING:
-    from maexp.agents.cli import Verb
 
-
-def verb_help(name: str, verb: "Verb") -> str:
+def verb_help(name: str, summary: str, examples: tuple[str, ...]) -> str:
     """The help of a verb: its settings and choices with what is taken without a word; the choices are the files of
     `conf/` with the comment on their first line."""
     from maexp.agents.settings.schema import schema
     from maexp.agents.settings.storable import describe
 
     kind, defaults = schema(name), compose_config(name, [], whole=False)
-    lines = [f"maexp {name}: {verb.summary}", ""]
-    lines += [f"  {example}" for example in verb.examples]
+    lines = [f"maexp {name}: {summary}", ""]
+    lines += [f"  {example}" for example in examples]
     lines += ["", "Settings (name=value)"]
     for setting, _, text in describe(kind):
         lines += _row(_assign(setting, OmegaConf.select(defaults, setting)), text)

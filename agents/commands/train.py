@@ -23,7 +23,7 @@ from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, warm_start
 from maexp.agents.training.logs import check_logger, log_results
-from maexp.agents.training.named import Player, find_players, suit_observation
+from maexp.agents.training.named import NamedPolicy, find_players, suit_observation
 from maexp.agents.training.train import (
     TrainingRun,
     check_collector,
@@ -84,7 +84,7 @@ def check(cfg: TrainSettings) -> None:
     suit_observation(copy.deepcopy(cfg), find_others(cfg))
 
 
-def find_others(cfg: TrainSettings) -> list[Player]:
+def find_others(cfg: TrainSettings) -> list[NamedPolicy]:
     """The policies played at the end beside the trained one."""
     words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
     others = find_players(words, "classical")
@@ -166,13 +166,13 @@ def finish(done: TrainingRun) -> None:
     print(f"Next: {evaluate}, or {command('view', short(where))}")
 
 
-def trained_player(done: TrainingRun) -> Player:
+def trained_player(done: TrainingRun) -> NamedPolicy:
     """The team that was trained."""
     looks, direct = model_settings(done.cfg).action == "regions", done.cfg.planner.name == "direct"
-    return Player("trained", lambda env: done.learner.policy, "checkpoint", pictures=looks, direct=direct)
+    return NamedPolicy("trained", lambda env: done.learner.policy, "checkpoint", pictures=looks, direct=direct)
 
 
-def start_players(done: TrainingRun) -> list[Player]:
+def start_players(done: TrainingRun) -> list[NamedPolicy]:
     """The team as it was before its training; none where that checkpoint is gone."""
     try:
         saved = load_checkpoint(done.folder / "checkpoints" / START)
@@ -184,7 +184,7 @@ def start_players(done: TrainingRun) -> list[Player]:
     return [replace(like, name=name, kind="start", build=lambda env: restore_policy(env, model, saved))]
 
 
-def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside: list[Player]) -> None:
+def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside: list[NamedPolicy]) -> None:
     """curves.png from metrics.csv, and from what the players `beside` the trained one did in the end."""
     from maexp.agents.evaluation.learning import draw_curves as draw
 
@@ -194,7 +194,7 @@ def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside
 
 
 def draw_rollout(
-    cfg: TrainSettings, env: ExplorationEnv, teams: list[Player], results: list[EvaluationResult], path: Path
+    cfg: TrainSettings, env: ExplorationEnv, teams: list[NamedPolicy], results: list[EvaluationResult], path: Path
 ) -> None:
     """A film of the teams side by side in the held-out episode that stands for the mean difference of the first to the
     last; in the first episode where there are no results.

@@ -11,7 +11,7 @@ from maexp.envs import PointCloudMap
 
 
 @dataclass(frozen=True)
-class Floor:
+class FloorCells:
     """Free cells of a map, one a point of it.
 
     Attributes:
@@ -38,7 +38,7 @@ class Floor:
         return (ndimage.distance_transform_edt(self.free) - 0.5) * self.cell >= radius
 
 
-def make_floor(world: PointCloudMap) -> Floor:
+def make_floor(world: PointCloudMap) -> FloorCells:
     """The cells of a map on a lattice, as imported floors are."""
     cell, points = world.resolution, world.free[:, :2].astype(np.float64)
     if np.ptp(world.free_spacing):
@@ -49,4 +49,4 @@ def make_floor(world: PointCloudMap) -> Floor:
     free[index[:, 0], index[:, 1]] = True
     if free.sum() < 0.99 * len(points):
         raise ValueError(f"the points of map {world.name} stand on no lattice along x and y: import it unturned")
-    return Floor(free, cell, low)
+    return FloorCells(free, cell, low)

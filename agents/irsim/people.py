@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from skimage.graph import MCP_Geometric
 
-from .floor import Floor
+from .floor import FloorCells
 
 PERSON_RADIUS, PERSON_SPEED = 0.25, 0.8  # [m], [m/s]
 POLITE = 0.8  # [m] to the edge of another before a person stops
@@ -24,7 +24,7 @@ class Walkers:
         rng: chooses where they start and where they go.
     """
 
-    def __init__(self, floor: Floor, count: int, robots: np.ndarray, rng: np.random.Generator):
+    def __init__(self, floor: FloorCells, count: int, robots: np.ndarray, rng: np.random.Generator):
         self.floor, self.rng = floor, rng
         self.roomy = floor.roomy(PERSON_RADIUS + 0.1)
         cells = np.argwhere(self.roomy)

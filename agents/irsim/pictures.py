@@ -13,13 +13,13 @@ from maexp.envs.render import ROBOT_COLOURS
 
 from .config import DT
 from .people import PERSON_RADIUS
-from .trial import Moment
+from .trial import FilmFrame
 
 UNKNOWN, CLEAR, WALL, PERSON = (205, 205, 210), (255, 255, 255), (40, 40, 46), (235, 160, 0)
 HEAD = 26  # pixels above the picture, for what is going on
 
 
-def draw_moment(moment: Moment, radius: float, width: int = 640) -> np.ndarray:
+def draw_moment(moment: FilmFrame, radius: float, width: int = 640) -> np.ndarray:
     """The team's grid with robots where they believe to be (discs) and are (rings); uint8 [height, width, 3]."""
     values = moment.grid.values()
     colours = np.array([UNKNOWN, CLEAR, WALL], np.uint8)[np.where(values < 0, 0, np.where(values < 50, 1, 2))]

@@ -16,14 +16,14 @@ from maexp.agents.runtime.grid import read_grid
 from maexp.agents.runtime.scene import find_ways
 from maexp.agents.runtime.team import read_team
 from maexp.agents.runtime.ways import trace_from
-from maexp.agents.training.named import Player
+from maexp.agents.training.named import NamedPolicy
 from maexp.envs import ExplorationEnv
 from maexp.kernels.constants import FREE, OBSTACLE, UNREACHED
 
 from .config import TrialConfig
 
 
-def check_player(word: str, player: Player) -> None:
+def check_player(word: str, player: NamedPolicy) -> None:
     """Raise UserError for a policy that plays in our simulator alone."""
     if player.kind == "classical" and word not in CHOICES:
         known = ", ".join(CHOICES)
@@ -37,7 +37,7 @@ def check_player(word: str, player: Player) -> None:
         )
 
 
-def make_planner(word: str, player: Player, config: TrialConfig, env: ExplorationEnv, where: Path):
+def make_planner(word: str, player: NamedPolicy, config: TrialConfig, env: ExplorationEnv, where: Path):
     """What `run_trial` asks for plans.
 
     Args:
@@ -64,7 +64,7 @@ def make_planner(word: str, player: Player, config: TrialConfig, env: Exploratio
 class ForeignTeam:
     """A foreign policy in the place of a `TeamPlanner`: all robots hear each other, ways are found as there."""
 
-    def __init__(self, player: Player, config: TrialConfig, num_robots: int):
+    def __init__(self, player: NamedPolicy, config: TrialConfig, num_robots: int):
         self.config, self.calls = config, ForeignCalls(player.name)
         self.agent = self.calls.make(player.found)
         self.poses = np.full((num_robots, 3), np.nan)

@@ -14,7 +14,7 @@ import yaml
 from PIL import Image
 
 from .config import DT, TrialConfig
-from .floor import Floor
+from .floor import FloorCells
 from .people import PERSON_RADIUS, PERSON_SPEED, Walkers
 
 
@@ -39,7 +39,7 @@ class Simulator:
         ImportError: ir-sim is not installed.
     """
 
-    def __init__(self, floor: Floor, starts: np.ndarray, config: TrialConfig):
+    def __init__(self, floor: FloorCells, starts: np.ndarray, config: TrialConfig):
         self.count, self.config = len(starts), config
         rng = np.random.default_rng([config.seed, 7])
         self.walkers = Walkers(floor, config.people, starts[:, :2], rng)
@@ -54,7 +54,7 @@ class Simulator:
         self.people = [one for one in objects if one.role == "obstacle" and one.shape == "circle"]
         self.ids = [one.id for one in (*self.robots, *self.people)]
 
-    def _describe(self, floor: Floor, image: Path, starts: np.ndarray) -> dict:
+    def _describe(self, floor: FloorCells, image: Path, starts: np.ndarray) -> dict:
         c, size = self.config, np.array(floor.free.shape) * floor.cell
         lidar = {
             "name": "lidar2d",

@@ -47,7 +47,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Moment:
+class FilmFrame:
     """What a frame of the film shows."""
 
     time: float
@@ -64,7 +64,7 @@ def run_trial(
     policy: str | TeamPlanner,
     starts: np.ndarray,
     config: TrialConfig,
-    watch: Callable[[Moment], None] | None = None,
+    watch: Callable[[FilmFrame], None] | None = None,
 ) -> Trial:
     """A team from `starts` [N, 3] until the time is up, all robots have collided or nothing is left to see.
 
@@ -125,7 +125,7 @@ def run_trial(
             trial.notes += [note for note in plan.notes if note not in trial.notes]
             if watch is not None:
                 people = simulator.walkers.places.copy()
-                watch(Moment(time, grid, believed.copy(), poses, plan.goals.copy(), people, judge.share))
+                watch(FilmFrame(time, grid, believed.copy(), poses, plan.goals.copy(), people, judge.share))
             if plan.done:
                 trial.done_at = time
                 break

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
@@ -138,30 +139,44 @@ def to_onnx(chooser: TargetChooser, robots: int) -> bytes:
     Raises:
         UserError: the exporter is not installed.
     """
+    batch, team, count = (torch.export.Dim(name, min=1, max=most) for name, most in MOST.items())
+    example = {
+        "features": torch.randn(2, max(robots, 2), 5, len(FEATURES)),
+        "mask": torch.ones(2, max(robots, 2), 5, dtype=torch.bool),
+        "comm": torch.ones(2, max(robots, 2), max(robots, 2), dtype=torch.bool),
+    }
+    shapes = {"features": {0: batch, 1: team, 2: count}, "mask": {0: batch, 1: team, 2: count}}
+    return trace_network(chooser, example, "logits", shapes | {"comm": {0: batch, 1: team, 2: team}})
+
+
+def trace_network(net: nn.Module, example: dict[str, torch.Tensor], output: str, shapes: dict[str, dict]) -> bytes:
+    """A network in ONNX.
+
+    Args:
+        example: its inputs by name.
+        output: the name of its output.
+        shapes: of each input, the axes whose lengths vary.
+
+    Raises:
+        UserError: the exporter is not installed.
+    """
     try:
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise UserError("Exporting needs onnx and onnxscript: pip install 'maexp[export]'.") from error
-    batch, team, count = (torch.export.Dim(name, min=1, max=most) for name, most in MOST.items())
-    example = (
-        torch.randn(2, max(robots, 2), 5, len(FEATURES)),
-        torch.ones(2, max(robots, 2), 5, dtype=torch.bool),
-        torch.ones(2, max(robots, 2), max(robots, 2), dtype=torch.bool),
-    )
-    shapes = {"features": {0: batch, 1: team, 2: count}, "mask": {0: batch, 1: team, 2: count}}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about names of axes that are the same axis
         program = torch.onnx.export(
-            chooser,
-            example,
+            net,
+            tuple(example.values()),
             dynamo=True,
             verbose=False,
             opset_version=OPSET,
-            input_names=["features", "mask", "comm"],
-            output_names=["logits"],
-            dynamic_shapes=shapes | {"comm": {0: batch, 1: team, 2: team}},
+            input_names=list(example),
+            output_names=[output],
+            dynamic_shapes=shapes,
         )
     out = io.BytesIO()
     program.save(out)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from maexp.agents.irsim.floor import Floor
+from maexp.agents.irsim.floor import FloorCells
 from maexp.agents.ros2.messages import CLASSES
 from maexp.agents.runtime.frames import NOWHERE, Pose, fill_pose, fill_turn
 
@@ -71,7 +71,7 @@ def fill_scan(message, frame: str, now: int, ranges: np.ndarray, reach: float) -
     message.ranges = ranges.tolist()
 
 
-def look(floor: Floor, pose: Pose, reach: float, beams: int = BEAMS) -> np.ndarray:
+def look(floor: FloorCells, pose: Pose, reach: float, beams: int = BEAMS) -> np.ndarray:
     """How far each beam is free, float [beams] [m]; infinite where it meets nothing within `reach`."""
     angles = pose[2] - math.pi + 2.0 * math.pi / beams * np.arange(beams)
     far = np.arange(0.0, reach, STEP * floor.cell)

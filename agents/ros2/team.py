@@ -23,7 +23,7 @@ NUMBERS = ("begins", "radar_range", "robot_radius", "max_speed", "max_accel", "s
 
 
 @dataclass
-class Course:
+class Outing:
     """What a team did.
 
     Attributes:
@@ -73,9 +73,9 @@ class Ros2Team:
         self.planned: float | None = None  # time of the last decision [s]
         self.said: set[str] = set()
         self.heard = time.monotonic()
-        self.course = Course()
+        self.course = Outing()
 
-    def run(self) -> Course:
+    def run(self) -> Outing:
         """Drive until the arena is over, or nobody publishes maps any more.
 
         Raises:

@@ -18,7 +18,7 @@ import numpy as np
 
 from maexp.agents.runtime import CHOICES, TeamPlanner, shipped_names
 from maexp.agents.runtime.floors import make_floor, place_team, read_floor
-from maexp.agents.runtime.simulate import MARKS, Course, Floor, explore
+from maexp.agents.runtime.simulate import MARKS, Course, SimulatedFloor, explore
 from maexp.envs.config import TargetsConfig
 from maexp.envs.fields import check_value, explain, kinds, replaced, same, setting
 
@@ -104,7 +104,7 @@ def run(given: SimulateSettings, grid: np.ndarray, cell: float, policy: str, see
     """One exploration, told in a line."""
     first = np.random.default_rng(seed) if given.start is None else np.array(given.start)
     places = place_team(grid, cell, given.radius, given.robots, first)
-    floor = Floor(grid, cell, places, given.radius, given.range, given.speed)
+    floor = SimulatedFloor(grid, cell, places, given.radius, given.range, given.speed)
     planner = TeamPlanner(
         policy,
         radar_range=given.range,
@@ -157,7 +157,7 @@ def compare(policy: str, apart: list[Course], shared: list[Course], limit: float
     return "\n".join(lines)
 
 
-def draw(path: str, floor: Floor, course: Course, policy: str) -> None:
+def draw(path: str, floor: SimulatedFloor, course: Course, policy: str) -> None:
     """The floor, what was seen (white), and the ways of a policy's robots, as a picture."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # late: robots need it not
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from .agent import go_beyond, planner_options
 from .frames import (
     NOWHERE,
     Frames,
-    Grid,
+    OccupancyGrid,
     Pose,
     compose,
     heading_of,
@@ -200,7 +200,7 @@ class TeamDriver:
         speed = np.array([self.speeds.get(name, 0.0) for name in self.robots])
         return go_beyond(plan, grid, at, speed, self.episode)
 
-    def _merge(self, notes: list[str]) -> Grid | None:
+    def _merge(self, notes: list[str]) -> OccupancyGrid | None:
         """The team's map in its frame; None until there is one."""
         self._check_frames()
         placed = []

@@ -17,7 +17,7 @@ NOWHERE: Pose = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Grid:
+class OccupancyGrid:
     """An occupancy grid.
 
     Attributes:
@@ -31,7 +31,7 @@ class Grid:
     origin: Pose
 
 
-def read_map(message) -> Grid:
+def read_map(message) -> OccupancyGrid:
     """The grid of a nav_msgs/OccupancyGrid.
 
     Raises:
@@ -43,7 +43,7 @@ def read_map(message) -> Grid:
         raise ValueError(f"a map of {info.width} x {info.height} cells came with {values.size} of them")
     place = info.origin.position
     origin = (place.x, place.y, read_yaw(info.origin.orientation))
-    return Grid(values.reshape(info.height, info.width), float(f"{info.resolution:.7g}"), origin)
+    return OccupancyGrid(values.reshape(info.height, info.width), float(f"{info.resolution:.7g}"), origin)
 
 
 def read_time(stamp) -> float:
@@ -121,12 +121,12 @@ class Frames:
         return None
 
 
-def place_grid(grid: Grid, pose: Pose) -> Grid:
+def place_grid(grid: OccupancyGrid, pose: Pose) -> OccupancyGrid:
     """The grid in the frame in which its own frame stands at `pose`."""
-    return grid if pose == NOWHERE else Grid(grid.values, grid.resolution, compose(pose, grid.origin))
+    return grid if pose == NOWHERE else OccupancyGrid(grid.values, grid.resolution, compose(pose, grid.origin))
 
 
-def merge_grids(grids: list[Grid]) -> Grid:
+def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
     """One grid of several in one frame: occupied where any is, free where any is and none occupied.
 
     It has the finest resolution and lies along the frame's axes. Grids that lie alike, or one alone, stay as they are.
@@ -134,7 +134,7 @@ def merge_grids(grids: list[Grid]) -> Grid:
     first = grids[0]
     alike = (first.resolution, first.origin, first.values.shape)
     if all((grid.resolution, grid.origin, grid.values.shape) == alike for grid in grids):
-        return Grid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
+        return OccupancyGrid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
     cell = min(grid.resolution for grid in grids)
     corners = np.concatenate([_corners(grid) for grid in grids])
     low = np.floor(corners.min(axis=0) / cell) * cell
@@ -149,10 +149,10 @@ def merge_grids(grids: list[Grid]) -> Grid:
         height, width = grid.values.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         merged[inside] = np.maximum(merged[inside], grid.values[row[inside], column[inside]])
-    return Grid(merged, cell, (float(low[0]), float(low[1]), 0.0))
+    return OccupancyGrid(merged, cell, (float(low[0]), float(low[1]), 0.0))
 
 
-def _corners(grid: Grid) -> np.ndarray:
+def _corners(grid: OccupancyGrid) -> np.ndarray:
     height, width = grid.values.shape
     x, y, yaw = grid.origin
     c, s = math.cos(yaw), math.sin(yaw)

@@ -96,7 +96,7 @@ class ArrayScene:
         return values[None]
 
     def found_by_trees(self, samples: int, branch: float) -> np.ndarray:
-        ends = grow_trees(self, samples, branch)
+        ends = grow_trees(self.grid, self.at, self.rng, samples, branch)
         block = self.targets.block_of(ends % self.grid.width, ends // self.grid.width)
         return (self.targets.block[:, None] == block).all(-1).any(1)
 

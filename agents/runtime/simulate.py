@@ -54,7 +54,7 @@ class Course:
     tracks: np.ndarray | None = None
 
 
-class Floor:
+class SimulatedFloor:
     """A floor and what a team has seen of it.
 
     Args:
@@ -146,7 +146,7 @@ class Floor:
         return np.zeros(2)
 
 
-def explore(floor: Floor, planner: TeamPlanner, seconds: float) -> Course:
+def explore(floor: SimulatedFloor, planner: TeamPlanner, seconds: float) -> Course:
     """Let a team explore a floor, until the planner says done or for so many seconds; it plans once a second."""
     course, tracks = Course(np.full(len(MARKS), np.inf)), [floor.at.copy()]
     ways: list[np.ndarray] = [np.zeros((0, 2))] * len(floor.at)
@@ -167,7 +167,7 @@ def explore(floor: Floor, planner: TeamPlanner, seconds: float) -> Course:
     return course
 
 
-def _note(course: Course, plan: Plan, floor: Floor, now: float) -> None:
+def _note(course: Course, plan: Plan, floor: SimulatedFloor, now: float) -> None:
     share = floor.share()
     course.reached[(share >= np.array(MARKS)) & np.isinf(course.reached)] = now
     course.waits += int(plan.waits.sum())

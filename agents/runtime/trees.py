@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from maexp.kernels.constants import FREE, UNKNOWN
 
-if TYPE_CHECKING:
-    from .scene import ArrayScene
+from .grid import KnownGrid
 
 
-def grow_trees(scene: ArrayScene, samples: int, branch: float) -> np.ndarray:
+def grow_trees(grid: KnownGrid, at: np.ndarray, rng: np.random.Generator, samples: int, branch: float) -> np.ndarray:
     """Free cells where the branches of the robots' trees left what is known, int64 [n].
 
     Args:
+        at: where the robots are [m], float [N, 2].
         samples: points drawn for each tree.
         branch: longest step towards one of them [m].
 
     All trees grow at once, and x + iy stands for a place in cells: what this takes is mostly the number of calls.
     """
-    grid, robots = scene.grid, len(scene.at)
+    robots = len(at)
     size = np.array([grid.width, grid.height])
-    draw = np.minimum(scene.rng.random((robots, samples, 2)) * size, size - 1e-6)
+    draw = np.minimum(rng.random((robots, samples, 2)) * size, size - 1e-6)
     branch = branch / grid.cell
     node = np.full((robots, samples + 1), np.inf, complex)
-    node[:, 0] = (scene.at / grid.cell) @ (1, 1j)
+    node[:, 0] = (at / grid.cell) @ (1, 1j)
     flat, known, first_node = node.ravel(), grid.known.ravel(), np.arange(robots) * node.shape[1]
     numbers, row, count, ends = np.arange(int(2.0 * branch) + 3), np.arange(robots), [1] * robots, []
     for point in (draw @ (1, 1j)).T:
@@ -37,8 +35,8 @@ def grow_trees(scene: ArrayScene, samples: int, branch: float) -> np.ndarray:
         way = (point - start) * np.minimum(1.0, branch / np.maximum(length, 1e-9))
         steps = np.minimum(2.0 * length, 2.0 * branch).astype(np.int64)
         shares = np.minimum(numbers / (steps[:, None] + 1), 1.0)  # where a branch is looked at; its end fills the row
-        at = start[:, None] + way[:, None] * shares
-        cells = at.imag.astype(np.int64) * grid.width + at.real.astype(np.int64)
+        looked = start[:, None] + way[:, None] * shares
+        cells = looked.imag.astype(np.int64) * grid.width + looked.real.astype(np.int64)
         state = known.take(cells)
         first = (state != FREE).argmax(1)
         for robot, (k, end) in enumerate(zip(first.tolist(), state[row, first].tolist(), strict=True)):

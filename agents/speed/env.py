@@ -92,7 +92,7 @@ def print_latency(rows: list[dict]) -> None:
     print_table(title, ["platform", *(f"N = {size}" for size in sizes)], cells)
 
 
-class Batch:
+class MeasuredBatch:
     """A batch of teams whose throughput is measured, compile time apart.
 
     Args:
@@ -149,7 +149,7 @@ class Batch:
 
 def measure_batch(cfg: BenchSettings, env: ExplorationEnv) -> dict:
     """Throughput of a batch over at least ``cfg.seconds``."""
-    batch = Batch(cfg, env)
+    batch = MeasuredBatch(cfg, env)
     batch.run(cfg.seconds, LEAST_LAPS)
     return batch.summary()
 

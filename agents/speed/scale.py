@@ -22,7 +22,7 @@ from maexp.agents.settings.checks import check_counts, check_distinct
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import without
 from maexp.agents.settings.verbs import BenchSettings
-from maexp.agents.speed.env import Batch
+from maexp.agents.speed.env import MeasuredBatch
 from maexp.agents.speed.shared import LEAST_LAPS, write_report
 from maexp.agents.tables import print_table
 from maexp.envs import PointCloudMap
@@ -143,7 +143,7 @@ def measure_axis(axis: str, plan: list[tuple[int, BenchSettings]], show: Callabl
         begin = time.perf_counter()
         env = make_env(cfg, maps, cfg.num_robots)
         built = time.perf_counter() - begin
-        batches.append((value, built, Batch(cfg, env)))
+        batches.append((value, built, MeasuredBatch(cfg, env)))
         show(f"{axis} {value}: built")
     for k in range(1, ROUNDS + 1):
         for value, _, batch in batches:

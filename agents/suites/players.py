@@ -11,8 +11,7 @@ from maexp.agents.policies.hosted import HostedPolicy, greet, guest_of
 from maexp.agents.policies.load import is_exported
 from maexp.agents.policies.names import plug_ins
 from maexp.agents.policies.process import APART, EXEC, Guest, command_of
-from maexp.agents.training.named import Player as Named
-from maexp.agents.training.named import find_player
+from maexp.agents.training.named import NamedPolicy, find_player
 from maexp.agents.training.named import short_name as name_of
 from maexp.envs import ExplorationEnv, ObservationConfig
 
@@ -36,7 +35,7 @@ class Player:
         self.word, self.limit, self.patience = word, limit, patience
         self.make_guest = self._find_guest()
         self.name = name or short_name(word)
-        self.found: Named | None = None if self.hosted else find_player(word, name=self.name)
+        self.found: NamedPolicy | None = None if self.hosted else find_player(word, name=self.name)
         if self.found is not None and self.found.direct:
             raise UserError(f"policy={word} gives controls (planner=direct), and the robots of a suite drive to goals.")
 

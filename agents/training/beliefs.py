@@ -68,7 +68,7 @@ class BeliefConfig:
 
 
 @dataclass(frozen=True)
-class Episode:
+class BeliefEpisode:
     """When a team got to know each cell of a map.
 
     Attributes:
@@ -134,7 +134,7 @@ def depart_at_random(env: ExplorationEnv, share: float) -> FrontierPlanner:
 
 
 @torch.no_grad()
-def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: float) -> list[Episode]:
+def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: float) -> list[BeliefEpisode]:
     """As many episodes as there are maps, each on one that is drawn."""
     row = find_scenario(maps[0].scenario)
     steps = int(LONGER * row.macro_steps) if row.macro_steps else default_macro_steps(maps, row)
@@ -168,44 +168,46 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
     for k, grid in enumerate(grids[m] for m in place):
         size, cells = (grid.height, grid.width), grid.height * grid.width
         when = [one[k, :cells].numpy().reshape(size).copy() for one in (free_at, wall_at)]
-        episodes.append(Episode(*when, open_cells(grid).reshape(size), decision, row.radar_range / grid.cell))
+        episodes.append(BeliefEpisode(*when, open_cells(grid).reshape(size), decision, row.radar_range / grid.cell))
     return episodes
 
 
-def save_episodes(path: Path, episodes: list[Episode]) -> None:
+def save_episodes(path: Path, episodes: list[BeliefEpisode]) -> None:
     """One compressed file, whole or not there."""
     arrays = {
-        f"{k}/{one.name}": getattr(episode, one.name) for k, episode in enumerate(episodes) for one in fields(Episode)
+        f"{k}/{one.name}": getattr(episode, one.name)
+        for k, episode in enumerate(episodes)
+        for one in fields(BeliefEpisode)
     }
     write_file(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def load_episodes(path: Path) -> list[Episode]:
+def load_episodes(path: Path) -> list[BeliefEpisode]:
     """What `save_episodes` wrote."""
     with np.load(path, allow_pickle=False) as file:
         count = 1 + max(int(name.split("/")[0]) for name in file.files)
-        names = [one.name for one in fields(Episode)]
+        names = [one.name for one in fields(BeliefEpisode)]
         values = [{name: file[f"{k}/{name}"] for name in names} for k in range(count)]
     return [
-        until_covered(Episode(**{name: one[name] if one[name].ndim else one[name].item() for name in names}))
+        until_covered(BeliefEpisode(**{name: one[name] if one[name].ndim else one[name].item() for name in names}))
         for one in values
     ]
 
 
-def until_covered(episode: Episode, share: float = COVERED) -> Episode:
+def until_covered(episode: BeliefEpisode, share: float = COVERED) -> BeliefEpisode:
     """The episode up to the decision at which a share of what is free was known: there is nothing to decide after."""
     when = np.sort(episode.free_at[episode.truth])
     last = int(when[min(len(when) - 1, int(share * len(when)))])
     return replace(episode, decisions=max(1, min(episode.decisions, last)))
 
 
-def load_groups(folder: Path) -> dict[str, list[Episode]]:
+def load_groups(folder: Path) -> dict[str, list[BeliefEpisode]]:
     """Episodes by scenario.
 
     Raises:
         UserError: there are none.
     """
-    groups: dict[str, list[Episode]] = {}
+    groups: dict[str, list[BeliefEpisode]] = {}
     for path in sorted(folder.glob("*.npz")):
         groups.setdefault(path.stem.split("-")[0], []).extend(load_episodes(path))
     if not groups:

@@ -27,7 +27,7 @@ from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collect import batch_statistics, divide_teams
-from maexp.agents.training.named import Player, check_planner, find_player, suit_observation
+from maexp.agents.training.named import NamedPolicy, check_planner, find_player, suit_observation
 from maexp.agents.training.train import TrainingRun
 
 LEARNING_RATE = 2e-3
@@ -47,7 +47,7 @@ def check_warm_start(cfg: TrainSettings) -> None:
     _check_kind(cfg, taught_by(teacher))
 
 
-def taught_by(teacher: Player) -> str | None:
+def taught_by(teacher: NamedPolicy) -> str | None:
     """What a policy chooses; None: it tells when it acts."""
     if teacher.direct:
         return "controls"

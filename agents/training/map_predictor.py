@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.map_predictor import MapPredictor
-from maexp.agents.training.beliefs import Episode, load_groups
+from maexp.agents.training.beliefs import BeliefEpisode, load_groups
 from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, UNKNOWN
 
@@ -63,7 +63,7 @@ class Crops:
     counts: torch.Tensor
 
 
-def draw_crops(groups: dict[str, list[Episode]], count: int, side: int, rng: np.random.Generator) -> Crops:
+def draw_crops(groups: dict[str, list[BeliefEpisode]], count: int, side: int, rng: np.random.Generator) -> Crops:
     """Beliefs of scenarios drawn evenly, around frontier cells, turned and mirrored."""
     names = sorted(groups)
     drawn = []
@@ -78,7 +78,7 @@ def draw_crops(groups: dict[str, list[Episode]], count: int, side: int, rng: np.
     return Crops(known, truth, counts)
 
 
-def cut_around(known: np.ndarray, episode: Episode, side: int, rng: np.random.Generator):
+def cut_around(known: np.ndarray, episode: BeliefEpisode, side: int, rng: np.random.Generator):
     """A square around a frontier cell that is drawn: known, truth, counts, [side, side] each; None without frontier."""
     frontier = np.argwhere((known == FREE) & ndimage.binary_dilation(known == UNKNOWN))
     if not len(frontier):

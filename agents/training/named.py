@@ -34,7 +34,7 @@ TAKEN = ("run", "difference", "headroom_share", "trained", *STARTS, "best_classi
 
 
 @dataclass(frozen=True)
-class Player:
+class NamedPolicy:
     """A policy that can be played in any env that shows what it looks at.
 
     Attributes:
@@ -92,7 +92,7 @@ class Player:
             warn_of_changed_maps(self.saved, maps)
 
 
-def find_player(word: str, setting: str = "policy", name: str | None = None) -> Player:
+def find_player(word: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
     """The policy that a word names.
 
     Args:
@@ -104,7 +104,7 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
     """
     name = name or short_name(word)
     if word in POLICIES:
-        return Player(name, POLICIES[word], "classical")
+        return NamedPolicy(name, POLICIES[word], "classical")
     if not is_exported(word) and word in plug_ins():
         return _own(word, setting, name)
     if not is_exported(word) and is_run(Path(word)):
@@ -114,7 +114,7 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
     if not is_exported(word):
         raise UserError(describe_unknown(word, setting))
     _, contract = open_policy(word, setting)
-    return Player(
+    return NamedPolicy(
         name,
         lambda env: load_policy_folder(word, env, setting),
         "exported",
@@ -124,11 +124,11 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
     )
 
 
-def _from_checkpoint(word: str, name: str) -> Player:
+def _from_checkpoint(word: str, name: str) -> NamedPolicy:
     path, saved = find_checkpoint(word)
     settings, model = flatten(saved["settings"]), model_of(saved)
     regions, direct = model.action == "regions", settings["planner.name"] == "direct"
-    return Player(
+    return NamedPolicy(
         name,
         lambda env: restore_policy(env, model, saved).to(env.device),
         "checkpoint",
@@ -142,10 +142,10 @@ def _from_checkpoint(word: str, name: str) -> Player:
     )
 
 
-def _own(word: str, setting: str, name: str) -> Player:
+def _own(word: str, setting: str, name: str) -> NamedPolicy:
     found = find_own(word, setting)
     foreign = is_foreign(found)
-    return Player(
+    return NamedPolicy(
         name,
         lambda env: make_own(found, env, name),
         "own",
@@ -156,7 +156,7 @@ def _own(word: str, setting: str, name: str) -> Player:
     )
 
 
-def find_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[Player]:
+def find_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
     """The policies of several words, with names of their own.
 
     Raises:
@@ -201,7 +201,7 @@ def short_name(word: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name)
 
 
-def check_planner(planner: str, players: Sequence[Player]) -> None:
+def check_planner(planner: str, players: Sequence[NamedPolicy]) -> None:
     """Raise UserError where policies that pick goals meet a planner that takes controls, or the other way round."""
     goals = [one.name for one in players if one.direct is False]
     if goals and planner == "direct":
@@ -217,7 +217,7 @@ def check_planner(planner: str, players: Sequence[Player]) -> None:
         )
 
 
-def suit_observation(cfg: CommonSettings, players: Sequence[Player]) -> None:
+def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> None:
     """Let the env of the settings show what the policies look at, and nothing that nobody does.
 
     Raises:

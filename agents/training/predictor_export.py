@@ -6,10 +6,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
-import logging
 import sys
-import warnings
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +19,7 @@ from torch import Tensor, nn
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
 from maexp.agents.networks.map_predictor import CARD, CONTRACT, NETWORK, STRIDE, WEIGHTS, MapPredictor, finish_guess
-from maexp.agents.policies.export import OPSET, PACKAGES, without_traces
+from maexp.agents.policies.export import OPSET, PACKAGES, trace_network
 from maexp.agents.training.beliefs import load_groups
 from maexp.agents.training.map_predictor import CHECKPOINT
 from maexp.agents.training.predictor_score import count_tables
@@ -67,30 +64,10 @@ def predictor_to_onnx(net: MapPredictor) -> bytes:
     Raises:
         UserError: the exporter is not installed.
     """
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise UserError("Exporting needs onnx and onnxscript: pip install 'maexp[export]'.") from error
     batch, height, width = (torch.export.Dim(name, min=1, max=most) for name, most in MOST.items())
     sizes = {0: batch, 1: STRIDE * height, 2: STRIDE * width}
-    example = (torch.randint(0, 3, (2, 3 * STRIDE, 5 * STRIDE), dtype=torch.uint8),)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nothing here needs
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        program = torch.onnx.export(
-            Guess(net).eval(),
-            example,
-            dynamo=True,
-            verbose=False,
-            opset_version=OPSET,
-            input_names=["known"],
-            output_names=["free"],
-            dynamic_shapes={"known": sizes},
-        )
-    out = io.BytesIO()
-    program.save(out)
-    return without_traces(out.getvalue())
+    example = torch.randint(0, 3, (2, 3 * STRIDE, 5 * STRIDE), dtype=torch.uint8)
+    return trace_network(Guess(net).eval(), {"known": example}, "free", {"known": sizes})
 
 
 def export_predictor(config: ExportConfig) -> None:

@@ -22,7 +22,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.networks.map_predictor import load_predictor, predict, sample_worlds
 from maexp.agents.tables import fixed, markdown_table
-from maexp.agents.training.beliefs import Episode, load_groups
+from maexp.agents.training.beliefs import BeliefEpisode, load_groups
 from maexp.agents.training.map_predictor import BAND, matters
 from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
@@ -66,7 +66,7 @@ class Unknown:
     guess: np.ndarray
 
 
-def look_at(episodes: list[Episode], moments: int, guess: Callable[[np.ndarray], np.ndarray] | None) -> Unknown:
+def look_at(episodes: list[BeliefEpisode], moments: int, guess: Callable[[np.ndarray], np.ndarray] | None) -> Unknown:
     """Unknown cells near known free ground at some decisions of every episode, ground around the maps included."""
     parts = []
     for one in episodes:
@@ -105,7 +105,7 @@ def by_nearest(cells: Unknown) -> np.ndarray:
     return by_distance(cells) + (MOST_DISTANCE + 1) * cells.beside_wall
 
 
-def count_tables(groups: dict[str, list[Episode]]) -> dict[str, np.ndarray]:
+def count_tables(groups: dict[str, list[BeliefEpisode]]) -> dict[str, np.ndarray]:
     """Histograms of training maps: what a cell is where nothing, or only what is near it, is looked at."""
     seen = [look_at(one[:: max(1, len(one) // COUNTED)], 2, None) for one in groups.values()]
     return {
@@ -133,7 +133,7 @@ def judge(free: np.ndarray, chance: np.ndarray, ranges: np.ndarray) -> dict[str,
 
 
 def judge_samples(
-    episodes: list[Episode], guess: Callable[[np.ndarray], np.ndarray], moments: int, lengths: Sequence[float]
+    episodes: list[BeliefEpisode], guess: Callable[[np.ndarray], np.ndarray], moments: int, lengths: Sequence[float]
 ) -> dict[str, dict[str, float]]:
     """Whether samples look like ground: {length: figures}, under "truth" those of the true maps.
 
