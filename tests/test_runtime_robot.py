@@ -5,7 +5,7 @@ import pytest
 from test_runtime_watch import CELL, SETTINGS, World
 
 from maexp.agents.runtime import CHOICES, RobotPlanner, TeamPlanner, Word
-from maexp.agents.runtime.frames import Grid
+from maexp.agents.runtime.frames import OccupancyGrid
 
 NAMES = ("a", "b")
 
@@ -49,7 +49,7 @@ def test_robots_that_hear_each_other_choose_as_the_team_does(policy):
         world.drive(wanted)
 
 
-def word(name: str, at, time: float, grid: Grid | None = None) -> Word:
+def word(name: str, at, time: float, grid: OccupancyGrid | None = None) -> Word:
     return Word(name, (float(at[0]), float(at[1]), 0.0), 0.0, time, grid)
 
 
@@ -90,7 +90,7 @@ def test_words_and_grids_go_together():
 
 def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
     world, planner = World(), RobotPlanner("a", memory=5.0, **SETTINGS)
-    known = Grid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
+    known = OccupancyGrid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
     planner.hear(word("b", world.at[1], 0.0, known))
     planner.hear(word("b", (5.0, 5.0), -1.0))
     assert planner.heard["b"].pose[0] == world.at[1][0], "an older word"

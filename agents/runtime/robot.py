@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .frames import Grid, merge_grids
+from .frames import OccupancyGrid, merge_grids
 from .planner import Plan, TeamPlanner
 
 
@@ -28,7 +28,7 @@ class Word:
     pose: tuple[float, ...]
     speed: float
     time: float
-    grid: Grid | None = None
+    grid: OccupancyGrid | None = None
 
 
 class RobotPlanner:
@@ -50,7 +50,7 @@ class RobotPlanner:
         self.name, self.memory = name, memory
         self.team = TeamPlanner(policy, **settings)
         self.heard: dict[Hashable, Word] = {}
-        self.grids: dict[Hashable, Grid] = {}
+        self.grids: dict[Hashable, OccupancyGrid] = {}
         self._word: Word | None = None
 
     def reset(self) -> None:
@@ -95,7 +95,7 @@ class RobotPlanner:
         """
         if share:
             yaw = float(origin[2]) if len(origin) > 2 else 0.0
-            own = Grid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
+            own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             own = merge_grids([own, *self.grids.values()])
             grid, resolution, origin = own.values, own.resolution, own.origin
         words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory}
