@@ -47,7 +47,7 @@ class Strategy:
     """
 
     def __init__(self, env: ExplorationEnv):
-        self.env, self.name, self.period = env, env.comm_config.strategy, env.comm_config.period
+        self.env, self.name, self.given_period = env, env.comm_config.strategy, env.comm_config.period
         s, device = env.simulation.tensors, env.device
         e, n, u = *s["center"].shape[:2], s["known_weight"].shape[1]
         self.has_base, self.robots = env.comm_config.has_base, n
@@ -109,7 +109,8 @@ class Strategy:
         self.straight = (s["place"] - self.at.unsqueeze(2)).norm(dim=-1)
         since = torch.where(s["met"] < 0, torch.inf, odometer.unsqueeze(-1) - s["driven"])
         self.way = torch.minimum(since, DETOUR * self.straight)  # into contact with a radio again [m]
-        self.left = (self.env.macro_steps - self.step) * self.drive  # how far a robot still gets in the episode [m]
+        self.rest = self.env.macro_steps - self.step  # decisions left
+        self.left = self.rest * self.drive  # how far a robot still gets in the episode [m]
         self.idle = self.step - s["grew"] >= IDLE
 
     def _links(self) -> torch.Tensor:
@@ -121,14 +122,28 @@ class Strategy:
             links = ((links @ links) > 0).float()
         return links[:, : self.robots] > 0
 
+    def _period(self, cost: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
+        """Decisions from one report to the next, where each takes `cost` of them and so many are left.
+
+        A robot that learns at an even rate, but nothing while it reports, tells most over a time L if it reports every
+        x = sqrt(c L), with c the time of a report: what it tells, integrated over the time, is in proportion to
+        (x - c) (L - x) / x. Half the time left counts, for the less is unknown the slower robots learn.
+        """
+        if self.given_period != "auto":
+            return torch.full_like(cost, float(self.given_period))
+        return (0.5 * cost * rest).sqrt()
+
     # The strategies: bool [E, N], who is taken over, and float32 [E, N, 2], where to [m]
 
     def _return_to_base(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Who has something to tell reports every `comm.period` decisions, when nothing new comes, and in time before
-        the end."""
+        """Who has something to tell reports after `comm.period`, when nothing new comes, and in time before the end.
+
+        A period that is given counts to where the robot turns back, the other one to where it arrives.
+        """
         n, s = self.robots, self.state
-        since = self.step - s["met"][..., n].clamp_min(0)
-        go = s["duty"] | (since >= self.period) | self.idle | self._is_late()
+        since, way = self.step - s["met"][..., n].clamp_min(0), self.way[..., n] / self.drive
+        away = since + (way if self.given_period == "auto" else 0.0)
+        go = s["duty"] | (away >= self._period(2.0 * way, self.rest + since)) | self.idle | self._is_late()
         return go & self._has_news(n) & ~self.linked[..., n], s["place"][:, :, n]
 
     def _has_news(self, radio: int) -> torch.Tensor:
@@ -140,8 +155,9 @@ class Strategy:
         return self.left <= self.way[..., self.robots] + self.drive
 
     def _rendezvous(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Robots that are connected agree to meet `comm.period` decisions later, at the base station or where the first
-        of them is; whoever is parted from others of its party is there in time, and waits."""
+        """Robots that are connected agree to meet after `comm.period`, at the base station or where the first of them
+        is; whoever is parted from others of its party is there in time, and waits. How far apart they will be then
+        they take from how wide the ground is that they know."""
         s, n = self.state, self.robots
         mates = self.linked[..., :n]
         missing = (s["party"] & ~self.linked).any(-1) & (self.step <= s["due"] + PATIENCE)
@@ -154,7 +170,10 @@ class Strategy:
         spot = self._pick(self.at, leader)
         if self.has_base:
             party[..., n], spot = True, s["place"][:, :, n]
-        s["due"] = torch.where(keeps, s["due"].gather(1, first), self.step + self.period).to(torch.int32)
+        wide = self.reach * (self.known / self._disc()).sqrt()  # radius of a disc of as much ground [m]
+        cost = 2.0 * DETOUR * wide / self.drive + PATIENCE
+        period = self._period(cost, self.rest).round().clamp_min(1.0).gather(1, leader)
+        s["due"] = torch.where(keeps, s["due"].gather(1, first), self.step + period).to(torch.int32)
         s["spot"] = torch.where(keeps.unsqueeze(-1), self._pick(s["spot"], first), spot)
         promised = s["party"].gather(1, first.unsqueeze(-1).expand_as(s["party"])) | self.linked
         s["party"] = torch.where(keeps.unsqueeze(-1), promised, party)
@@ -175,6 +194,12 @@ class Strategy:
     def _pick(self, places: torch.Tensor, robot: torch.Tensor) -> torch.Tensor:
         """Rows [E, N, 2] of others' places, int64 [E, N]."""
         return places.gather(1, robot.unsqueeze(-1).expand(-1, -1, 2))
+
+    def _disc(self) -> torch.Tensor:
+        """What a radar's disc of free ground weighs on each env's map, float32 [E, 1]."""
+        maps = self.env.simulation.map_tensors
+        area = torch.tensor([one.free_area for one in self.env.maps], device=self.env.device)
+        return (maps["total_weight"] / area * torch.pi * self.reach**2)[self.sim["map_id"].long()].view(-1, 1)
 
     def _relay(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The last robot goes to and fro between the base station and whom it has not met for longest; the others come
@@ -197,13 +222,10 @@ class Strategy:
     def _pursuit(self) -> tuple[torch.Tensor, torch.Tensor]:
         """A robot goes to where it last heard the one that misses most, the base station too, as soon as that pays."""
         s = self.state
-        maps = self.env.simulation.map_tensors
-        area = torch.tensor([one.free_area for one in self.env.maps], device=self.env.device)
-        disc = (maps["total_weight"] / area * torch.pi * self.reach**2)[self.sim["map_id"].long()].view(-1, 1, 1)
         gap = self.straight / self.reach
         there = (gap <= NEAR) & ~self.linked  # nobody is here any more: it will not be looked for again
         s["told"] = torch.where(there, self.known.unsqueeze(-1), s["told"])
-        misses = (self.known.unsqueeze(-1) - s["told"]) / disc
+        misses = (self.known.unsqueeze(-1) - s["told"]) / self._disc().unsqueeze(-1)
         known = s["met"] >= 0
         if self.has_base:
             known[..., self.robots] = True

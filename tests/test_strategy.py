@@ -9,7 +9,7 @@ from torchrl.envs.utils import step_mdp
 from worlds import room
 
 from maexp.agents.policies import POLICIES
-from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig
 from maexp.envs.config import STRATEGIES
 from maexp.envs.strategy import PATIENCE
 from maexp.kernels.types import REGIONS
@@ -77,6 +77,37 @@ def test_a_robot_reports_and_is_released():
     told = env.simulation.tensors["known_weight"][0, 2].item()
     put(env, {1: (6.0, 12.0)})
     assert wait(env, 2).tolist() == [False, False] and env.simulation.tensors["known_weight"][0, 2] > told
+
+
+@pytest.mark.parametrize("x", [12.0, 20.0, 36.0])
+def test_reports_are_rarer_the_longer_the_way(x):
+    """By itself a robot turns back to report sqrt(c L / 2) decisions after the last time, c the way there and out."""
+    env = make(robots=1, period="auto", macro_steps=60)
+    start(env, (4.0, 10.0))
+    wait(env)
+    put(env, {0: (x, 10.0)})
+    drive = 0.7 * env.robot_configs[0].max_speed * 1.0  # of a decision [m]
+    s, found = env.simulation.tensors, []
+    while not found or not found[-1]:
+        env.strategy.state["grew"][:] = s["macro_step"].view(-1, 1)  # there is always news
+        step, at = int(s["macro_step"][0]), s["center"][0, 0, :2]
+        way = min(float(s["path_length"][0, 0]), 1.5 * float((at - torch.tensor(BASE)).norm())) / drive
+        found.append(bool(wait(env)[0]))
+        turns = step + way >= (0.5 * 2.0 * way * 60) ** 0.5 or 60 - step <= way + 1.0
+        assert found[-1] == turns, (step, way)
+    assert len(found) > 5
+
+
+def test_the_next_meeting_is_farther_off_the_more_they_know():
+    """All who meet agree on one time, also where one of them is slower."""
+    env = make("rendezvous", robots=2, period="auto", robot=[RobotConfig(max_speed=one) for one in (1.0, 2.0)])
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    first = env.strategy.state["due"][0].tolist()
+    disc = float(env.strategy._disc())
+    wide = env.strategy.reach * (float(env.simulation.tensors["known_weight"][0, 0]) / disc) ** 0.5
+    cost = 2.0 * 1.5 * wide / (0.7 * 1.0 * 1.0) + PATIENCE
+    assert first[0] == first[1] == pytest.approx((0.5 * cost * 40) ** 0.5, abs=1.0)
 
 
 def test_who_has_nothing_to_tell_does_not_report():
@@ -164,9 +195,16 @@ def test_a_pursuit_pays_by_what_the_other_misses():
 
 
 @pytest.mark.parametrize("strategy", [one for one in STRATEGIES if one != "opportunistic"])
-def test_decisions_repeat(strategy):
+@pytest.mark.parametrize("period", [3, "auto"])
+def test_decisions_repeat(strategy, period):
     """For any size of the batch, from a saved state and in a copy, with targets or a planner's goals."""
-    world = {"base": True, "local_steps": 10, "observation": ObservationConfig(targets=4), "robots": 3}
+    world = {
+        "base": True,
+        "period": period,
+        "local_steps": 10,
+        "observation": ObservationConfig(targets=4),
+        "robots": 3,
+    }
     small, large = (make(strategy, envs=count, **world) for count in (1, 3))
     for env in (small, large):
         env.set_episodes(torch.arange(env.num_envs))
@@ -189,7 +227,7 @@ def test_decisions_repeat(strategy):
         for name, value in small.strategy.state.items():
             assert torch.equal(value[0], large.strategy.state[name][0]), name
         on_duty += int(large.strategy.state["duty"].sum())
-    assert on_duty or strategy in ("pursuit", "relay")
+    assert on_duty or strategy in ("pursuit", "relay") or period == "auto"
 
 
 def test_a_new_episode_remembers_nothing():
@@ -219,6 +257,7 @@ def test_a_new_episode_remembers_nothing():
         (dict(strategy="pursuit", range=5.0), dict(planner=PlannerConfig(name="dwa")), "planner=dwa finds no way"),
         (dict(strategy="pursuit", range=5.0, period=0), {}, "comm.period=0"),
         (dict(strategy="pursuit", range=5.0, period=2.5), {}, "comm.period=2.5"),
+        (dict(strategy="pursuit", range=5.0, period="often"), {}, "comm.period='often' must be auto or a whole number"),
     ],
 )
 def test_bad_settings_are_named(comm, settings, words):

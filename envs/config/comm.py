@@ -23,7 +23,7 @@ class CommConfig(Group):
     Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
     (`maexp.kernels.radio`). Messages may take room and time (`maexp.kernels.messages`). ``strategy`` is what robots do
     to tell others what they know, whatever their policy (`maexp.envs.strategy`): nothing but to talk when they meet
-    (``opportunistic``), or to report or meet every ``period`` decisions. A base station is a radio with a map of its
+    (``opportunistic``), or to report or meet after ``period`` decisions. A base station is a radio with a map of its
     own.
     """
 
@@ -55,7 +55,9 @@ class CommConfig(Group):
     strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = setting(
         "opportunistic", "what robots do to tell others what they know (docs/conditions.md)"
     )
-    period: int = setting(8, "decisions between two reports or meetings", low=1)
+    period: int | Literal["auto"] = setting(
+        "auto", "decisions between two reports or meetings; auto: by the way back and the time left", low=1
+    )
 
     @property
     def limited(self) -> bool:
