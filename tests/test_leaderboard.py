@@ -166,7 +166,7 @@ def edit_maps(run: Path) -> None:
     [
         (edit_score, [], "is not what it says (results.json: score.mean)"),
         (edit_checksum, ["verify=false"], "was played with another version of small"),
-        (edit_maps, ["verify=false"], "was played on other maps (seed=0)"),
+        (edit_maps, ["verify=false"], "was played on other maps or starts (seed=0)"),
     ],
 )
 def test_a_run_that_is_not_what_it_says_is_no_row(edit, words, told, small, runs, tmp_path, capsys):

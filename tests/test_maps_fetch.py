@@ -4,67 +4,21 @@ import csv
 import errno
 import hashlib
 import os
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
+from map_server import Server
 from worlds import room
 
+from maexp.agents import map_sets
 from maexp.agents.cli import main
-from maexp.agents.commands import maps_fetch
 from maexp.envs import PointCloudMap
 from maexp.envs.importing import download
 from maexp.envs.importing.export import export_ros_map
 
 LICENCE = b"Do as you like.\n"
 BUILDINGS = {"hall_1": ("hall", "training"), "hall_2": ("hall", "training"), "shed": ("shed", "test")}
-
-
-class Server(ThreadingHTTPServer):
-    """Serves `files` (address -> bytes) and notes what was asked; `cut` and others make it misbehave."""
-
-    def __init__(self, files: dict[str, bytes]):
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.files, self.asked = files, []
-        self.cut, self.ranges, self.endless, self.busy = 0, True, False, 0
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
-
-
-class Handler(BaseHTTPRequestHandler):
-    def log_message(self, *words) -> None:
-        pass
-
-    def do_GET(self) -> None:
-        server, body = self.server, self.server.files.get(self.path.lstrip("/"))
-        begin = int(self.headers.get("Range", "bytes=0-").split("=")[1].rstrip("-"))
-        server.asked.append((self.path.rsplit("/", 1)[1], begin))
-        if server.busy:
-            server.busy -= 1
-            self.send_error(503)
-        elif body is None:
-            self.send_error(404)
-        else:
-            begin = begin if server.ranges else 0
-            self.send_response(206 if begin else 200)
-            if not server.endless:
-                self.send_header("Content-Length", str(len(body) - begin))
-            self.end_headers()
-            self.send(body[begin:])
-
-    def send(self, body: bytes) -> None:
-        if self.server.cut and len(body) > self.server.cut:
-            body = body[: self.server.cut]
-        try:
-            self.wfile.write(body)
-            while self.server.endless:
-                self.wfile.write(bytes(2**16))
-        except OSError:
-            pass
 
 
 @pytest.fixture
@@ -86,15 +40,11 @@ def server(tmp_path, monkeypatch):
             writer.writerow([*row, len(body), hashlib.sha256(body).hexdigest(), "MIT"])
     one = Server(files)
     (sets / "tiny.yaml").write_text(f"about: rooms\naddress: {one.address}\n")
-    monkeypatch.setattr(maps_fetch, "SETS", sets)
+    monkeypatch.setattr(map_sets, "SETS", sets)
     monkeypatch.setattr(download, "PAUSES", (0.0, 0.0))
     monkeypatch.setattr(download, "PATIENCE", 2.0)
-    thread = threading.Thread(target=one.serve_forever, daemon=True)
-    thread.start()
-    yield one
-    one.shutdown()
-    one.server_close()
-    thread.join()
+    with one.serving():
+        yield one
 
 
 @pytest.fixture
@@ -235,24 +185,24 @@ def test_bad_words_get_a_sentence(words, told, capsys):
 
 def test_the_cache_is_where_such_things_are_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert maps_fetch.find_cache() == tmp_path / "maexp" / "maps"
+    assert map_sets.find_cache() == tmp_path / "maexp" / "maps"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert maps_fetch.find_cache() == Path.home() / ".cache" / "maexp" / "maps"
+    assert map_sets.find_cache() == Path.home() / ".cache" / "maexp" / "maps"
 
 
-@pytest.mark.parametrize("name", maps_fetch.set_names())
+@pytest.mark.parametrize("name", map_sets.set_names())
 def test_a_set_is_pinned_split_by_building_and_has_its_licences(name):
-    found = maps_fetch.load_set(name)
+    found = map_sets.load_set(name)
     assert len({one.sha256 for one in found.maps}) == len({one.place for one in found.maps}) == len(found.maps) > 10
     assert len({Path(one.file).stem for one in found.maps}) == len(found.maps), "a yaml each"
     for one in found.entries:
-        assert len(one.sha256) == 64 and 0 < one.bytes < 10**7 and one.split in (*maps_fetch.SPLITS, "licences")
+        assert len(one.sha256) == 64 and 0 < one.bytes < 10**7 and one.split in (*map_sets.SPLITS, "licences")
         commit = one.address.split("/")[2]
         assert len(commit) == 40 and not set(commit) - set("0123456789abcdef"), "an address that does not move"
     splits = {}
     for one in found.maps:
         assert np.isfinite([one.resolution, one.free_thresh]).all()
         assert splits.setdefault(one.building, one.split) == one.split
-    assert set(splits.values()) == set(maps_fetch.SPLITS)
+    assert set(splits.values()) == set(map_sets.SPLITS)
     licensed = {one.source for one in found.entries if one.split == "licences"}
     assert set(found.sources()) == licensed and all(found.sources().values())

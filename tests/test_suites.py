@@ -58,11 +58,12 @@ def test_there_is_a_quick_suite_and_its_name_is_its_file():
 
 @pytest.mark.parametrize("name", suite_names())
 def test_a_suite_is_as_it_was_frozen(name):
-    """Its file, its episodes and the points of all its maps."""
+    """Its file, its episodes and the points of all its maps; of those to fetch see test_suites_fetched.py."""
     suite = load_suite(name)
     suite.check()
     for part in suite.parts.values():
-        check_maps(suite, part, build_maps(part))
+        if not part.fetched:
+            check_maps(suite, part, build_maps(part))
     frozen = read_frozen(suite)
     for policy, results in frozen.items():
         values = {part: one.episodes[suite.score] for part, one in results.items()}

@@ -10,6 +10,7 @@ from maexp.agents.commands.maps_folder import find_files
 from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import command, write_text
+from maexp.agents.map_sets import set_names
 from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
@@ -43,7 +44,7 @@ def check(cfg: MapsSettings) -> None:
     if cfg.task == "list" and cfg.file:
         raise UserError(f"maexp maps list lists all scenarios and takes no file: leave {cfg.file} out.")
     if cfg.task != "list" and not cfg.file:
-        what = {"make": "scenario", "fetch": f"set ({', '.join(maps_fetch.set_names())})"}.get(cfg.task, "file")
+        what = {"make": "scenario", "fetch": f"set ({', '.join(set_names())})"}.get(cfg.task, "file")
         raise UserError(f"maexp maps {cfg.task} needs a {what} after it.")
     if cfg.task == "fetch":
         maps_fetch.check(cfg.file, cfg.mirror)

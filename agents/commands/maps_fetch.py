@@ -1,114 +1,19 @@
 """`maexp maps fetch NAME`: a set of published maps from its public address, file by file as pinned, and imported."""
 
 import csv
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-import maexp.conf
 from maexp.agents.commands import maps_folder
 from maexp.agents.errors import UserError
 from maexp.agents.files import short, write_text
 from maexp.agents.locking import lock
+from maexp.agents.map_sets import FILES, LICENCES, MAPS, SPLITS, Entry, MapSet, find_cache, load_set
 from maexp.agents.progress import Progress
-
-SETS = Path(maexp.conf.__path__[0]) / "_maps"
-LICENCES, FILES, MAPS = "licences", "files", "maps"
-SPLITS = ("training", "validation", "test")
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A file of a set: an image of a floor, or a licence.
-
-    Attributes:
-        split: training, validation, test; or licences
-        address: below the set's
-        bytes, sha256: what it must be
-        licence: its short name
-        building: floors of one are in one split
-        resolution: edge of a pixel [m]
-        free_thresh: of map_server
-    """
-
-    split: str
-    file: str
-    address: str
-    bytes: int
-    sha256: str
-    licence: str
-    building: str
-    resolution: float
-    free_thresh: float
-
-    @property
-    def place(self) -> str:
-        """Where it is kept, below the folder of the set."""
-        return f"{LICENCES}/{self.file}" if self.split == LICENCES else f"{FILES}/{self.split}/{self.file}"
-
-    @property
-    def source(self) -> str:
-        """The repository, OWNER/NAME."""
-        return "/".join(self.address.split("/")[:2])
-
-
-@dataclass(frozen=True)
-class MapSet:
-    """A set of maps; `about` says what it is and `address` where it is, before those of its files."""
-
-    name: str
-    about: str
-    address: str
-    entries: tuple[Entry, ...]
-
-    @property
-    def maps(self) -> list[Entry]:
-        return [one for one in self.entries if one.split != LICENCES]
-
-    def describe(self) -> list[str]:
-        """Its content and licences."""
-        count = ", ".join(f"{sum(one.split == part for one in self.maps)} for {part}" for part in SPLITS)
-        size = sum(one.bytes for one in self.entries) / 1e6
-        lines = [f"{self.name}: {self.about}", f"{len(self.maps)} maps ({count}), {size:.1f} MB. Licences:"]
-        return [*lines, *(f"  {licence} {source}" for source, licence in self.sources().items())]
-
-    def sources(self) -> dict[str, str]:
-        """Repository -> licence."""
-        return {one.source: one.licence for one in self.maps}
-
-
-def set_names() -> list[str]:
-    """The sets that come with the package."""
-    return sorted(one.stem for one in SETS.glob("*.yaml"))
-
-
-def load_set(name: str) -> MapSet:
-    """A set by its name.
-
-    Raises:
-        UserError: there is none of that name.
-    """
-    if name not in set_names():
-        raise UserError(f"{name} is no set of maps: choose one of {', '.join(set_names())}.")
-    head = yaml.safe_load((SETS / f"{name}.yaml").read_text())
-    with open(SETS / f"{name}.csv", newline="") as file:
-        entries = tuple(_entry(row) for row in csv.DictReader(file))
-    return MapSet(name, head["about"], head["address"], entries)
-
-
-def _entry(row: dict[str, str]) -> Entry:
-    numbers = {name: float(row[name] or "nan") for name in ("resolution", "free_thresh")}
-    return Entry(**row | numbers | {"bytes": int(row["bytes"])})
-
-
-def find_cache() -> Path:
-    """Where sets are kept unless `out` says otherwise."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "maexp" / "maps"
 
 
 def check(name: str, mirror: str | None) -> None:

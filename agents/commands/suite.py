@@ -69,7 +69,11 @@ def check(cfg: SuiteSettings) -> None:
         what = "the folder of a run" if cfg.task == "verify" else f"a name: {', '.join(suite_names())}"
         raise UserError(f"maexp suite {cfg.task} needs {what} after it.")
     if cfg.task != "verify":
-        load_suite(cfg.place)
+        suite = load_suite(cfg.place)
+    if cfg.task in ("run", "freeze"):
+        for part in suite.parts.values():
+            if part.fetched:
+                part.check_fetched()
     if cfg.task == "run":
         if not cfg.policy:
             raise UserError("Nothing to run: give policy=NAME, as policy=universal.")

@@ -10,7 +10,8 @@ import yaml
 from maexp.agents.checksums import checksum
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.files import write_text
+from maexp.agents.files import short, write_text
+from maexp.agents.map_sets import MAPS, MapsError
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.suites.play import build_env, build_maps, play_batch
 from maexp.agents.suites.score import RANDOM, Results, mean_of
@@ -23,20 +24,23 @@ NUM_ENVS = 16
 
 
 def sums(part: Part, maps: list[PointCloudMap], seed: int | None = None) -> dict[str, str]:
-    """Number of each map in the scenario -> checksum of its points."""
-    return {str(index): checksum(one) for index, one in zip(part.indices(seed), maps, strict=True)}
+    """Number of each map in the scenario, or its name in the set -> checksum of its points."""
+    return {name: checksum(one) for name, one in zip(part.map_names(seed), maps, strict=True)}
 
 
 def check_maps(suite: Suite, part: Part, maps: list[PointCloudMap]) -> None:
     """Raise UserError unless the maps have the points that were frozen."""
     found, wanted = sums(part, maps), suite.frozen["maps"][part.name]
-    wrong = [index for index, one in found.items() if wanted.get(index) != one]
-    if wrong or len(found) != len(wanted):
-        told = ", ".join(f"{part.scenario} {index}" for index in wrong[:3])
-        raise UserError(
-            f"suite {suite.name}: {part.name} has maps with other points than were frozen ({told}): "
-            "use the version of MAexp that the suite came with."
-        )
+    wrong = [name for name, one in found.items() if wanted.get(name) != one]
+    if not wrong and len(found) == len(wanted):
+        return
+    told = ", ".join(f"{part.scenario} {name}".strip() for name in wrong[:3])
+    told = f"suite {suite.name}: {part.name} has maps with other points than were frozen ({told})"
+    version = "use the version of MAexp that the suite came with"
+    if part.fetched:
+        own = part.map_set
+        raise MapsError(f"{told}: remove {short(own.kept / MAPS)} and import anew with {own.fetch}; or {version}.")
+    raise UserError(f"{told}: {version}.")
 
 
 def read_frozen(suite: Suite) -> dict[str, Results]:

@@ -51,8 +51,19 @@ class Batch:
 
 
 def build_maps(part: Part, seed: int | None = None) -> list[PointCloudMap]:
-    """The maps of a part; of another seed: others."""
+    """The maps of a part; of another seed: others, unless they are of a published set.
+
+    Raises:
+        MapsError: the set has not been fetched.
+    """
+    if part.fetched:
+        return _load_maps(part)
     return list(_make_maps(part.scenario, tuple(part.indices(seed))))
+
+
+def _load_maps(part: Part) -> list[PointCloudMap]:
+    part.check_fetched()
+    return [PointCloudMap.load(part.map_set.kept / one.map_place) for one in part.floors]
 
 
 @lru_cache(maxsize=16)

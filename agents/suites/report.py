@@ -29,10 +29,22 @@ def describe_suite(suite: Suite) -> list[str]:
     heads, rows = ("part", "maps", "robots", "radar [m]", "starts", "episode [s]"), []
     for name, part in suite.parts.items():
         maps = f"{part.scenario} {part.first} to {part.first + part.count - 1}"
+        if part.fetched:
+            maps = f"{part.fetched}: {', '.join(part.map_names())}"
         robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"
         seconds = f"{0.1 * part.limit:g}, a decision every {0.1 * part.local_steps:g}"
         rows.append([name, maps, robots, f"{part.radar['range']:g}", part.starts, seconds])
-    return [*lines, "", *markdown_table(heads, rows), "", f"File: {suite.path}"]
+    return [*lines, "", *markdown_table(heads, rows), "", *_describe_sources(suite), f"File: {suite.path}"]
+
+
+def _describe_sources(suite: Suite) -> list[str]:
+    """Whose published maps it plays, with their licences."""
+    sets = {part.map_set.name: part for part in suite.parts.values() if part.fetched}
+    lines = []
+    for part in sets.values():
+        sources = ", ".join({f"{one.source} ({one.licence})": None for one in part.floors})
+        lines.append(f"Maps to fetch, {part.map_set.fetch}: {sources}")
+    return lines
 
 
 def print_results(suite: Suite, results: dict[str, Any]) -> None:
@@ -76,7 +88,8 @@ def describe_results(suite: Suite, results: dict[str, Any]) -> list[str]:
         number, reason = next(iter(reasons.items()))
         lines.append(f"{part}: {len(reasons)} of {suite.episodes} episodes ended early, {number} first: {reason}.")
     if not results["suite"]["frozen_maps"]:
-        lines.append(f"Other maps and starts, of seed {results['suite']['seed']}: not the score of {suite.name}.")
+        others = "starts" if all(part.fetched for part in suite.parts.values()) else "maps and starts"
+        lines.append(f"Other {others}, of seed {results['suite']['seed']}: not the score of {suite.name}.")
     return lines
 
 

@@ -68,7 +68,9 @@ def make_row(
     if results["suite"]["checksum"] != suite.checksum:
         raise UserError(f"{short(where)} was played with another version of {suite.name} than is here.")
     if not results["suite"]["frozen_maps"]:
-        raise UserError(f"{short(where)} was played on other maps (seed={results['suite']['seed']}): it has no score.")
+        raise UserError(
+            f"{short(where)} was played on other maps or starts (seed={results['suite']['seed']}): it has no score."
+        )
     row: dict[str, Any] = {"format": FORMAT, "verified": check, "metric": suite.score}
     row |= {name: results[name] for name in KEPT}
     row["reference"] = {name: one for name, one in results["reference"].items() if name != "differences"}

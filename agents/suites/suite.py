@@ -17,15 +17,16 @@ import yaml
 
 import maexp.conf
 from maexp.agents.errors import UserError
+from maexp.agents.files import short
+from maexp.agents.map_sets import SPLITS, Entry, MapsError, MapSet, load_set, set_names
 from maexp.envs.config import STARTS
 from maexp.envs.scenarios import SCENARIOS
 
 FOLDER = Path(maexp.conf.__path__[0]) / "_suite"
 KEYS = ("name", "version", "score", "metrics", "reference", "seed", "episodes", "decision_limit", "parts")
+GENERATED, FETCHED = ("scenario", "first", "count"), ("fetched",)
+"""What says which maps a part has: one or the other."""
 PART_KEYS = (
-    "scenario",
-    "first",
-    "count",
     "num_robots",
     "starts",
     "local_steps",
@@ -43,12 +44,11 @@ OTHER_MAPS = 10_000, 2**31
 
 @dataclass(frozen=True)
 class Part:
-    """Teams of one size on maps of one scenario; fields as in the file, lengths in metres, times in local steps."""
+    """Teams of one size on maps of one scenario, or of a published set; fields as in the file, lengths in metres, times
+    in local steps.
+    """
 
     name: str
-    scenario: str
-    first: int
-    count: int
     num_robots: int
     starts: str
     local_steps: int
@@ -59,6 +59,10 @@ class Part:
     radar: dict
     planner: dict
     comm: dict
+    scenario: str = ""
+    first: int = 0
+    count: int = 0
+    fetched: str = ""
 
     @property
     def limit(self) -> int:
@@ -71,6 +75,31 @@ class Part:
             return list(range(self.first, self.first + self.count))
         drawn = np.random.default_rng([seed, *self.scenario.encode()]).integers(*OTHER_MAPS, 4 * self.count)
         return list(dict.fromkeys(drawn.tolist()))[: self.count]
+
+    @property
+    def map_set(self) -> MapSet:
+        """The published set of which `fetched` names a split."""
+        return load_set(self.fetched.partition("/")[0])
+
+    @property
+    def floors(self) -> list[Entry]:
+        """The maps of that split, in the order of the set."""
+        return [one for one in self.map_set.maps if one.split == self.fetched.partition("/")[2]]
+
+    def check_fetched(self) -> None:
+        """Raise MapsError unless all of them have been fetched."""
+        where, floors = self.map_set.kept, self.floors
+        if missing := [one.name for one in floors if not (where / one.map_place).is_file()]:
+            raise MapsError(
+                f"{self.name} plays maps of {self.fetched}, and {len(missing)} of {len(floors)} are not in "
+                f"{short(where)}: fetch them with {self.map_set.fetch}."
+            )
+
+    def map_names(self, seed: int | None = None) -> list[str]:
+        """What tells its maps apart: numbers in the scenario, or names in the set."""
+        if self.fetched:
+            return [one.name for one in self.floors]
+        return [str(index) for index in self.indices(seed)]
 
 
 @dataclass(frozen=True)
@@ -200,17 +229,29 @@ def _check_content(path: Path, content: Any) -> None:
     if not isinstance(content["parts"], dict) or not content["parts"]:
         raise UserError(f"{path}: parts must name at least one part.")
     for name, part in content["parts"].items():
-        _check_keys(path, f"parts.{name}.", part, PART_KEYS)
-        for count in ("count", "num_robots", "local_steps", "macro_steps"):
+        fetched = isinstance(part, dict) and "fetched" in part
+        _check_keys(path, f"parts.{name}.", part, (*(FETCHED if fetched else GENERATED), *PART_KEYS))
+        for count in ("num_robots", "local_steps", "macro_steps"):
             _check_count(path, f"parts.{name}.{count}", part[count])
-        _check_count(path, f"parts.{name}.first", part["first"], least=0)
-        scenario = SCENARIOS.get(part["scenario"])
-        if scenario is None or scenario.build is None:
-            raise UserError(f"{path}: parts.{name}.scenario={part['scenario']} builds no maps.")
+        (_check_fetched if fetched else _check_generated)(path, f"parts.{name}", part)
         if part["starts"] not in STARTS:
             raise UserError(f"{path}: parts.{name}.starts={part['starts']} is unknown: choose {', '.join(STARTS)}.")
         for group, kind in _configs().items():
             _check_group(path, f"parts.{name}.{group}", part[group], kind)
+
+
+def _check_generated(path: Path, where: str, part: dict) -> None:
+    _check_count(path, f"{where}.count", part["count"])
+    _check_count(path, f"{where}.first", part["first"], least=0)
+    scenario = SCENARIOS.get(part["scenario"])
+    if scenario is None or scenario.build is None:
+        raise UserError(f"{path}: {where}.scenario={part['scenario']} builds no maps.")
+
+
+def _check_fetched(path: Path, where: str, part: dict) -> None:
+    known = [f"{name}/{split}" for name in set_names() for split in SPLITS]
+    if part["fetched"] not in known:
+        raise UserError(f"{path}: {where}.fetched={part['fetched']} is unknown: choose {', '.join(known)}.")
 
 
 def _configs() -> dict[str, type]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.errors import UserError
+from maexp.agents.map_sets import MapsError
 from maexp.agents.suites import folder
 from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
 from maexp.agents.suites.play import Batch, build_env, build_maps, replay_batch
@@ -34,7 +35,7 @@ def verify(where: Path, file: str | None = None, advance: Callable[[int], None] 
         advance: called with the number of episodes that were played again
 
     Raises:
-        UserError: there is no folder.
+        UserError: there is no folder; MapsError: maps that were fetched are missing or others.
     """
     if not where.is_dir():
         raise UserError(f"{where} is no folder: give one that maexp suite run wrote.")
@@ -51,6 +52,8 @@ def verify(where: Path, file: str | None = None, advance: Callable[[int], None] 
         if _same_suite(suite, stated["suite"], found):
             _check_files(where, stated["files"], found)
             _check_numbers(where, suite, stated, found, advance)
+    except MapsError:
+        raise  # that says nothing about the folder
     except UserError as error:
         found.add(folder.RESULTS, str(error))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
@@ -105,7 +108,7 @@ def _replay_part(
 ) -> list[Batch]:
     part = suite.parts[name]
     maps = build_maps(part, seed)
-    if seed is None:
+    if seed is None or part.fetched:
         check_maps(suite, part, maps)
     compare(found, folder.RESULTS, f"maps.{name}", stated["maps"][name], sums(part, maps, seed), 0.0)
     played, first, env = [], 0, None
