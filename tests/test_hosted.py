@@ -105,7 +105,11 @@ def test_a_fault_costs_its_episode_and_nothing_else(kind, tmp_path, monkeypatch)
     assert all(one.isprintable() and len(one) < 500 for one in reasons)
     if kind in ("Forks", "Daemons"):
         children = [int(line) for line in (tmp_path / "children").read_text().split()]
-        assert len(children) == 5 * sum(bad) and not [one for one in children if alive(one)]
+        assert len(children) == 5 * sum(bad)
+        end = time.monotonic() + 20
+        while [one for one in children if alive(one)]:  # killed, and on a busy machine not yet gone
+            assert time.monotonic() < end
+            time.sleep(0.05)
 
 
 def alive(process: int) -> bool:

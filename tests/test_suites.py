@@ -527,6 +527,7 @@ def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, sm
         cwd=Path(__file__).parent,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # tests under nohup would hand on that it is ignored
     )
     try:
         end = time.monotonic() + 120
