@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ torch.set_num_threads(1)
 wp.config.quiet = True
 if os.environ.get("MAEXP_WARP_MODE"):  # `.ci/run` repeats the kernel tests with "debug" (bounds checks)
     wp.config.mode = os.environ["MAEXP_WARP_MODE"]
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell hands that on to what runs in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 settings.register_profile("long")  # `--hypothesis-profile=long`: hours of fuzzing by hand (CONTRIBUTING.md)
 
 

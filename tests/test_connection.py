@@ -39,7 +39,7 @@ def listening(word: str, folder: Path = TESTS):
         yield f"socket:127.0.0.1:{server.stdout.readline().split()[-1]}", server
     finally:
         server.send_signal(signal.SIGINT)
-        server.wait()
+        server.wait(60)
         server.stdout.close()
 
 
@@ -131,7 +131,7 @@ def test_who_is_gone_loses_its_episodes_and_the_run_goes_on():
             play(policy, env, torch.tensor([0]))
             assert policy.reasons == [""]
             server.send_signal(signal.SIGINT)
-            server.wait()
+            server.wait(60)
             for told in ("it closed the connection", *2 * ["nobody can be reached at 127.0.0.1, port"]):
                 final = play(policy, env, torch.tensor([1]))
                 assert policy.reasons[0].startswith(told) and "\n" not in policy.reasons[0]
