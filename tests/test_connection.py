@@ -173,8 +173,7 @@ def test_a_listener_that_is_told_to_end_leaves_nobody_behind(tmp_path):
         server.stdout.close()
 
 
-def test_a_program_that_is_not_there_is_told_before_anybody_connects(capsys, monkeypatch):
-    monkeypatch.setattr(connection.signal, "signal", lambda *_: None)
+def test_a_program_that_is_not_there_is_told_before_anybody_connects(capsys):
     assert connection.main([f"127.0.0.1:{free_port()}", "exec:/no/such/program"]) == 2
     assert "/no/such/program is no program" in capsys.readouterr().err
 

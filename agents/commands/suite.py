@@ -2,11 +2,9 @@
 
 import json
 import math
-import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import SuiteSettings
+from maexp.agents.signals import ended_by_signals
 from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.
@@ -140,7 +139,7 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
             write_text(where / files.RUN, files.dump(content) + "\n")
         try:
             total = len(suite.parts) * suite.episodes
-            with _ending(), Progress(f"{player.name} on {suite.name}", total) as progress:
+            with ended_by_signals(), Progress(f"{player.name} on {suite.name}", total) as progress:
                 playing = SuiteRun(
                     suite, player, where, seed, settings["num_envs"], device, progress.advance, progress.tell
                 )
@@ -156,22 +155,6 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
     print(f"Written to {short(where)}: {files.RESULTS}, {files.ACTIONS}/, profile.png, {files.RUN}")
     print(f"Next: {command('suite', 'verify', short(where))}")
     return 0
-
-
-@contextmanager
-def _ending() -> Iterator[None]:
-    """A cluster or terminal that ends the run stops it as Ctrl-C does: no process of a policy stays behind."""
-
-    def stop(*_) -> None:
-        raise KeyboardInterrupt
-
-    wanted = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) != signal.SIG_IGN]  # nohup
-    before = {number: signal.signal(number, stop) for number in wanted}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _check_same_suite(where: Path, suite: Suite) -> None:

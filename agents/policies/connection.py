@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import select
 import shutil
-import signal
 import socket
 import sys
 from threading import Thread
 
 from maexp.agents.policies.process import Guest, Lost, Session, command_of
+from maexp.agents.signals import ended_by_signals
 
 SOCKET = "socket:"
 REACH = 10.0  # seconds that connecting may take
@@ -81,18 +81,14 @@ def _attend(link: socket.socket, process: Session, running: set[Session]) -> Non
 
 
 def main(words: list[str]) -> int:
-    """Serve until Ctrl-C or SIGTERM."""
-
-    def stop(*_) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, stop)
+    """Serve until Ctrl-C, SIGTERM or SIGHUP."""
     try:
         where, word = words
         command = command_of(word)
         if shutil.which(command[0]) is None:
             raise ValueError(f"{command[0]} is no program")
-        serve(*address_of(where), command)
+        with ended_by_signals():
+            serve(*address_of(where), command)
     except (OSError, ValueError) as error:
         print(f"usage: python -m maexp.agents.policies.connection HOST:PORT WORD ({error})", file=sys.stderr)
         return 2

@@ -1,0 +1,21 @@
+"""What ends a program from outside."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """A cluster or a terminal that ends the program stops it as Ctrl-C does: no process of a policy stays behind."""
+
+    def stop(*_) -> None:
+        raise KeyboardInterrupt
+
+    wanted = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) != signal.SIG_IGN]  # nohup
+    before = {number: signal.signal(number, stop) for number in wanted}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
