@@ -24,9 +24,8 @@ import os, sys, time
 from pathlib import Path
 from maexp.agents.locking import lock
 with lock(Path(sys.argv[1]), "maexp train"):
-    if os.fork() == 0:  # a worker that outlives its parent
-        time.sleep(60)
-    print("held", flush=True)
+    if os.fork() == 0:  # a worker that outlives its parent, and has let go by the time it speaks
+        print("held", flush=True)
     time.sleep(60)
 """
 
