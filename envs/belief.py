@@ -339,13 +339,17 @@ class Beliefs(Branches):
             one[:count] = self.table[name][place]
         self._fit_blocks(place)
         self.wall[:count] = NOBODY
-        prefix = "known" if self.rows > 1 else "viewers"
-        self.known[:count] = self.nav._known[teams].flatten(0, 1)
-        self.flags[: len(teams)] = origin[f"{prefix}_boundary"][teams]
+        self._take_up(teams)
         self.map_id[: len(teams)] = origin["map_id"][teams]
         if self.unknown is not None:
             self._guess(count)
         replay(self.writing)
+
+    def _take_up(self, teams: torch.Tensor) -> None:
+        """What the robots of some teams know: of each cell, and the walls that they have seen."""
+        prefix = "known" if self.rows > 1 else "viewers"
+        self.known[: len(teams) * self.rows] = self.nav._known[teams].flatten(0, 1)
+        self.flags[: len(teams)] = self.origin.simulation.tensors[f"{prefix}_boundary"][teams]
 
     def _guess(self, count: int) -> None:
         """Let unknown cells of the first `count` worlds hold what `unknown` makes of what is known."""

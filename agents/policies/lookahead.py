@@ -11,7 +11,14 @@ from __future__ import annotations
 import torch
 
 from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner, rank_by_utility
-from maexp.agents.policies.rollouts import ROLLOUT_POLICY, Rollouts, check_rollout_policy, pick_places
+from maexp.agents.policies.rollouts import (
+    ROLLOUT_POLICY,
+    Rollouts,
+    branches_of,
+    check_rollout_policy,
+    pick_places,
+    search_in_turn,
+)
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.choices import value_targets
@@ -38,7 +45,7 @@ class LookaheadPlanner(FrontierPlanner):
         if self.trained:
             self.rank = TrainedRank(config.rollout_policy, env, self.tracker, ROLLOUT_POLICY)
         self.env, self.config = env, config
-        self.rollouts = Rollouts(env, config, self.tracker, true_world)
+        self.rollouts = Rollouts(branches_of(env, config, self.tracker, true_world), config, self.tracker)
 
     def choose(self, scene: TensorScene) -> tuple[torch.Tensor, torch.Tensor]:
         """The target of each robot, and which robots wait: as the rollout policy says, but where a branch is better."""
@@ -54,8 +61,10 @@ class LookaheadPlanner(FrontierPlanner):
         offers = self._offer(scene, preference, own, waits)
         chosen = torch.zeros_like(own)
         teams = (self.env.simulation.tensors["active"] != 0).nonzero().squeeze(-1)
-        for some in teams.split(self.rollouts.teams) if len(teams) else ():
-            chosen[some] = self._search(some, {name: one[some] for name, one in offers.items()})
+        distinct = self.env.targets_config.distinct
+        for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
+            theirs = {name: one[some] for name, one in offers.items()}
+            chosen[some] = search_in_turn(self.rollouts, some, theirs, distinct)
         if not bool(chosen.any()):
             return own, waits
         best = offers["index"].gather(2, chosen.unsqueeze(-1))
@@ -93,33 +102,6 @@ class LookaheadPlanner(FrontierPlanner):
             "body": self.tracker.body,
             "hears": self.tracker.nav.state["comm"],
         }
-
-    def _search(self, teams: torch.Tensor, mine: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Which candidate each robot of some teams takes, int64 [T, N]."""
-        kept = self.rollouts.look(teams)
-        chosen = torch.zeros(mine["index"].shape[:2], dtype=torch.int64, device=teams.device)
-        for robot in range(chosen.shape[1]):
-            wanted = mine["wanted"][:, robot] & ~self._taken(robot, mine, chosen)
-            if not bool(wanted[:, 1:].any()):
-                continue
-            worth = self.rollouts.weigh(robot, mine, chosen, wanted, kept)
-            score = torch.where(wanted, worth + self.config.prior * mine["value"][:, robot], -torch.inf)
-            best = score.argmax(-1)
-            takes = score.gather(1, best.unsqueeze(-1)).squeeze(-1) - score[:, 0] > self.config.margin
-            chosen[:, robot] = torch.where(takes, best, 0)
-            kept = self.rollouts.keep(kept, worth, wanted, chosen[:, robot])
-        return chosen
-
-    def _taken(self, robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor) -> torch.Tensor:
-        """Which of a robot's candidates leave no room beside what those before it have chosen, bool [T, K]."""
-        if robot == 0 or not self.env.targets_config.distinct:
-            return torch.zeros_like(mine["wanted"][:, robot])
-        where = pick_places(mine["point"], chosen.unsqueeze(-1)).squeeze(2)[:, :robot]  # [T, robot, 2]
-        gap = (mine["point"][:, robot].unsqueeze(2) - where.unsqueeze(1)).norm(dim=-1)  # [T, K, robot]
-        apart = (mine["body"][:, robot : robot + 1] + mine["body"][:, :robot]).unsqueeze(1)
-        goes = mine["block"].gather(2, chosen.unsqueeze(-1)).squeeze(-1)[:, :robot] >= 0
-        counts = goes & mine["hears"][:, robot, :robot] & mine["wanted"][:, :robot, 0]
-        return ((gap < apart) & counts.unsqueeze(1)).any(-1)
 
 
 def list_candidates(preference: torch.Tensor, own: torch.Tensor, count: int) -> torch.Tensor:

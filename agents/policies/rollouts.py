@@ -5,6 +5,8 @@ The copies live in a world of what the robots know, or in the true one (`maexp.e
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from maexp.agents.networks.map_predictor import predict
@@ -24,35 +26,34 @@ GUESSES: dict[str, Guess | None] = {"free": None, "nearest": guess_nearest, "pre
 """What stands where nobody has looked: the values of `lookahead.unknown`."""
 
 
+def branches_of(env: ExplorationEnv, config: LookaheadConfig, tracker: TargetTracker, true_world: bool) -> Branches:
+    """Room for branches of an env's teams, in worlds of what their robots know or in the true one; the env is only
+    read."""
+    teams = max(1, min(env.num_envs, BRANCHES // config.candidates))
+    if true_world:
+        return Branches(env, teams, config.candidates, config.local_steps)
+    return Beliefs(env, teams, config.candidates, tracker.nav, GUESSES[config.unknown], config.local_steps)
+
+
 class Rollouts:
-    """Branches of an env's teams, and the policy that plays on in them.
+    """Branches of teams, and the policy that plays on in them.
 
     Args:
-        env: whose teams; only read.
+        branches: where they are played.
         config: how.
-        tracker: of the env's targets, up to date when branches are played.
-        true_world: play in the true world.
-
-    Attributes:
-        teams: how many branch at once.
+        tracker: of the targets of the env that branches start from, up to date when they are played.
 
     Raises:
         ValueError: the rollout policy is none.
     """
 
-    def __init__(self, env: ExplorationEnv, config: LookaheadConfig, tracker: TargetTracker, true_world: bool = False):
+    def __init__(self, branches: Branches, config: LookaheadConfig, tracker: TargetTracker):
         check_rollout_policy(config)
-        self.config, self.tracker = config, tracker
-        self.teams = max(1, min(env.num_envs, BRANCHES // config.candidates))
-        self.branches = (
-            Branches(env, self.teams, config.candidates, config.local_steps)
-            if true_world
-            else Beliefs(env, self.teams, config.candidates, tracker.nav, GUESSES[config.unknown], config.local_steps)
-        )
+        self.branches, self.config, self.tracker = branches, config, tracker
         self.follower = None
         if config.horizon > 1:
-            self.follower = FrontierPlanner(self.branches.env, CLASSICAL.get(config.rollout_policy, rank_by_utility))
-            self.branches.attach(self.follower.tracker)
+            self.follower = FrontierPlanner(branches.env, CLASSICAL.get(config.rollout_policy, rank_by_utility))
+            branches.attach(self.follower.tracker)
 
     def goals(
         self, block: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor
@@ -167,6 +168,52 @@ class Rollouts:
         env.simulation.step(0, env.local_steps)
         env._raise_errors()
         state["macro_step"] += running
+
+
+def search_in_turn(
+    rollouts: Rollouts,
+    teams: torch.Tensor,
+    mine: dict[str, torch.Tensor],
+    distinct: bool,
+    go_on: Callable[[], bool] = lambda: True,
+) -> torch.Tensor:
+    """Which candidate each robot of some teams takes, int64 [T, N], robots in turn; the own choice is number 0.
+
+    Args:
+        teams: int64 [T], which of those that `rollouts` plays.
+        mine: what they are offered, as `Rollouts.weigh` takes it, and "point": float32 [T, N, K, 2] [m], "value":
+            float32 [T, N, K], more than the own choice [radar discs], "wanted": bool [T, N, K], "body": float32 [T, N]
+            [m], "hears": bool [T, N, N].
+        distinct: no robot takes what one before it has chosen.
+        go_on: asked before each robot's turn; after a no all others keep to their own choice.
+    """
+    config, kept = rollouts.config, rollouts.look(teams)
+    chosen = torch.zeros(mine["value"].shape[:2], dtype=torch.int64, device=teams.device)
+    for robot in range(chosen.shape[1]):
+        if not go_on():
+            break
+        wanted = mine["wanted"][:, robot].clone()
+        if distinct and robot:
+            wanted &= ~_taken(robot, mine, chosen)
+        if not bool(wanted[:, 1:].any()):
+            continue
+        worth = rollouts.weigh(robot, mine, chosen, wanted, kept)
+        score = torch.where(wanted, worth + config.prior * mine["value"][:, robot], -torch.inf)
+        best = score.argmax(-1)
+        takes = score.gather(1, best.unsqueeze(-1)).squeeze(-1) - score[:, 0] > config.margin
+        chosen[:, robot] = torch.where(takes, best, 0)
+        kept = rollouts.keep(kept, worth, wanted, chosen[:, robot])
+    return chosen
+
+
+def _taken(robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor) -> torch.Tensor:
+    """Which of a robot's candidates leave no room beside what those before it have chosen, bool [T, K]."""
+    where = pick_places(mine["point"], chosen.unsqueeze(-1)).squeeze(2)[:, :robot]  # [T, robot, 2]
+    gap = (mine["point"][:, robot].unsqueeze(2) - where.unsqueeze(1)).norm(dim=-1)  # [T, K, robot]
+    apart = (mine["body"][:, robot : robot + 1] + mine["body"][:, :robot]).unsqueeze(1)
+    goes = mine["block"].gather(2, chosen.unsqueeze(-1)).squeeze(-1)[:, :robot] >= 0
+    counts = goes & mine["hears"][:, robot, :robot] & mine["wanted"][:, :robot, 0]
+    return ((gap < apart) & counts.unsqueeze(1)).any(-1)
 
 
 def pick_tried(offered: torch.Tensor, tried: torch.Tensor) -> torch.Tensor:

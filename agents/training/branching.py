@@ -30,7 +30,7 @@ from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.actor import PREFERENCE, TARGETS, TARGETS_MASK
 from maexp.agents.networks.distributions import ACTION
 from maexp.agents.policies.lookahead import list_candidates
-from maexp.agents.policies.rollouts import Rollouts, pick_places
+from maexp.agents.policies.rollouts import Rollouts, branches_of, pick_places
 from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.features import FEATURES
@@ -76,7 +76,8 @@ class BranchPlayer:
     def __init__(self, env: ExplorationEnv, candidates: int, horizon: int, seed: int | None = None):
         self.env, self.view = env, env.target_view
         config = replace(env.lookahead_config, candidates=candidates, horizon=horizon)
-        self.rollouts = Rollouts(env, config, self.view.tracker, true_world=True)
+        branches = branches_of(env, config, self.view.tracker, true_world=True)
+        self.rollouts = Rollouts(branches, config, self.view.tracker)
         self.draw = None if seed is None else torch.Generator().manual_seed(seed)
 
     def try_candidates(
@@ -107,7 +108,7 @@ class BranchPlayer:
         mine = {"region": region, "offset": offset, "block": block, "wanted": there}
         worth = torch.full(index.shape, torch.nan)
         teams = active.nonzero().squeeze(-1)
-        for some in teams.split(self.rollouts.teams) if len(teams) else ():
+        for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
             worth[some] = self._weigh(some, {name: one[some] for name, one in mine.items()})
         return torch.where(there, index, -1), worth - worth[..., :1]
 
