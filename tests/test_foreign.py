@@ -99,6 +99,7 @@ def test_an_episode_is_told_with_its_units_and_a_seed_of_its_own():
         "robot_radius": 0.9,
         "max_speed": 8.0,
         "max_accel": 2.0,
+        "drive": "ackermann",
         "seconds": 160.0,
         "decision_seconds": 2.0,
         "seed": told[0]["seed"],

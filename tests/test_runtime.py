@@ -53,7 +53,7 @@ def test_imports_neither_torch_nor_warp():
 
 
 def test_robots_know_the_planners_of_the_simulator():
-    beyond = {"oracle", "clairvoyant", "lookahead"}  # what no robot knows, or what the simulator plays
+    beyond = {"oracle", "clairvoyant", "lookahead"}  # what no robot knows, or what needs the simulator
     assert set(CHOICES) == set(classical.POLICIES) - beyond
 
 

@@ -13,6 +13,7 @@ from maexp.agents.policies.foreign import ForeignCalls
 from maexp.agents.policies.own import is_foreign
 from maexp.agents.runtime import CHOICES, Plan, TeamPlanner
 from maexp.agents.runtime.grid import read_grid
+from maexp.agents.runtime.imagine import LOOKAHEAD
 from maexp.agents.runtime.scene import find_ways
 from maexp.agents.runtime.team import read_team
 from maexp.agents.runtime.ways import trace_from
@@ -25,8 +26,8 @@ from .config import TrialConfig
 
 def check_player(word: str, player: NamedPolicy) -> None:
     """Raise UserError for a policy that plays in our simulator alone."""
-    if player.kind == "classical" and word not in CHOICES:
-        known = ", ".join(CHOICES)
+    if player.kind == "classical" and word not in (names := (*CHOICES, LOOKAHEAD)):
+        known = ", ".join(names)
         raise UserError(f"policy={word} looks into our simulator and plays there alone: choose of {known}.")
     if player.kind == "checkpoint" and player.targets is None:
         raise UserError(f"policy={word} chooses regions of a whole map: maexp irsim plays those trained on targets.")

@@ -6,7 +6,8 @@ A foreign policy is an object with
     act(observation: dict) -> goals      float [N, 2] [m]; NaN: the robot stays
 
 `episode` holds `num_robots`, `radar_range` [m], `robot_radius` [m], `max_speed` [m/s], `max_accel` [m/s^2] (of a mixed
-team the largest), `seconds` (of the whole episode), `decision_seconds` and `seed` (of this episode alone).
+team the largest), `drive` ("ackermann", "differential" or "omnidirectional"; that of robot 0), `seconds` (of the whole
+episode), `decision_seconds` and `seed` (of this episode alone).
 `observation` holds, row i being what robot i knows:
 
     grid          int8 [N, H, W]      -1 unknown, 0 free, 100 occupied; row = y
@@ -137,6 +138,7 @@ class TeamSight:
             "robot_radius": _largest(robots["collision_threshold"][team]),
             "max_speed": _largest(robots["max_speed"][team]),
             "max_accel": _largest(robots["max_accel"][team]),
+            "drive": env.robot_configs[0].kind,
             "seconds": round(env.macro_steps * env.local_steps * DT, 6),
             "decision_seconds": round(env.local_steps * DT, 6),
             "seed": int(np.random.SeedSequence([one % 2**32 for one in keys]).generate_state(1)[0]) >> 1,

@@ -1,7 +1,7 @@
 """`python -m maexp.agents.runtime`: how long a plan takes on this computer, for every planner and shipped policy.
 
 `python -m maexp.agents.runtime simulate` lets a team explore a floor in closed loop, and counts what goes wrong.
-Policies need onnxruntime and are left out where it is not installed.
+Policies need onnxruntime, lookahead needs torch and Warp; they are left out where these are not installed.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import numpy as np
 
 from maexp.agents.runtime import CHOICES, TeamPlanner, shipped_names
 from maexp.agents.runtime.floors import make_floor, place_team, read_floor
+from maexp.agents.runtime.imagine import LOOKAHEAD
 from maexp.agents.runtime.simulate import MARKS, Course, SimulatedFloor, explore
 from maexp.envs.config import TargetsConfig
 from maexp.envs.fields import check_value, explain, kinds, replaced, same, setting
@@ -65,7 +66,8 @@ def measure(given: MeasureSettings) -> None:
     poses = [(1.5 + 1.2 * (k % 5), 1.5 + 1.2 * (k // 5), 0.0) for k in range(given.robots)]
     print(f"{given.robots} robots, {grid.shape[1]} x {grid.shape[0]} cells of {given.resolution:g} m")
     trained = shipped_names() if importlib.util.find_spec("onnxruntime") else []
-    for name in (*CHOICES, *trained):
+    search = [LOOKAHEAD] if all(importlib.util.find_spec(one) for one in ("torch", "warp")) else []
+    for name in (*CHOICES, *trained, *search):
         planner, spent = TeamPlanner(name, radar_range=5.0, robot_radius=0.3), []
         for now in range(given.calls):
             begin = time.process_time()

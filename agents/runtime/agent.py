@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from maexp.envs.features import drive_until_next
+
 from .frontiers import look_around
 from .grid import read_grid
-from .planner import Plan, TeamPlanner
+from .planner import TeamPlanner
 
 
 class TeamAgent:
@@ -54,9 +56,16 @@ class TeamAgent:
             time_left=observation["time_left"],
             now=observation["time"],
         )
-        grid = observation["grid"][robot], observation["resolution"], observation["origin"]
-        at, speed = observation["poses"][robot, :, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
-        return np.where(plan.active[:, None], go_beyond(plan, grid, at, speed, self.episode), np.nan)
+        rows, goals = np.flatnonzero(plan.active), np.full((len(plan.names), 2), np.nan)
+        if len(rows):
+            grid = observation["grid"][robot], observation["resolution"], observation["origin"]
+            known = read_grid(*grid, 50.0, [])
+            at, speed = observation["poses"][robot, rows, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
+            limits = (self.episode[name] for name in ("max_accel", "max_speed", "decision_seconds"))
+            drive, target = drive_until_next(np, speed[rows], *limits), plan.goals[rows]
+            _, middle = look_around(known, known.cells(known.from_map(target)), self.episode["radar_range"], True)
+            goals[rows] = go_beyond(target, middle, at, drive)
+        return goals
 
 
 def planner_options(episode: dict[str, Any]) -> dict[str, Any]:
@@ -68,28 +77,23 @@ def planner_options(episode: dict[str, Any]) -> dict[str, Any]:
         "least_area": 0.0,
         "max_speed": episode["max_speed"],
         "max_accel": episode["max_accel"],
+        "drive": episode.get("drive", "differential"),
         "seconds": episode["decision_seconds"],
         "seed": episode["seed"],
         "patience": 3.0 * episode["decision_seconds"],
     }
 
 
-def go_beyond(plan: Plan, grid: tuple, at: np.ndarray, speed: np.ndarray, episode: dict[str, Any]) -> np.ndarray:
-    """Goals beyond targets that are near, toward what is to be seen from there, as far as a robot still gets, [N, 2].
+def go_beyond(target: np.ndarray, middle: np.ndarray, at: np.ndarray, drive: np.ndarray) -> np.ndarray:
+    """Goals beyond targets that are near, as far as a robot still gets, float [..., 2] [m].
 
     One that stopped at its target would stand there until the next decision (as `TargetTracker` in the simulator).
 
     Args:
-        grid: values [H, W], resolution [m] and origin [m] of what the plan was made on.
-        at, speed: of the robots, [N, 2] [m] and [N] [m/s].
+        target: [..., 2] [m].
+        middle: of what is to be seen from there, from the target, [..., 2] [m].
+        at: the robots, [..., 2] [m].
+        drive: how far they get, [...] [m].
     """
-    goals, rows, seconds = plan.goals.copy(), np.flatnonzero(plan.active), episode["decision_seconds"]
-    if len(rows):
-        known = read_grid(*grid, 50.0, [])
-        drive = np.minimum(speed * seconds + 0.5 * episode["max_accel"] * seconds**2, episode["max_speed"] * seconds)[
-            rows
-        ]
-        _, middle = look_around(known, known.cells(known.from_map(goals[rows])), episode["radar_range"], True)
-        left = np.maximum(drive - np.linalg.norm(goals[rows] - at[rows], axis=-1), 0.0)
-        goals[rows] += middle * (left / np.maximum(np.linalg.norm(middle, axis=-1), 1e-6))[:, None]
-    return goals
+    left = np.maximum(drive - np.linalg.norm(target - at, axis=-1), 0.0)
+    return target + middle * (left / np.maximum(np.linalg.norm(middle, axis=-1), 1e-6))[..., None]

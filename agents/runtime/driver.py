@@ -38,7 +38,7 @@ class DriverSettings:
     """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
 
     robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
-    policy: str = setting("cost_utility", "a planner, a trained policy that ships, or the folder of one")
+    policy: str = setting("cost_utility", "a planner, a trained policy that ships or the folder of one, lookahead")
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
     global_frame: str = setting("map", "all maps and poses are brought into this frame")
     base_frame: str = setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")

@@ -8,10 +8,11 @@ import time
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from maexp.envs.config.robot import ROBOT_KINDS
 from maexp.kernels.constants import FREE, UNREACHED
 
 from .choices import CHOICES
@@ -19,6 +20,7 @@ from .coarse import coarsen
 from .features import Motion
 from .folder import Contract, LearnedChoice
 from .grid import MAX_CELLS, KnownGrid, read_grid
+from .imagine import LOOKAHEAD, load_foresight, read_lookahead
 from .scene import ArrayScene, look_at
 from .sharing import Shares
 from .shipped import find_policy
@@ -61,7 +63,7 @@ class TeamPlanner:
 
     Args:
         policy: one of the classical planners, `maexp.agents.runtime.CHOICES`, a trained policy that ships, by its name
-            (`shipped_names()`), or the folder of another one.
+            (`shipped_names()`), the folder of another one, or "lookahead", which needs Warp and torch.
         radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
         robot_radius: distance that a robot's centre keeps from obstacles [m]: one for all, {name: radius} or a list;
             None: as the policy was trained, 0.3 m for planners.
@@ -76,6 +78,10 @@ class TeamPlanner:
         distinct: robots go to different targets, farther apart than their bodies; otherwise each takes its best.
         spare: what robots without a target do: "wait" where they are, or drive "home" to where they were first seen.
         seed: of random choices.
+        lookahead: how policy="lookahead" plans, a `maexp.envs.LookaheadConfig` or a mapping of its fields by name.
+        drive: how the robots move, for "lookahead": "differential", "omnidirectional" or, as a car, "ackermann".
+        deadline: after so many seconds of a call, robots that "lookahead" has not searched for keep to its
+            ``rollout_policy`` [s]; None: all have their turn, and plans repeat bit for bit.
     """
 
     def __init__(
@@ -96,13 +102,23 @@ class TeamPlanner:
         distinct: bool = True,
         spare: Literal["wait", "home"] = "wait",
         seed: int = 0,
+        lookahead: Any = None,
+        drive: Literal["differential", "omnidirectional", "ackermann"] = "differential",
+        deadline: float | None = None,
     ):
-        if spare not in SPARE:
-            raise ValueError(f"spare={spare!r} is unknown: choose {' or '.join(SPARE)}")
+        for name, word, words in (("spare", spare, SPARE), ("drive", drive, ROBOT_KINDS)):
+            if word not in words:
+                raise ValueError(f"{name}={word!r} is unknown: choose {' or '.join(words)}")
         self.distinct, self.spare = distinct, spare
-        known = isinstance(policy, str) and policy in CHOICES
-        self.learned = None if known else LearnedChoice(find_policy(policy, CHOICES))
-        self.policy, self.bounded, self.seed = policy, bounded, _whole("seed", seed)
+        self.search, base = None, policy
+        if policy == LOOKAHEAD:
+            self.search = read_lookahead(lookahead)
+            base = self.search.rollout_policy
+        elif lookahead is not None or deadline is not None:
+            raise ValueError(f"lookahead= and deadline= are for policy={LOOKAHEAD!r}, and this is {policy!r}")
+        known = isinstance(base, str) and base in CHOICES
+        self.learned = None if known else LearnedChoice(find_policy(base, (*CHOICES, LOOKAHEAD)))
+        self.policy, self.base, self.bounded, self.seed = policy, base, bounded, _whole("seed", seed)
         defaults = DEFAULTS if self.learned is None else self.learned.contract
         self.radar_range = _positive("radar_range", defaults.radar_range if radar_range is None else radar_range)
         self.robot_radius = defaults.robot_radius if robot_radius is None else robot_radius
@@ -115,6 +131,10 @@ class TeamPlanner:
             raise ValueError(f"occupied={occupied!r} must be at most 100, as the cells of a grid are")
         self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
         self.watch = Watch(_positive("patience", patience), _positive("pause", pause))
+        self.foresight = None
+        if self.search is not None:
+            limit = math.inf if deadline is None else _positive("deadline", deadline)
+            self.foresight = load_foresight()(self.search, drive, self.clearance_factor, distinct, bounded, limit)
         self.reset()
 
     def reset(self) -> None:
@@ -199,7 +219,7 @@ class TeamPlanner:
         parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots], bool)
         preference = np.full(travel.shape, -np.inf)
         if travel.size and not parked.all():
-            preference[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left)
+            preference[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left, notes)
         travel[parked] = scene.travel[parked]
         preference[parked] = -travel[parked]
         preference[~np.isfinite(travel)] = -np.inf
@@ -216,15 +236,19 @@ class TeamPlanner:
         notes += self.watch.settle(team, scene.robots, scene.targets, travel, shares, scene.radar_range)
         return shares, notes
 
-    def _ask(self, team: Team, scene: ArrayScene, time_left: float) -> np.ndarray:
-        """What the policy thinks of each target for each robot of the scene, float [n, K]."""
+    def _ask(self, team: Team, scene: ArrayScene, time_left: float, notes: list[str]) -> np.ndarray:
+        """What the policy thinks of each target for each robot of the scene, float [n, K]; notes are added."""
+        heading = team.yaw - scene.grid.yaw
         if self.learned is None:
-            return CHOICES[str(self.policy)](scene)
-        robots = scene.robots
-        last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
-        heading = team.yaw[robots] - scene.grid.yaw
-        before = scene.grid.from_map(np.array(last))
-        return self.learned.rank(scene, heading, team.speed[robots], before, time_left, self.motion)
+            preference = CHOICES[str(self.base)](scene)
+        else:
+            robots = scene.robots
+            last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
+            before = scene.grid.from_map(np.array(last))
+            preference = self.learned.rank(scene, heading[robots], team.speed[robots], before, time_left, self.motion)
+        if self.foresight is None:
+            return preference
+        return self.foresight.improve(scene, preference, team, self.motion, self.learned is not None, notes)
 
     def _send_away(self, plan: Plan, team: Team, scene: ArrayScene, shares: Shares) -> Plan:
         """The plan with what robots do for which no target is left."""
