@@ -16,8 +16,8 @@ different moments, and where both look at one, looking for what is new is most o
 
 import warp as wp
 
+from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
