@@ -19,7 +19,12 @@ BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb: what it does, examples, bare arguments; `run(cfg, folder, overrides)` of commands/VERB.py does it."""
+    """A verb: what it does, examples, bare arguments.
+
+    `commands/VERB.py` does it: `check(cfg)` and `run(cfg, folder, overrides)`. Where it has `prepare(overrides)`, that
+    makes the recipe of the settings from the words; where it has `folder(overrides, claim)`, that says where it writes,
+    else into a new folder of its own.
+    """
 
     summary: str
     examples: tuple[str, ...]
@@ -187,6 +192,7 @@ def run_verb(name: str, words: list[str]) -> int:
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.settings.resolved import describe_radius, without_hydra
+    from maexp.agents.settings.runs import Recipe
     from maexp.agents.words import check_sweep, check_words
 
     verb = VERBS[name]
@@ -206,7 +212,7 @@ def run_verb(name: str, words: list[str]) -> int:
         from maexp.agents.commands.sweep import run_sweep
 
         return run_sweep(name, overrides)
-    recipe = home.prepare(overrides)
+    recipe = getattr(home, "prepare", Recipe)(overrides)
     composed = compose_recipe(name, recipe)
     cfg = without_hydra(composed)
     if {"-c", "--cfg"} & set(flags):
@@ -216,7 +222,8 @@ def run_verb(name: str, words: list[str]) -> int:
     if told := describe_radius(cfg):
         print(told, flush=True)
     chosen = find_override(overrides, "hydra.run.dir") is not None
-    folder = home.folder(overrides, partial(claim_folder, composed.hydra.run.dir, chosen))
+    claim = partial(claim_folder, composed.hydra.run.dir, chosen)
+    folder = home.folder(overrides, claim) if hasattr(home, "folder") else claim()
     try:
         return home.run(cfg, folder, without(recipe.words, "hydra", "resume", "checkpoint"))
     except UserError:

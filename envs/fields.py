@@ -112,7 +112,7 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return str in allowed or value in words
     if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
-    if float not in allowed and low is not None and float(value) > WHOLE_LIMIT:
+    if float not in allowed and low is not None and high is None and float(value) > WHOLE_LIMIT:
         return False
     inside = (low is None or value >= low) and (high is None or value <= high)
     inside = inside and (above is None or value > above) and (below is None or value < below)
@@ -136,7 +136,7 @@ def _wanted(allowed, unit, low, high, above, below, infinite) -> str:
 
 def _between(low, high, above, below) -> str:
     if low is not None and high is not None:
-        return f" from {low:g} to {high:g}"
+        return f" from {low:g} to {high if isinstance(high, int) else f'{high:g}'}"
     if above is not None and below is not None:
         return f" above {above:g} and below {below:g}"
     if low is not None:

@@ -72,18 +72,14 @@ class Navigation:
         self._state, self.device = sim.believed, env.device
         self.num_envs, self.num_robots = env.num_envs, env.num_robots
         self.launch = launch_on(env.device)
-        nav = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
-        self.grids, cells = nav
         limited = env.settings.limited
-        self.rows = self.num_robots if limited else 1
         names = ("map_id", "active", "collided", "macro_step", "seed", "env_id", "episode")
         self.arrays = {name: wp.from_torch(self._state[name]) for name in names}
         self.arrays["center"] = wp.from_torch(self._state["center"], dtype=wp.vec3)
         self.arrays |= {name: wp.from_torch(sim.map_tensors[name], dtype=wp.vec2) for name in ("lower", "upper")}
-        prefix = "known" if limited else "viewers"
-        flags = [wp.from_torch(self._state[f"{prefix}_{points}"]) for points in ("free", "boundary")]
-        false = wp.from_torch(self._state["false_walls"]) if sim.settings.false_alarms else None
-        self.known_grids = KnownGrids(sim.maps, self.grids, self.arrays["map_id"], *flags, self.rows, cells, false)
+        self.known_grids = known_grids(env)
+        self.grids, self.rows = self.known_grids.grids, self.known_grids.rows_per_env
+        cells = self.known_grids.known.shape[1]
         threshold, clearance = (sim.robot_tensors[name].cpu().numpy() for name in ("collision_threshold", "clearance"))
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         self.passable = PassableGrids(self.known_grids, radius, comfort, MARGIN_CELLS, through_unknown=False)
@@ -425,6 +421,19 @@ class Navigation:
     def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """`to_action` of this env's goals [m], float [E, N, 2]."""
         return _to_action(points, self.arrays, self.launch)
+
+
+def known_grids(env: ExplorationEnv) -> KnownGrids:
+    """Grids of what the teams of an env know, a row for each env, or for each robot where communication is limited.
+
+    Not those of the local planner `wavefront`, though at a decision they show the same (see `kernels.known_grid`).
+    """
+    sim, limited = env.simulation, env.settings.limited
+    state, prefix = sim.tensors, "known" if limited else "viewers"
+    grids, cells = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
+    map_id, *flags = (wp.from_torch(state[name]) for name in ("map_id", f"{prefix}_free", f"{prefix}_boundary"))
+    false = wp.from_torch(state["false_walls"]) if sim.settings.false_alarms else None
+    return KnownGrids(sim.maps, grids, map_id, *flags, env.num_robots if limited else 1, cells, false)
 
 
 def to_action(env: ExplorationEnv, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,9 +11,9 @@ import warp as wp
 from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
 from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
+from maexp.kernels.arrays import count_bytes
 from maexp.kernels.blocks import BLOCKS
 from maexp.kernels.dynamics import KINDS, Robots
-from maexp.kernels.fields import count_bytes
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights

@@ -7,8 +7,8 @@ numbered ``by * blocks_x + bx`` with ``blocks_x = ceil(width / block)`` of the e
 import numpy as np
 import warp as wp
 
+from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import MARGIN_CELLS, UNREACHED
-from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.frontier import is_frontier
 from maexp.kernels.known_grid import NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named

@@ -18,8 +18,8 @@ from collections.abc import Callable
 import torch
 import warp as wp
 
+from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import BLOCKED, DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
-from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.startup import MODULE_OPTIONS
 

@@ -7,12 +7,17 @@ Painting enters what has become known since the last time, and lists the cells t
 Knowledge only grows within an episode, but for false walls. A row where less is known than was painted (a new episode,
 a state that was loaded, a false wall that is none), or whose env has another map, is cleared and painted anew: nobody
 has to say so.
+
+Each who looks has grids of its own, the local planner as well as a policy's `Navigation`: the list is of what has
+changed since it looked, and a policy that shared it would take from the planner what that has not seen. They look at
+different moments, and where both look at one, looking for what is new is most of the work
+(docs/log/2026-11-25-one-fact.md).
 """
 
 import warp as wp
 
+from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps

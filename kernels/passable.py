@@ -7,8 +7,8 @@ cleared, they are drawn anew.
 import numpy as np
 import warp as wp
 
+from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import BLOCKED, FREE, OBSTACLE, TIGHT, UNKNOWN
-from maexp.kernels.fields import Field, make_arrays
 from maexp.kernels.known_grid import KnownGrids, NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from maexp.kernels.arrays import Field, count_bytes
 from maexp.kernels.dynamics import Robots
-from maexp.kernels.fields import Field, count_bytes
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD

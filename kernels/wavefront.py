@@ -14,9 +14,9 @@ held never outlives a macro step: a new goal always searches anew.
 import numpy as np
 import warp as wp
 
+from maexp.kernels.arrays import Field, count_bytes, make_arrays
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
 from maexp.kernels.dynamics import Robots
-from maexp.kernels.fields import Field, count_bytes, make_arrays
 from maexp.kernels.geodesic import SEARCH, SKIP, DistanceSearch
 from maexp.kernels.known_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_run import SMALL
 
 from maexp.agents.build import model_settings
 from maexp.agents.cli import main
@@ -107,18 +108,7 @@ def test_what_cannot_go_on_is_a_sentence(unbroken, tmp_path, monkeypatch, capsys
 def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, capsys):
     """The planner's episodes stay; a policy of two halves would be nobody's."""
     monkeypatch.chdir(tmp_path)
-    small = [
-        "scenario.maps=[0]",
-        "scenario.held_out=[70]",
-        "scenario.macro_steps=2",
-        "scenario.local_steps=3",
-        "num_envs=2",
-        "num_robots=2",
-        "collector.steps=2",
-        "total_frames=8",
-        "model.channels=4",
-    ]
-    assert main(["train", *small, "episodes=0", "hydra.run.dir=run"]) == 0
+    assert main(["train", *SMALL, "total_frames=8", "episodes=0", "hydra.run.dir=run"]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
         words = ["checkpoint=run", "policy=cost_utility", "num_envs=2", "episodes=4", "hydra.run.dir=e"]
@@ -135,21 +125,7 @@ def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, 
 
 def test_ctrl_c_in_the_evaluation_after_a_training(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = [
-        "scenario.maps=[0]",
-        "scenario.held_out=[70]",
-        "scenario.macro_steps=2",
-        "scenario.local_steps=3",
-        "num_envs=2",
-        "num_robots=2",
-        "collector.steps=2",
-        "total_frames=8",
-        "model.channels=4",
-        "episodes=4",
-        "classical=[cost_utility]",
-        "evaluate_every=0",
-        "evaluate_episodes=2",
-    ]
+    small = [*SMALL, "total_frames=8", "episodes=4", "classical=[cost_utility]", "evaluate_every=0"]
     assert main(["train", *small, "hydra.run.dir=whole"]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)

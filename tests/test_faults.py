@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_run import SMALL
 
 from maexp.agents.benchmark.cell import read_result, write_result
 from maexp.agents.benchmark.plan import Cell, cell_folder
@@ -32,17 +33,7 @@ pytestmark = pytest.mark.slow  # full disks, files that cannot be read
 
 CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
-RUN = [
-    "scenario.maps=[0]",
-    "scenario.held_out=[70]",
-    "scenario.macro_steps=2",
-    "scenario.local_steps=2",
-    "num_envs=2",
-    "num_robots=2",
-    "collector.steps=2",
-    "episodes=2",
-    "evaluate_episodes=2",
-]
+RUN = [*SMALL, "episodes=2", "evaluate_episodes=2"]
 
 
 @pytest.fixture(autouse=True)

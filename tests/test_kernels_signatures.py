@@ -14,7 +14,6 @@ IN = ("Map", "State in", "Scratch in", "In")
 BOTH = ("State in and out", "Scratch in and out", "In and out", "Scratch")
 OUT = ("State out", "Scratch out", "Out")
 """Headings of arrays: only read; read and written, so that what was there before counts; written."""
-TOLD = set("Marks Lowers Fills Gives Draws Opens Closes Gathers Walks Follows Brings Returns".split())
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -53,12 +52,10 @@ def test_no_argument_is_there_for_nothing():
 
 
 def test_one_dialect():
-    """Constants are plain numbers, no adjoint code is compiled, and docstrings tell what to do, not what is done."""
+    """Constants are plain numbers, and no adjoint code is compiled."""
     files = sorted(Path(maexp.kernels.__path__[0]).glob("*.py"))
     assert len(files) > 25
     for file in files:
         text = file.read_text()
         assert not re.search(r"\bwp_|wp\.constant|enable_backward=", text), file.name
         assert ("@wp.kernel" in text) == ("set_module_options" in text), file.name
-        for first in re.findall(r'^\s*def .*?"""(\w+)', text, re.MULTILINE | re.DOTALL):
-            assert first not in TOLD, f"{file.name}: {first}"

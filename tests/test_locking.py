@@ -13,6 +13,7 @@ import threading
 import time
 
 import pytest
+from small_run import SMALL
 
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
@@ -87,8 +88,7 @@ def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch):
 
 def test_a_second_training_in_a_folder_changes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    tiny = ["num_envs=2", "num_robots=2", "scenario.maps=[0]", "scenario.local_steps=3", "scenario.macro_steps=2"]
-    tiny += ["collector.steps=2", "total_frames=4", "episodes=0", "model.channels=4", "device=cpu"]
+    tiny = [*SMALL, "total_frames=4", "episodes=0", "device=cpu"]
     assert main(["train", *tiny, "hydra.run.dir=my run"]) == 0
     told = "Next: maexp evaluate 'checkpoint=my run' num_robots=1,2,6,8, or maexp view 'my run'"
     assert told in capsys.readouterr().out

@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 import torch
 from scipy import ndimage
+from tools.predictor import beliefs, command, score, train
+from tools.predictor.beliefs import NEVER, BeliefConfig, BeliefEpisode
+from tools.predictor.export import Guess, predictor_to_onnx
+from tools.predictor.train import PredictorConfig
 
 from maexp.agents.errors import UserError
 from maexp.agents.networks.map_predictor import (
@@ -28,10 +32,6 @@ from maexp.agents.networks.map_predictor import (
 )
 from maexp.agents.settings.groups import ScenarioSettings
 from maexp.agents.settings.indices import map_indices
-from maexp.agents.training import beliefs, map_predictor, predictor_score
-from maexp.agents.training.beliefs import NEVER, BeliefConfig, BeliefEpisode
-from maexp.agents.training.map_predictor import PredictorConfig
-from maexp.agents.training.predictor_export import Guess, predictor_to_onnx
 from maexp.envs import make_map
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 
@@ -222,26 +222,26 @@ def toy_episode(wall: int = 30) -> BeliefEpisode:
 
 
 def test_crops_count_unknown_cells_near_free_ground():
-    crops = map_predictor.draw_crops({"toy": [toy_episode()]}, 24, 32, np.random.default_rng(0))
+    crops = train.draw_crops({"toy": [toy_episode()]}, 24, 32, np.random.default_rng(0))
     assert crops.known.shape == crops.truth.shape == crops.counts.shape == (24, 32, 32)
     for known, truth, counts in zip(crops.known.numpy(), crops.truth.numpy(), crops.counts.numpy(), strict=True):
         away = ndimage.distance_transform_edt(known != FREE)
         assert counts.any() and (known[counts] == UNKNOWN).all() and away[counts].max() <= 10
-        edge = map_predictor.EDGE
+        edge = train.EDGE
         assert not counts[:edge].any() and not counts[:, -edge:].any()
         assert truth[known == FREE].all()
 
 
 def test_a_cut_goes_beyond_the_grid():
     grid = np.arange(1, 13).reshape(3, 4)
-    found = map_predictor.cut(grid, np.array([-1, 2]), 4)
+    found = train.cut(grid, np.array([-1, 2]), 4)
     assert found.tolist() == [[0, 0, 0, 0], [3, 4, 0, 0], [7, 8, 0, 0], [11, 12, 0, 0]]
-    assert not map_predictor.cut(grid, np.array([10, 10]), 4).any()
+    assert not train.cut(grid, np.array([10, 10]), 4).any()
 
 
 def test_the_eight_turns_differ_and_turn_together():
     grid = np.arange(9).reshape(3, 3)
-    turned = [map_predictor.turn((grid, grid + 1), k) for k in range(8)]
+    turned = [train.turn((grid, grid + 1), k) for k in range(8)]
     assert len({one.tobytes() for one, _ in turned}) == 8
     assert all(np.array_equal(one + 1, other) for one, other in turned)
 
@@ -262,7 +262,7 @@ def toy_config(folder, **others) -> PredictorConfig:
 
 def test_training_learns_and_goes_on_bit_for_bit(tmp_path, monkeypatch):
     beliefs.save_episodes(tmp_path / "data" / "toy-00000-0.npz", [toy_episode(wall=12)])  # hardly anything is free
-    whole = map_predictor.train_predictor(toy_config(tmp_path), report=lambda line: None)
+    whole = train.train_predictor(toy_config(tmp_path), report=lambda line: None)
     rows = (tmp_path / "out" / "metrics.csv").read_text().splitlines()
     assert len(rows) == 4 and float(rows[-1].split(",")[1]) < float(rows[1].split(",")[1]) - 0.02
 
@@ -271,27 +271,27 @@ def test_training_learns_and_goes_on_bit_for_bit(tmp_path, monkeypatch):
 
     parts = toy_config(tmp_path, out=str(tmp_path / "parts"))
     with pytest.raises(KeyboardInterrupt):
-        map_predictor.train_predictor(parts, report=stop)
-    again = map_predictor.train_predictor(parts, report=lambda line: None)
+        train.train_predictor(parts, report=stop)
+    again = train.train_predictor(parts, report=lambda line: None)
     assert all(torch.equal(one, other) for one, other in zip(whole.parameters(), again.parameters(), strict=True))
     assert (tmp_path / "parts" / "metrics.csv").read_text().splitlines() == rows
     with pytest.raises(UserError, match="holds a training with width=4, not 8"):
-        map_predictor.train_predictor(toy_config(tmp_path, width=8), report=lambda line: None)
+        train.train_predictor(toy_config(tmp_path, width=8), report=lambda line: None)
 
 
 def test_settings_out_of_range_are_named(tmp_path):
-    with pytest.raises(ValueError, match="map_predictor.crop=8 must be a whole number"):
-        map_predictor.train_predictor(toy_config(tmp_path, crop=8))
-    with pytest.raises(ValueError, match="beliefs.departures=2.0 must be"):
+    with pytest.raises(ValueError, match="crop=8 must be a whole number"):
+        train.train_predictor(toy_config(tmp_path, crop=8))
+    with pytest.raises(ValueError, match="departures=2.0 must be"):
         beliefs.write_beliefs(BeliefConfig(departures=2.0))
     with pytest.raises(UserError, match="holds no beliefs"):
-        map_predictor.train_predictor(toy_config(tmp_path))
+        train.train_predictor(toy_config(tmp_path))
 
 
 def test_figures_of_a_guess():
     free = np.array([True, True, False, False])
     chance, ranges = np.array([0.9, 0.4, 0.2, 0.2]), np.array([0.1, 0.3, 0.7, 1.5])
-    found = predictor_score.judge(free, chance, ranges)
+    found = score.judge(free, chance, ranges)
     losses = [-math.log(0.9), -math.log(0.4), -math.log(0.8), -math.log(0.8)]
     assert found["log_loss"] == pytest.approx(sum(losses) / 4)
     assert found["accuracy"] == 0.75
@@ -300,10 +300,10 @@ def test_figures_of_a_guess():
 
 
 def test_histograms_are_the_shares_of_free_cells():
-    cells = predictor_score.look_at([toy_episode()], 2, None)
-    table = predictor_score.count_free([cells], predictor_score.by_distance, predictor_score.MOST_DISTANCE + 1)
+    cells = score.look_at([toy_episode()], 2, None)
+    table = score.count_free([cells], score.by_distance, score.MOST_DISTANCE + 1)
     for distance in range(1, 10):
-        some = predictor_score.by_distance(cells) == distance
+        some = score.by_distance(cells) == distance
         assert table[distance] == pytest.approx(cells.free[some].mean(), abs=1e-3)
 
 
@@ -311,19 +311,20 @@ def test_the_predictor_beats_distance_where_nobody_trained(played):
     """On two validation maps; the guesses are those of docs/log."""
     episodes, loss = [beliefs.until_covered(one) for one in played], {}
     for guess in (predict, predict_by_distance):
-        cells = predictor_score.look_at(episodes, 3, lambda known, guess=guess: guess(as_batch(known))[0].numpy())
-        loss[guess] = predictor_score.judge(cells.free, cells.guess, cells.ranges)["log_loss"]
+        cells = score.look_at(episodes, 3, lambda known, guess=guess: guess(as_batch(known))[0].numpy())
+        loss[guess] = score.judge(cells.free, cells.guess, cells.ranges)["log_loss"]
     assert loss[predict] < 0.6 * loss[predict_by_distance], loss
 
 
 def test_the_commands_end_with_a_sentence(tmp_path, capsys, monkeypatch):
-    for module, words in ((map_predictor, []), (predictor_score, [f"train={tmp_path}"])):
-        monkeypatch.setattr("sys.argv", ["x", f"data={tmp_path}", *words])
-        assert module.main() == 1
+    for kind, work in ((PredictorConfig, train.train_predictor), (score.ScoreConfig, score.main)):
+        monkeypatch.setattr("sys.argv", ["x", f"data={tmp_path}"])
+        assert command.run(kind, work) == 1
         assert "holds no beliefs" in capsys.readouterr().err
-    monkeypatch.setattr("sys.argv", ["x", "batch=many"])
-    assert map_predictor.main() == 1
-    assert "many" in capsys.readouterr().err
+    for word, told in (("batch=many", "many"), ("crop=8", "crop=8 must be a whole number from 32 to 512")):
+        monkeypatch.setattr("sys.argv", ["x", word])
+        assert command.run(PredictorConfig, train.train_predictor) == 1
+        assert told in capsys.readouterr().err
 
 
 def test_contract_tells_what_goes_in_and_out():

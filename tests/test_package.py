@@ -63,6 +63,14 @@ def test_torchrl_is_bounded_by_what_is_tested(name):
     assert pinned in wanted.specifier and f"{major}.{minor + 1}.0" not in wanted.specifier
 
 
+def test_the_version_is_the_same_wherever_it_stands():
+    """In the package, what one cites, and the newest entry of the changes, with its date."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    cited = dict(re.findall(r"^(version|date-released): (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
+    newest = re.search(r"^## (\S+), (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert (project["version"], *cited.values()) == (newest[1], *newest.groups())
+
+
 def test_constraints_name_exact_versions():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert lines and all("==" in line and "+" not in line for line in lines)

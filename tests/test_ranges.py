@@ -177,3 +177,28 @@ def test_the_command_refuses_in_one_sentence(words, sentence, capsys, tmp_path, 
     assert main(["train", *tiny, *words]) == 2
     assert capsys.readouterr().err == f"maexp: {sentence}\n"
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("train episodes=-1", "episodes=-1 must be a whole number, 0 or more."),
+        ("train total_frames=0", "total_frames=0 must be a whole number from 1 to 1000000000000."),
+        ("train seed=2147483648", "seed=2147483648 must be a whole number from 0 to 2147483647."),
+        ("train collector=processes collector.workers=0", "collector.workers=0 must be a whole number, 1 or more."),
+        ("evaluate policy=random render_envs=65", "render_envs=65 must be a whole number from 1 to 64."),
+        ("benchmark iterations=0", "iterations=0 must be a whole number, 1 or more."),
+        ("view maze_small size=10", "size=10 must be a whole number from 64 to 8192 [px]."),
+        ("view maze_small azimuth=nan", "azimuth=nan must be a number from -360 to 360 [degrees]."),
+        ("view maze_small cut=0", "cut=0.0 must be a finite number above 0 [m]."),
+        ("maps make maze index=-1", "index=-1 must be a whole number, 0 or more."),
+        ("irsim floor.yaml people=-1", "people=-1 must be a whole number, 0 or more."),
+        ("suite run minival policy=random patience=inf", "patience=inf must be a finite number above 0 [s]."),
+        ("bench env seconds=0", "seconds=0.0 must be a finite number above 0 [s]."),
+        ("train --cfg job evaluate_every=-1", "evaluate_every=-1 must be a whole number, 0 or more."),
+    ],
+)
+def test_a_setting_of_a_verb_is_refused_by_the_range_of_its_field(words, sentence, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    assert capsys.readouterr().err == f"maexp: {sentence}\n" and not list(tmp_path.iterdir())

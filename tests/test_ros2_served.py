@@ -636,7 +636,7 @@ def test_the_team_ends_with_the_arena(folders):
         (["serve", "minivall"], "minivall is no suite: choose one of minival"),
         (["serve", "minival", "tf=both"], "tf=both is unknown: choose shared or own"),
         (["serve", "minival", "wait_for=none"], "wait_for=none is unknown: choose all or idle"),
-        (["serve", "minival", "limit=0"], "limit=0.0 must be a number of seconds above 0"),
+        (["serve", "minival", "limit=0"], "limit=0.0 must be a finite number above 0 [s]"),
         (["serve", "minival", "domain=300"], "domain=300 must be a whole number from 0 to 232"),
         (["team", "robots=a", "goals=action"], "goals=action is unknown: choose goal_pose or navigate_to_pose"),
         (["team"], "No robots: name those of the team"),

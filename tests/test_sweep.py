@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_run
 from metrics_file import read_metrics
 
 from maexp.agents.cli import main
@@ -23,12 +24,9 @@ from maexp.envs import ExplorationEnv, make_map
 pytestmark = pytest.mark.slow  # trainings
 
 SMALL = [
-    "scenario.maps=[0]",
+    *small_run.PLACE,
     "scenario.validation=[1]",
-    "scenario.held_out=[70]",
     "num_envs=3",
-    "scenario.macro_steps=2",
-    "scenario.local_steps=3",
     "total_frames=6",
     "model.channels=4",
     "episodes=5",
@@ -109,16 +107,9 @@ SWEEP = [
     "train",
     "-m",
     "seed=0,1,2",
-    "scenario.maps=[0]",
-    "scenario.held_out=[70]",
-    "scenario.macro_steps=2",
-    "scenario.local_steps=2",
-    "num_envs=2",
-    "num_robots=2",
-    "collector.steps=2",
+    *small_run.SMALL,
     "total_frames=16",
     "episodes=0",
-    "model.channels=4",
     "evaluate_every=0",
     "checkpoint_every=1",
 ]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from metrics_file import read_metrics
+from small_run import PLACE
 
 from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
@@ -234,9 +235,7 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
     words = [
         "scenario=maze_small",
         "scenario.also=[indoor_small]",
-        "scenario.maps=[0]",
-        "scenario.held_out=[70]",
-        "scenario.macro_steps=2",
+        *PLACE,
         "num_envs=4",
         "episodes=0",
         "evaluate_every=0",

@@ -1,12 +1,10 @@
 """`maexp bench`: throughput, as a table and JSON."""
 
 import importlib
-import math
-from collections.abc import Callable
 from pathlib import Path
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
+from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.overrides import find_override, move_sweeps
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import BenchSettings
@@ -25,21 +23,10 @@ def prepare(overrides: list[str]) -> Recipe:
     return Recipe(move_sweeps(overrides, ONE_VALUE))
 
 
-def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
-    """Every measurement has a new folder of its own."""
-    return claim()
-
-
 def check(cfg: BenchSettings) -> None:
-    """Raise UserError for counts out of range, and for settings that another measurement has."""
-    check_counts(cfg, "num_envs")
-    check_steps(cfg.collector)
-    if not (cfg.seconds > 0 and math.isfinite(cfg.seconds)):
-        raise UserError(f"seconds={cfg.seconds} must be a time to measure for, above 0 [s].")
+    """Raise UserError for team sizes that are none, and for settings that another measurement has."""
     if cfg.num_robots is not None:
         team_sizes(cfg.num_robots)
-    if cfg.largest is not None:
-        check_counts(cfg, "largest")
     for name, action in (("baseline", "kernels"), ("axes", "scale"), ("largest", "scale")):
         value = getattr(cfg, name)
         if value is not None and cfg.task != action:

@@ -31,7 +31,7 @@ from maexp.agents.evaluation.results import describe_run, print_results, result_
 from maexp.agents.files import command, short, write_json
 from maexp.agents.locking import lock
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts, team_sizes, words_of
+from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -68,8 +68,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 
 def check(cfg: EvaluateSettings) -> None:
-    """Raise UserError for counts out of range and unknown policies."""
-    check_counts(cfg, "num_envs", "episodes")
+    """Raise UserError for team sizes that are none and unknown policies."""
     team_sizes(cfg.num_robots)
     check_planner(cfg.planner.name, find_players(words_of(cfg.policy)))
     check_render(cfg)

@@ -1,6 +1,5 @@
 """`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.runtime`)."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,6 @@ def prepare(overrides: list[str]) -> Recipe:
     if place is None:
         raise UserError("Nothing to export: give a run, as in maexp export RUN out=FOLDER.")
     return continue_run(*find_checkpoint(place), overrides, "export")
-
-
-def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
-    """A new folder, which stays empty: what is written goes to `out`."""
-    return claim()
 
 
 def check(cfg: ExportSettings) -> None:

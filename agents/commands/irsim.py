@@ -1,7 +1,6 @@
 """`maexp irsim`: a team on a floor in the simulator ir-sim, beside the same team in ours."""
 
 import importlib.util
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -9,8 +8,6 @@ import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
-from maexp.agents.settings.checks import check_counts
-from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import IrsimSettings
 from maexp.agents.training.named import find_player
@@ -22,19 +19,8 @@ from maexp.envs.scenarios import default_macro_steps, find_scenario
 FILM_SPEED = 4.0  # frames a second; one a decision
 
 
-def prepare(overrides: list[str]) -> Recipe:
-    return Recipe(overrides)
-
-
-def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
-    """Every trial has a new folder of its own."""
-    return claim()
-
-
 def check(cfg: IrsimSettings) -> None:
-    """Raise UserError for what is missing or out of range, before a folder is made."""
-    check_counts(cfg, "num_robots")
-    check_counts(cfg, "episode", "people", "seed", least=0)
+    """Raise UserError for what is missing, before a folder is made."""
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
     from maexp.agents.irsim.players import check_player

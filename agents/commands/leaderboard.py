@@ -7,16 +7,11 @@ from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.progress import Progress
-from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import LeaderboardSettings
 
 # What needs torch is imported where it is used.
 
 RESULTS = "results.json"
-
-
-def prepare(overrides: list[str]) -> Recipe:
-    return Recipe(overrides)
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> None:

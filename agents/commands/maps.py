@@ -11,9 +11,7 @@ from maexp.agents.commands.maps_folder import run as run_folder
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import command, write_text
 from maexp.agents.map_sets import set_names
-from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.overrides import find_override
-from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import MapsSettings
 from maexp.envs.checker import check_map, repair_map
@@ -28,19 +26,13 @@ UNUSABLE = 1
 FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy .mcap .db3 (rosbag2)"
 
 
-def prepare(overrides: list[str]) -> Recipe:
-    return Recipe(overrides)
-
-
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
     """A new folder, except for the list, and for sets of maps, which have their own."""
     return None if find_override(overrides, "task") in ("list", "fetch") else claim()
 
 
 def check(cfg: MapsSettings) -> None:
-    """Raise UserError for what is missing or out of range, before a folder is made."""
-    check_counts(cfg, "num_robots")
-    check_counts(cfg, "index", least=0)
+    """Raise UserError for what is missing or does not fit, before a folder is made."""
     if cfg.task == "list" and cfg.file:
         raise UserError(f"maexp maps list lists all scenarios and takes no file: leave {cfg.file} out.")
     if cfg.task != "list" and not cfg.file:

@@ -6,12 +6,7 @@ from pathlib import Path
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.folder import CARD, read_contract
 from maexp.agents.runtime.shipped import SHIPPED, find_policy, shipped_names
-from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import PoliciesSettings
-
-
-def prepare(overrides: list[str]) -> Recipe:
-    return Recipe(overrides)
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> None:

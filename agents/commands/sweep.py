@@ -19,7 +19,7 @@ from maexp.agents.evaluation.once import keeping_episodes
 from maexp.agents.evaluation.sweeps import tell_runs
 from maexp.agents.files import command, short, write_json
 from maexp.agents.locking import lock
-from maexp.agents.settings.checks import check_seed
+from maexp.agents.settings.checks import check_ranges
 from maexp.agents.settings.compose import compose_config, compose_recipe, explain
 from maexp.agents.settings.overrides import find_override, find_sweeps, quote, set_names, without
 from maexp.agents.settings.resolved import without_hydra
@@ -132,7 +132,7 @@ def _run_job(cfg: TrainSettings) -> None:
     if list_checkpoints(where / "checkpoints"):
         recipe = train.prepare([f"resume={quote(str(where))}"])
         cfg, overrides = without_hydra(compose_recipe("train", recipe)), without(recipe.words, "hydra", "resume")
-    check_seed(cfg.seed)  # Hydra composed these settings, not compose_config
+    check_ranges(cfg, "train")  # Hydra composed these settings, not compose_config
     train.check(cfg)
     if train.run(cfg, where, overrides):
         raise KeyboardInterrupt

@@ -16,7 +16,7 @@ from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.kept import FOLDER
 from maexp.agents.files import command, short
 from maexp.agents.locking import lock
-from maexp.agents.settings.checks import check_counts, check_seed, team_sizes, words_of
+from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import TrainSettings
@@ -71,11 +71,8 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 
 
 def check(cfg: TrainSettings) -> None:
-    """Raise UserError for counts out of range."""
-    check_counts(cfg, "num_envs", "total_frames", "checkpoint_every", "checkpoint_keep", "evaluate_episodes")
-    check_counts(cfg, "episodes", "evaluate_every", least=0)
+    """Raise UserError for settings that do not go together."""
     team_sizes(cfg.num_robots)
-    check_seed(judged(cfg).seed, "evaluation_seed")
     check_collector(cfg.collector)
     check_expert(cfg)
     check_logger(cfg.logger)

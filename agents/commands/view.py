@@ -1,8 +1,6 @@
 """`maexp view`: a run, a recorded episode or a map in three dimensions: a window, a picture, a page in the browser."""
 
-import math
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +9,9 @@ from maexp.agents.build import import_files, load_maps, make_env
 from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluation.films import EPISODES, MOST_TEAMS, play_teams
+from maexp.agents.evaluation.films import EPISODES, play_teams
 from maexp.agents.files import command, short
-from maexp.agents.settings.checks import check_counts
+from maexp.agents.settings.groups import MOST_TEAMS
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.storable import read
@@ -48,36 +46,17 @@ def prepare(overrides: list[str]) -> Recipe:
     return continue_run(*find_checkpoint(run), without(overrides, "place"), "view", "num_envs")
 
 
-def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
-    """Every view has a new folder of its own, for what it writes."""
-    return claim()
-
-
 def check(cfg: ViewSettings) -> None:
     """Raise UserError for what cannot be viewed, before a folder is made."""
-    check_counts(cfg, "num_envs", "num_robots")
-    check_counts(cfg, *["index"] * (cfg.index is not None), "port", least=0)
-    if cfg.num_envs > MOST_TEAMS:
-        raise UserError(f"num_envs={cfg.num_envs} teams cannot be viewed at once: give at most {MOST_TEAMS}.")
     last = MOST_EPISODES - cfg.num_envs
     if cfg.episode is not None and not 0 <= cfg.episode <= last:
         raise UserError(f"episode={cfg.episode} must be a whole number from 0 to {last}.")
-    if cfg.seconds is not None and not 0 <= cfg.seconds < math.inf:
-        raise UserError(f"seconds={cfg.seconds:g} must be a time after the start of the episode, 0 s or more.")
     if cfg.policy is not None and not holds_episodes(cfg.place):  # there it only picks some of what was recorded
         check_planner(cfg.planner.name, [find_player(cfg.policy)])
     if cfg.policy is not None and cfg.checkpoint is not None:
         raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
     if cfg.renderer not in show.RENDERERS:
         raise UserError(f"renderer={cfg.renderer} is unknown: choose one of {', '.join(show.RENDERERS)}.")
-    if not 64 <= cfg.size <= 8192:
-        raise UserError(f"size={cfg.size} must be a width from 64 to 8192 pixels.")
-    if not abs(cfg.azimuth) <= 360:
-        raise UserError(f"azimuth={cfg.azimuth:g} must lie between -360 and 360 degrees.")
-    if not 1 <= cfg.elevation <= 89:
-        raise UserError(f"elevation={cfg.elevation:g} must lie between 1 and 89 degrees.")
-    if cfg.cut is not None and not 0 < cfg.cut < float("inf"):
-        raise UserError(f"cut={cfg.cut:g} must be a height above 0 m.")
     if cfg.out is not None:
         check_out(Path(cfg.out))
     if wants_page(cfg):

@@ -17,7 +17,6 @@ from maexp.envs.viewing.episode import Episode, EpisodeRecorder
 
 WRITERS = {"gif": write_gif, "mp4": write_mp4}
 EPISODES = "episodes"  # folder of the episode files
-MOST_TEAMS = 64  # in one film or on one page
 LINE = 26  # pixels of a line of the caption
 WIDTHS = ((1, 512), (2, 440), (4, 360), (9, 256), (10**9, 176))  # (up to so many teams, pixels of a team's picture)
 
@@ -26,8 +25,6 @@ def check_render(cfg: EvaluateSettings) -> None:
     """Raise UserError where no film could be written at the end."""
     if cfg.render_format not in WRITERS:
         raise UserError(f"render_format={cfg.render_format} is unknown: choose one of {', '.join(WRITERS)}.")
-    if type(cfg.render_envs) is not int or not 1 <= cfg.render_envs <= MOST_TEAMS:
-        raise UserError(f"render_envs={cfg.render_envs} must be a whole number from 1 to {MOST_TEAMS}.")
     if cfg.render and cfg.render_envs > cfg.episodes:
         asked = f"render_envs={cfg.render_envs} is more than is played"
         warnings.warn(f"{asked} (episodes={cfg.episodes}): {cfg.episodes} will be filmed", stacklevel=2)

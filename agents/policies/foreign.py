@@ -38,9 +38,7 @@ from tensordict.nn import TensorDictModule
 from maexp.agents.errors import UserError
 from maexp.agents.policies.classical import as_module
 from maexp.envs import ExplorationEnv
-from maexp.envs.nav_grid import bank_nav_grids
-from maexp.envs.navigation import to_action
-from maexp.kernels.known_grid import KnownGrids
+from maexp.envs.navigation import known_grids, to_action
 from maexp.kernels.launches import finish_filling, launch_on
 from maexp.kernels.types import DT
 
@@ -65,16 +63,9 @@ class TeamSight:
     """
 
     def __init__(self, env: ExplorationEnv):
-        self.env, sim = env, env.simulation
-        grids, cells = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
-        limited = env.settings.limited
-        self.rows = env.num_robots if limited else 1
-        kind = "known" if limited else "viewers"
-        map_id, free, boundary = (
-            wp.from_torch(sim.tensors[name]) for name in ("map_id", f"{kind}_free", f"{kind}_boundary")
-        )
-        false = wp.from_torch(sim.tensors["false_walls"]) if sim.settings.false_alarms else None
-        self.known_grids = KnownGrids(sim.maps, grids, map_id, free, boundary, self.rows, cells, false)
+        self.env = env
+        self.known_grids = known_grids(env)
+        self.rows, grids = self.known_grids.rows_per_env, self.known_grids.grids
         finish_filling(env.device)
         self.launch = launch_on(env.device)
         width, height, cell, origin = (getattr(grids, one).numpy() for one in ("width", "height", "cell", "origin"))

@@ -1,13 +1,15 @@
 """Checks of settings that their types cannot express."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
 from omegaconf import DictConfig
 
 from maexp.agents.errors import UserError
-
-LAST_SEED = 2**31 - 1  # the kernels' random numbers start from a 32-bit integer
+from maexp.agents.settings.groups import LAST_SEED, CollectorSettings
+from maexp.agents.settings.verbs import SCHEMAS
+from maexp.envs.fields import check_value, kinds
 
 
 def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = "") -> None:
@@ -18,10 +20,16 @@ def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = ""
             raise UserError(f"{prefix}{name}={value} must be a whole number, {least} or more.")
 
 
-def check_steps(collector: DictConfig) -> None:
-    """Raise UserError unless `collector.steps` is a whole number of at least 1, or null: those of an episode."""
-    if collector.steps is not None:
-        check_counts(collector, "steps", prefix="collector.")
+def check_ranges(cfg: DictConfig, verb: str) -> None:
+    """Raise UserError for the first setting of a verb, or of its collector, that is out of the range of its field.
+
+    What belongs to an env, an algorithm or a network is checked where that is made.
+    """
+    for kind, node, prefix in ((SCHEMAS[verb], cfg, ""), (CollectorSettings, cfg.get("collector"), "collector.")):
+        for one in fields(kind) if node is not None else ():
+            limits = one.metadata.get("limits", {})
+            if limits.get("low") is not None or limits.get("above") is not None:
+                check_value(prefix + one.name, node[one.name], kinds(kind)[one.name], one.metadata, UserError)
 
 
 def check_seed(value: Any, name: str = "seed") -> None:

@@ -13,6 +13,8 @@ from maexp.envs.fields import same, setting
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import Scenario
 
+MOST_TEAMS = 64  # in one film or on one page
+LAST_SEED = 2**31 - 1  # the kernels' random numbers start from a 32-bit integer
 FREE_GROUPS = tuple(name for name, kind in GROUPS.items() if not supplied(kind))
 """Groups of `EnvSettings` in which a scenario supplies nothing."""
 ModelSettings = storable(ModelConfig)
@@ -64,10 +66,10 @@ class CollectorSettings:
     """How experience is gathered."""
 
     steps: int | None = setting(
-        None, "macro steps of every team in one iteration; default: scenario.macro_steps, a whole episode"
+        None, "macro steps of every team in one iteration; default: scenario.macro_steps, a whole episode", low=1
     )
     backend: str = setting("single", "one process; or processes, ray")
-    workers: int = setting(1, "worker processes, for each team size")
+    workers: int = setting(1, "worker processes, for each team size", low=1)
     overlap: bool = setting(
         False, "collect the next batch while learning from this one; the policy that acts is one batch old"
     )
@@ -102,8 +104,8 @@ Groups = make_dataclass(
 class CommonSettings(Groups):
     """Settings that every verb with an environment shares: `scenario`, the groups of `EnvSettings`, and these."""
 
-    num_envs: int = setting(32, "teams simulated at once")
-    seed: int = setting(0, "of everything random: maps' starts, networks, policy")
+    num_envs: int = setting(32, "teams simulated at once", low=1)
+    seed: int = setting(0, "of everything random: maps' starts, networks, policy", low=0, high=LAST_SEED)
     device: str = setting("auto", "cpu, cuda, cuda:1, ...; auto: cuda where there is one")
     num_threads: int | None = setting(None, "CPU threads of the simulation; default: as many as help")
 

@@ -23,7 +23,6 @@ from maexp.agents.networks.actor import ALIVE
 from maexp.agents.networks.distributions import ACTION
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collect import batch_statistics, divide_teams
@@ -37,8 +36,7 @@ HEADS = ("region", "offset", "target", "control")
 
 
 def check_warm_start(cfg: TrainSettings) -> None:
-    """Raise UserError for a teacher or a count that cannot be used."""
-    check_counts(cfg, "warm_start_frames")
+    """Raise UserError for a teacher that cannot be used."""
     if cfg.warm_start is None:
         return
     teacher = find_player(cfg.warm_start, "warm_start")

@@ -31,7 +31,7 @@ from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
 from maexp.agents.settings.algorithms import ExpertSettings
-from maexp.agents.settings.checks import check_counts, check_steps, team_sizes
+from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.env import find_followers
 from maexp.agents.settings.overrides import without
@@ -395,8 +395,6 @@ def check_expert(cfg: TrainSettings) -> None:
 
 def check_collector(settings: DictConfig) -> None:
     """Raise UserError for settings of `collector` that do not go together."""
-    check_steps(settings)
-    check_counts(settings, "workers", prefix="collector.")
     if settings.backend not in BACKENDS:
         raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
     if settings.backend == "single":

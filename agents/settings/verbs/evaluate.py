@@ -6,7 +6,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from maexp.agents.runtime.choices import CHOICES
-from maexp.agents.settings.groups import LearnerSettings
+from maexp.agents.settings.groups import MOST_TEAMS, LearnerSettings
 from maexp.envs.fields import setting
 
 NAMES = (*CHOICES, "lookahead", "oracle", "clairvoyant")
@@ -24,8 +24,10 @@ class EvaluateSettings(LearnerSettings):
     policy: Any = setting(None, f"{', '.join(NAMES)}, {OTHERS}; several as a,b")
     checkpoint: str | None = setting(None, "a run's folder or one checkpoint file")
     resume: str | None = setting(None, "folder of an evaluation to go on with (its settings are kept)")
-    episodes: int = setting(256, "episodes of each policy and team size")
+    episodes: int = setting(256, "episodes of each policy and team size", low=1)
     baseline: str | None = setting(None, "an earlier evaluation of the same episodes, to compare with: its folder")
     render: bool = setting(False, "also write a film of each policy, and the episodes for maexp view")
-    render_envs: int = setting(1, "teams in a film, side by side, each in a held-out episode of its own")
+    render_envs: int = setting(
+        1, "teams in a film, side by side, each in a held-out episode of its own", low=1, high=MOST_TEAMS
+    )
     render_format: str = setting("gif", "of the film: gif, or mp4 with the extra maexp[video]")

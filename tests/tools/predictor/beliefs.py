@@ -1,6 +1,6 @@
 """What teams know in the middle of episodes, beside what is there: labelled beliefs for the map predictor.
 
-`python -m maexp.agents.training.beliefs out=FOLDER split=train` plays `cost_utility`, which takes some targets at
+`python -m tests.tools.predictor.beliefs out=FOLDER split=train` plays `cost_utility`, which takes some targets at
 random, on the maps
 of every scenario and writes a file for each batch of episodes. A file that is there already is kept, so a run that was
 stopped goes on.
@@ -16,15 +16,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_utility
-from maexp.agents.settings.storable import storable
-from maexp.envs import ExplorationEnv, MapError, ObservationConfig, PlannerConfig, PointCloudMap, make_map
+from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, make_map
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.importing.finish import crop_grid, finish_map
 from maexp.envs.importing.occupancy import read_occupancy
@@ -35,6 +32,8 @@ from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, default_macro_steps, find_scenario, split
 from maexp.envs.targets import TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
+
+from .command import run
 
 NEVER = 255  # a cell that does not get known
 LONGER = 2.0  # episodes go on for so many times the scenario's decisions: late beliefs count too
@@ -211,13 +210,13 @@ def load_groups(folder: Path) -> dict[str, list[BeliefEpisode]]:
     for path in sorted(folder.glob("*.npz")):
         groups.setdefault(path.stem.split("-")[0], []).extend(load_episodes(path))
     if not groups:
-        raise UserError(f"data={folder} holds no beliefs: write some with python -m maexp.agents.training.beliefs.")
+        raise UserError(f"data={folder} holds no beliefs: write some with python -m tests.tools.predictor.beliefs.")
     return groups
 
 
 def write_beliefs(config: BeliefConfig) -> None:
     """Play and write what is not there yet."""
-    check_settings(config, "beliefs")
+    check_settings(config)
     for name in config.scenarios:
         write_maps(config, name, list_sources(config, name))
         if config.extra and name != PLANS and config.split == "train":
@@ -252,16 +251,5 @@ def write_batch(config: BeliefConfig, name: str, sources: list, first: int) -> N
         print(f"{names[k].name}: {decisions} beliefs in {time.perf_counter() - begin:.1f} s", flush=True)
 
 
-def main() -> int:
-    """Write beliefs as the command line says."""
-    try:
-        words = OmegaConf.merge(OmegaConf.structured(storable(BeliefConfig)), OmegaConf.from_cli())
-        write_beliefs(OmegaConf.to_object(words))
-    except (OmegaConfBaseException, UserError, MapError, ValueError) as error:
-        print(str(error).splitlines()[0], file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(BeliefConfig, write_beliefs))

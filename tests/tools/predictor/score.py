@@ -1,7 +1,7 @@
 """How well guesses of unknown ground fit maps that nobody trained on.
 
-`python -m maexp.agents.training.predictor_score data=FOLDER predictor=NAME_OR_FOLDER` compares a predictor with simpler
-guesses on the beliefs that `maexp.agents.training.beliefs split=validation` wrote.
+`python -m tests.tools.predictor.score data=FOLDER predictor=NAME_OR_FOLDER` compares a predictor with simpler
+guesses on the beliefs that `tests.tools.predictor.beliefs split=validation` wrote.
 """
 
 from __future__ import annotations
@@ -14,18 +14,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from scipy import ndimage
 
-from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.networks.map_predictor import load_predictor, predict, sample_worlds
 from maexp.agents.tables import fixed, markdown_table
-from maexp.agents.training.beliefs import BeliefEpisode, load_groups
-from maexp.agents.training.map_predictor import BAND, matters
 from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
+
+from .beliefs import BeliefEpisode, load_groups
+from .command import run
+from .train import BAND, matters
 
 MOST_DISTANCE = 48  # cells; a histogram takes what lies farther as lying there
 BINS = 15  # of the expected calibration error
@@ -172,7 +171,7 @@ def share_alike(worlds: np.ndarray, pairs: np.ndarray) -> float:
 
 def score(config: ScoreConfig) -> dict[str, dict[str, dict[str, float]]]:
     """{scenario: {guess: figures}}; under "mean" the mean of all scenarios."""
-    check_settings(config, "score")
+    check_settings(config)
     net = load_predictor(config.predictor)
     tables = count_tables(load_groups(Path(config.train)))
     found = {}
@@ -227,20 +226,13 @@ def print_table(what: str, tables: dict[str, dict[str, dict[str, float]]]) -> No
     print("\n".join(markdown_table(["scenario", what, *(one.replace("_", " ") for one in columns)], rows)))
 
 
-def main() -> int:
-    """Compare as the command line says."""
-    try:
-        words = OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_cli())
-        config = OmegaConf.to_object(words)
-        found = score(config)
-    except (OmegaConfBaseException, UserError, ValueError) as error:
-        print(str(error).splitlines()[0], file=sys.stderr)
-        return 1
+def main(config: ScoreConfig) -> None:
+    """Compare, print the tables, and write the figures where that is asked for."""
+    found = score(config)
     print_scores(found)
     if config.out:
         write_json(Path(config.out), found)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(ScoreConfig, main))

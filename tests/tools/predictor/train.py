@@ -1,6 +1,6 @@
-"""Train the map predictor on beliefs that `maexp.agents.training.beliefs` wrote.
+"""Train the map predictor on beliefs that `tests.tools.predictor.beliefs` wrote.
 
-`python -m maexp.agents.training.map_predictor data=FOLDER out=FOLDER` goes on where it was stopped, with the same
+`python -m tests.tools.predictor.train data=FOLDER out=FOLDER` goes on where it was stopped, with the same
 numbers as if it had not been.
 """
 
@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from scipy import ndimage
 from torch.nn import functional as F
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.map_predictor import MapPredictor
-from maexp.agents.training.beliefs import BeliefEpisode, load_groups
 from maexp.envs.fields import check_settings, setting
 from maexp.kernels.constants import FREE, UNKNOWN
+
+from .beliefs import BeliefEpisode, load_groups
+from .command import run
 
 BAND = 2.0  # radar ranges from known free ground within which cells count
 EDGE = 8  # cells at the edge of a crop that do not count: what is known beyond is cut off
@@ -125,7 +125,7 @@ def train_predictor(config: PredictorConfig, report: Callable[[str], None] = pri
     Raises:
         ValueError: a setting is out of its range, or the folder holds a training with others.
     """
-    check_settings(config, "map_predictor")
+    check_settings(config)
     groups = load_groups(Path(config.data))
     torch.manual_seed(config.seed)
     net = start_net(config).to(memory_format=torch.channels_last)
@@ -202,16 +202,5 @@ def save(config: PredictorConfig, net: MapPredictor, optimizer: torch.optim.Opti
     write_text(Path(config.out) / LOG, "\n".join(lines) + "\n")
 
 
-def main() -> int:
-    """Train as the command line says."""
-    try:
-        words = OmegaConf.merge(OmegaConf.structured(PredictorConfig), OmegaConf.from_cli())
-        train_predictor(OmegaConf.to_object(words), report=lambda line: print(line, flush=True))
-    except (OmegaConfBaseException, UserError, ValueError) as error:
-        print(str(error).splitlines()[0], file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(PredictorConfig, train_predictor))

@@ -1,6 +1,6 @@
 """A trained map predictor as a folder that ships or that robots use: weights, ONNX, contract and card.
 
-`python -m maexp.agents.training.predictor_export run=FOLDER train=BELIEFS out=FOLDER card=FILE`
+`python -m tests.tools.predictor.export run=FOLDER train=BELIEFS out=FOLDER card=FILE`
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor, nn
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
 from maexp.agents.networks.map_predictor import CARD, CONTRACT, NETWORK, STRIDE, WEIGHTS, MapPredictor, finish_guess
 from maexp.agents.policies.export import OPSET, PACKAGES, trace_network
-from maexp.agents.training.beliefs import load_groups
-from maexp.agents.training.map_predictor import CHECKPOINT
-from maexp.agents.training.predictor_score import count_tables
 from maexp.agents.versions import find_commit
+
+from .beliefs import load_groups
+from .command import run
+from .score import count_tables
+from .train import CHECKPOINT
 
 FORMAT = "maexp-predictor-1"
 MOST = {"batch": 4096, "rows": 256, "columns": 256}
@@ -110,16 +110,5 @@ def export_predictor(config: ExportConfig) -> None:
     write_json(out / CONTRACT, contract)  # last: a folder without it is no predictor
 
 
-def main() -> int:
-    """Export as the command line says."""
-    try:
-        words = OmegaConf.merge(OmegaConf.structured(ExportConfig), OmegaConf.from_cli())
-        export_predictor(OmegaConf.to_object(words))
-    except (OmegaConfBaseException, UserError, OSError, ValueError) as error:
-        print(str(error).splitlines()[0], file=sys.stderr)
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(ExportConfig, export_predictor))
