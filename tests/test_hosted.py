@@ -154,6 +154,7 @@ def test_the_next_episode_has_a_new_process():
         ("process:hostile:factory", "is no class with act"),
         ("process:nobody", "policy=nobody is unknown"),
         ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
+        ("hostile:Inert", "it gave up: TypeError: Inert is a class without act"),
     ],
 )
 def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):
