@@ -198,5 +198,9 @@ class BadStart(Stays):
         raise RuntimeError("no weights")
 
 
+class Inert:
+    """Forgot to act."""
+
+
 def factory(env):
     """No class with act."""

@@ -1,11 +1,14 @@
 """Policies in processes of their own: what they are told and what they choose is the same as inside; what they do wrong
 costs them their episode, and nothing else."""
 
+import os
 import shutil
+import signal
 import struct
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +154,7 @@ def test_the_next_episode_has_a_new_process():
         ("process:hostile:factory", "is no class with act"),
         ("process:nobody", "policy=nobody is unknown"),
         ("hostile:BadStart", "it gave up: RuntimeError in hostile.py"),
+        ("hostile:Inert", "it gave up: TypeError: Inert is a class without act"),
     ],
 )
 def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):
@@ -384,6 +388,68 @@ def test_the_processor_time_is_that_of_the_process():
         assert isinstance(answer, Lost) and "thought for more than 0.2 s" in str(answer)
     finally:
         guest.kill()
+
+
+RUN = """
+import sys, threading, time
+from maexp.agents.policies.process import Process, command_of
+guests = []
+thread = threading.Thread(target=lambda: guests.append(Process(command_of(sys.argv[1]))))
+thread.start()
+thread.join()
+guests[0].begin({"type": "hello", "version": 1})
+guests[0].send()
+print("asked", flush=True)
+time.sleep(1000)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="NO LINUX: policies of a killed run may stay")
+@pytest.mark.parametrize("word", ["sleeper:Sleeper", "exec:sh -c 'setsid sleep 1000 & exec sleep 1000'"])
+def test_a_run_that_is_killed_outright_leaves_no_policy_behind(word, tmp_path):
+    """Nor what that has started, though it left the session; the thread that started the policy is gone by then."""
+    (tmp_path / "sleeper.py").write_text(
+        "import os, time\n\n\nclass Sleeper:\n    def __init__(self):\n        os.fork()\n        time.sleep(1e9)\n\n"
+        "    def act(self, observation):\n        pass\n"
+    )
+    name = f"KILLED_RUN={tmp_path.name}-{time.time_ns()}"
+    run = subprocess.Popen(
+        [sys.executable, "-c", RUN, word],
+        env=os.environ | dict([name.split("=")]),
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        assert run.stdout.readline() == b"asked\n"
+        wait_until(lambda: len(having(name, but=run.pid)) == 3)  # two of the policy, and who watches
+        os.killpg(run.pid, signal.SIGKILL)
+        run.wait()
+        begin = time.monotonic()
+        wait_until(lambda: not having(name, but=run.pid))
+        print(f"gone after {time.monotonic() - begin:.1f} s")
+    finally:
+        for one in having(name, but=0):
+            os.kill(one, signal.SIGKILL)
+        run.wait()
+        run.stdout.close()
+
+
+def having(variable: str, but: int) -> list[int]:
+    """Processes that run with a variable in their environment, but one."""
+    found = []
+    for one in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if variable.encode() in (one / "environ").read_bytes().split(b"\0") and int(one.name) != but:
+                found.append(int(one.name))
+    return found
+
+
+def wait_until(what, seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def test_where_memory_runs_out_the_policy_is_ended_and_not_the_run():

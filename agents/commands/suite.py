@@ -189,6 +189,7 @@ def _freeze(cfg: SuiteSettings, where: None) -> int:
     suite = load_suite(cfg.place)
     made = files.describe_code() | {"machine": files.describe_machine(), "date": time.strftime("%Y-%m-%d")}
     with Progress(f"random and {suite.reference} on {suite.name}", 2 * len(suite.parts) * suite.episodes) as progress:
-        frozen = freeze(suite, made, progress.advance)
+        with blame_input():
+            frozen = freeze(suite, made, progress.advance)
     print("\n".join(report.describe_suite(frozen)))
     return 0

@@ -60,6 +60,8 @@ def find(word: str) -> Callable[[], Any] | None:
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     found = reduce(getattr, names.split("."), importlib.import_module(module))
+    if isinstance(found, type) and not any({"act", "__call__"} & set(vars(one)) for one in found.__mro__):
+        raise TypeError(f"{names} is a class without act(observation)")
     return found if callable(found) and hasattr(found, "act") else None
 
 
@@ -71,7 +73,8 @@ def to_array(goals: Any) -> np.ndarray:
     """
     array = np.asarray(goals)
     if array.dtype.kind not in "iuf":
-        raise ValueError(f"act() returned {'nothing' if goals is None else f'a {type(goals).__name__}'}, and no goals")
+        what = "nothing" if goals is None else f"a {type(goals).__name__}"
+        raise ValueError(f"act() returned {what}, and no goals: numbers [robots, 2] in metres, NaN for one that stays")
     return array.astype(np.float64)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
 
-from maexp.agents.policies import wire
+from maexp.agents.policies import warden, wire
 
 EXEC, APART = "exec:", "process:"
 POLL = 0.02  # seconds between two looks at the clocks of processes that think
@@ -26,8 +26,6 @@ GRACE = 2.0  # seconds that a process whose pipes are closed may take to end
 TAIL = 2_000  # bytes kept of what a process says on its standard error
 CHUNK = 2**16
 MOST_REASON = 400  # characters
-MARK = "MAEXP_GUEST"  # variable of the environment by which a process and all that it started are known
-ROUNDS = 100
 
 
 def command_of(word: str) -> list[str]:
@@ -53,12 +51,12 @@ class Lost(Exception):
 
 
 class Session(subprocess.Popen):
-    """A process that leads a session; `end` ends it with all that it started."""
+    """A process that leads a session; `end` ends it with all that it started, and so does the end of this process,
+    however it comes."""
 
     def __init__(self, command: list[str], **files: Any):
-        self.mark = f"{MARK}={uuid4().hex}"
-        name, _, value = self.mark.partition("=")
-        super().__init__(command, start_new_session=True, env=os.environ | {name: value}, **files)
+        self.mark = f"{warden.watch(os.getpid())}.{uuid4().hex}"
+        super().__init__(command, start_new_session=True, env=os.environ | {warden.MARK: self.mark}, **files)
         with suppress(OSError):  # where memory runs out, Linux ends it, and not the run
             Path(f"/proc/{self.pid}/oom_score_adj").write_text("1000")
 
@@ -69,19 +67,7 @@ class Session(subprocess.Popen):
         except (ProcessLookupError, PermissionError):
             pass
         self.wait()
-        for _ in range(ROUNDS):  # some may start others meanwhile
-            left = [one for one in Path("/proc").glob("[0-9]*") if self._started(one)]
-            for one in left:
-                with suppress(ProcessLookupError, PermissionError):
-                    os.kill(int(one.name), signal.SIGKILL)
-            if not left:
-                break
-
-    def _started(self, process: Path) -> bool:
-        try:
-            return self.mark.encode() in (process / "environ").read_bytes().split(b"\0")
-        except OSError:  # it has ended, or is somebody else's
-            return False
+        warden.end_marked(self.mark)
 
 
 class Guest:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import short, without_nan, write_file, write_text
 from maexp.agents.suites.play import Batch
-from maexp.agents.suites.score import Results
+from maexp.agents.suites.score import Results, to_result
 from maexp.agents.suites.suite import Suite, sha256
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.map import MapError, read_npz
@@ -82,7 +81,7 @@ def to_results(policy: str, suite: Suite, batches: dict[str, list[Batch]]) -> Re
     for name, several in batches.items():
         episodes = {one: np.concatenate([batch.metrics[one] for batch in several]) for one in suite.metrics}
         maps = np.concatenate([batch.maps for batch in several])
-        found[name] = EvaluationResult(policy, suite.parts[name].num_robots, episodes, 0.0, maps)
+        found[name] = to_result(suite, policy, name, episodes, maps)
     return found
 
 

@@ -9,12 +9,11 @@ import yaml
 
 from maexp.agents.checksums import checksum
 from maexp.agents.errors import UserError
-from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import short, write_text
 from maexp.agents.map_sets import MAPS, MapsError
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.suites.play import build_env, build_maps, play_batch
-from maexp.agents.suites.score import RANDOM, Results, mean_of
+from maexp.agents.suites.score import RANDOM, Results, mean_of, to_result
 from maexp.agents.suites.suite import Part, Suite, load_suite, sha256
 from maexp.envs import ObservationConfig, PointCloudMap
 
@@ -55,11 +54,11 @@ def read_frozen(suite: Suite) -> dict[str, Results]:
             rows = list(csv.DictReader(file))
         for policy in (RANDOM, suite.reference):
             found[policy] = {}
-            for name, part in suite.parts.items():
+            for name in suite.parts:
                 mine = [row for row in rows if (row["policy"], row["part"]) == (policy, name)]
                 episodes = {one: np.array([float(row[one] or "nan") for row in mine]) for one in suite.metrics}
                 maps = np.array([row["map"] for row in mine])
-                found[policy][name] = EvaluationResult(policy, part.num_robots, episodes, 0.0, maps)
+                found[policy][name] = to_result(suite, policy, name, episodes, maps)
                 if len(maps) != suite.episodes:
                     raise ValueError(f"{len(maps)} episodes of {policy} in {name}")
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -83,7 +82,7 @@ def play_rivals(suite: Suite, seed: int | None, advance: Callable[[int], None] =
                 advance(len(batches[-1].decisions))
             episodes = {one: np.concatenate([batch.metrics[one] for batch in batches]) for one in suite.metrics}
             names = np.concatenate([batch.maps for batch in batches])
-            results[name] = EvaluationResult(policy, part.num_robots, episodes, 0.0, names)
+            results[name] = to_result(suite, policy, name, episodes, names)
     return {"results": found, "maps": points}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.suites.suite import Part, Suite
 from maexp.envs import (
@@ -21,7 +22,7 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
-from maexp.envs.metrics import episode_metrics
+from maexp.envs.metrics import RADIO, episode_metrics
 
 REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
 
@@ -94,6 +95,7 @@ def build_env(
         macro_steps=part.macro_steps,
         collision=part.collision,
         success_coverage=part.success_coverage,
+        done=part.done,
         starts=part.starts,
         **others,
     )
@@ -173,6 +175,9 @@ def play_batch(suite: Suite, env: ExplorationEnv, policy: Callable, first: int) 
     decisions = -(-final["local_steps"][:, 0].cpu().numpy() // env.local_steps)
     metrics = episode_metrics(final, env.local_steps * env.macro_steps, env.success_coverage)
     maps = np.array([env.maps[index].name for index in env.simulation.tensors["map_id"][:count].tolist()])
+    metrics |= {name: np.full(count, np.nan) for name in RADIO if name not in metrics}  # radios without limits
+    if unknown := [name for name in suite.metrics if name not in metrics]:
+        raise UserError(f"{suite.path}: metrics has {unknown[0]}, which is none: choose among {', '.join(metrics)}.")
     return recorder.batch(first, count, decisions, {name: metrics[name] for name in suite.metrics}, maps)
 
 

@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 from maexp.agents.evaluation.evidence import Evidence, describe_evidence, verdict
 from maexp.agents.evaluation.plots import COLOURS, LOOK, save
-from maexp.agents.suites.score import RANDOM, score_cells
-from maexp.agents.suites.suite import Suite
+from maexp.agents.suites.score import RANDOM, describe_score, score_cells
+from maexp.agents.suites.suite import Part, Suite
 from maexp.agents.tables import NONE, brackets, fixed, markdown_table, print_table
+from maexp.envs.config import CommConfig
 from maexp.envs.metrics import label_copies
 
 COLUMNS = ("part", "score", "95 % interval", RANDOM, "reference", "between", "less reference", "95 % at", "lost")
@@ -23,10 +24,13 @@ def describe_suite(suite: Suite) -> list[str]:
     told = ", ".join(f"{name} {values['score']:.4f}" for name, values in scores.items())
     lines = [
         f"{suite.name}, version {suite.version}, checksum {suite.checksum[:16]}",
-        f"score: mean {suite.score} of {suite.episodes} episodes of each of {len(suite.parts)} parts",
+        f"score: {describe_score(suite.scores)}",
+        f"{suite.episodes} episodes of each of {len(suite.parts)} parts",
         f"frozen scores: {told or 'none yet'} (0 and 1 of the normalised score)",
     ]
-    heads, rows = ("part", "maps", "robots", "radar [m]", "starts", "episode [s]"), []
+    heads, rows = ["part", "maps", "robots", "radar [m]", "starts", "episode [s]"], []
+    radios = {name: _describe_radios(part) for name, part in suite.parts.items()}
+    heads += ["radios", "ends an episode"] * any(radios.values())
     for name, part in suite.parts.items():
         maps = f"{part.scenario} {part.first} to {part.first + part.count - 1}"
         if part.fetched:
@@ -34,7 +38,14 @@ def describe_suite(suite: Suite) -> list[str]:
         robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"
         seconds = f"{0.1 * part.limit:g}, a decision every {0.1 * part.local_steps:g}"
         rows.append([name, maps, robots, f"{part.radar['range']:g}", part.starts, seconds])
+        rows[-1] += [radios[name] or "everyone", f"{part.success_coverage:.0%} of {part.done}"] * any(radios.values())
     return [*lines, "", *markdown_table(heads, rows), "", *_describe_sources(suite), f"File: {suite.path}"]
+
+
+def _describe_radios(part: Part) -> str:
+    """What limits them, as settings; "" where everyone hears everyone."""
+    usual = CommConfig()
+    return ", ".join(f"{name}={value}" for name, value in part.comm.items() if value != getattr(usual, name))
 
 
 def _describe_sources(suite: Suite) -> list[str]:

@@ -88,12 +88,14 @@ def _check_verified(where: Path, report: dict[str, Any]) -> None:
 
 
 def _describe_part(suite: Suite, part: str, summary: dict, results: dict) -> dict[str, Any]:
+    score = suite.scores[part]
     told = {name: summary[name] for name in (suite.score, *SHOWN) if name in summary}
+    told |= {"metric": score} if score != suite.score else {}
     episodes = results["episodes"][part]
     values = {name: np.array(episodes[name], dtype=np.float64) for name in suite.metrics}
     return told | {
         "normalised": summary["normalised"],
-        "episodes": episodes[suite.score],
+        "episodes": episodes[score],
         "copies": label_copies(np.array(episodes["map"]), values).tolist(),
         "lost": len(episodes["lost"]),
         "seconds": 0.1 * suite.parts[part].limit,
@@ -200,6 +202,8 @@ def _check_numbers(row: dict[str, Any]) -> None:
     if not isinstance(row.get("note", ""), str):
         raise ValueError("note is of another kind")
     parts = row["parts"]
+    if not all(isinstance(one.get("metric", ""), str) for one in parts.values()):
+        raise ValueError("metric of a part is of another kind")
     if not set(parts) == set(row["films"]) == set(row["reference"]["parts"]):
         raise ValueError("parts, films and reference are not of the same parts")
     if not all(row["metric"] in one and len(one["copies"]) == len(one["episodes"]) for one in parts.values()):

@@ -10,13 +10,36 @@ import numpy as np
 
 from maexp.agents.benchmark.compare import improvement
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.suites.suite import Suite
+from maexp.agents.suites.suite import SCORE, Suite
 from maexp.agents.tables import NONE, POINTS, brackets, estimate, fixed
 from maexp.envs.metrics import LEAST_DISTINCT, resample_weights, resampled_means
 
 Results = dict[str, EvaluationResult]  # part -> its episodes
 RANDOM = "random"
+SCORED = {
+    "coverage_auc": "the share of the place that the team has seen",
+    "base_coverage_auc": "the share of the place that the base station knows",
+    "worst_coverage_auc": "the share of the place that the robot knows that knows least",
+}
+"""What scores are in words."""
 LEVELS = 101  # of a performance profile, from 0 to 1
+
+
+def to_result(suite: Suite, policy: str, part: str, episodes: dict[str, np.ndarray], maps: Any) -> EvaluationResult:
+    """The episodes of a part: each metric's values [episodes], and `SCORE` where parts have different scores."""
+    own = {SCORE: episodes[suite.scores[part]]} if suite.score == SCORE else {}
+    return EvaluationResult(policy, suite.parts[part].num_robots, episodes | own, 0.0, maps)
+
+
+def describe_score(scores: dict[str, str]) -> str:
+    """What is scored, of the metric of each part: "mean coverage_auc, the share of ... seen, on average over time"."""
+    parts: dict[str, list[str]] = {}
+    for part, metric in scores.items():
+        parts.setdefault(metric, []).append(part)
+    told = [f"{metric}, {SCORED[metric]}" if metric in SCORED else metric for metric in parts]
+    if len(parts) > 1:
+        told = [f"{one} ({', '.join(names)})" for one, names in zip(told, parts.values(), strict=True)]
+    return f"mean {'; '.join(told)}{', on average over the time' * any(one in SCORED for one in parts)}"
 
 
 def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> dict[str, Any]:
@@ -42,7 +65,7 @@ def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> 
             "policy": suite.reference,
             "score": mean_of(one),
             "parts": {part: float(values.mean()) for part, values in one.items()},
-            "difference": {metric: subtract(mine, theirs, metric) for metric in suite.metrics},
+            "difference": {metric: subtract(mine, theirs, metric) for metric in dict.fromkeys((*suite.metrics, name))},
             "differences": {part: result.minus(theirs[part])[name] for part, result in mine.items()},
             "improvement": improvement(own, one, copies),
         },

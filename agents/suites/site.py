@@ -10,7 +10,7 @@ import numpy as np
 from maexp.agents.benchmark.compare import improvement
 from maexp.agents.evaluation.figures import COLOURS
 from maexp.agents.files import without_nan, write_text
-from maexp.agents.suites.score import profile, score_cells
+from maexp.agents.suites.score import describe_score, profile, score_cells
 from maexp.agents.tables import markdown_table
 
 TEMPLATE = Path(__file__).with_name("page.html")
@@ -53,6 +53,7 @@ def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         **{name: first["suite"][name] for name in ("name", "version", "checksum")},
         **{name: first[name] for name in ("metric", "random")},
+        "scored": describe_score(scores_of(first)),
         "reference": {name: first["reference"][name] for name in ("policy", "score", "parts")},
         "rows": [row | {"profile": profile(own)} for row, own in zip(rows, values, strict=True)],
         "better": [
@@ -60,6 +61,11 @@ def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
             for x in numbers
         ],
     }
+
+
+def scores_of(row: dict[str, Any]) -> dict[str, str]:
+    """Part -> the metric that counts there."""
+    return {part: one.get("metric", row["metric"]) for part, one in row["parts"].items()}
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
@@ -79,11 +85,13 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
         score = score_cells(row["score"], row["score"]["normalised"], row["reference"]["difference"])
         cells.append([str(number), f"`{name}`", *score, "yes" if row["verified"] else "no"])
     title = f"## {suite['name']}, version {suite['version']}"
-    told: dict[str, list[str]] = {}
+    noted: dict[str, list[str]] = {}
     for row in rows:
-        told.setdefault(row.get("note", ""), []).append(f"`{_escaped(row['policy'])}`")
-    notes = [f"- {', '.join(names)}: {_escaped(note)}" for note, names in told.items() if note]
-    return [title, "", *markdown_table([*heads, "verified"], cells), "", *notes, *[""] * bool(notes)]
+        noted.setdefault(row.get("note", ""), []).append(f"`{_escaped(row['policy'])}`")
+    notes = [f"- {', '.join(names)}: {_escaped(note)}" for note, names in noted.items() if note]
+    told = describe_score(scores_of(rows[0]))
+    scored = [f"Score: {told}.", ""] * (rows[0]["metric"] != "coverage_auc")
+    return [title, "", *scored, *markdown_table([*heads, "verified"], cells), "", *notes, *[""] * bool(notes)]
 
 
 def _escaped(text: str) -> str:

@@ -19,13 +19,15 @@ import maexp.conf
 from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.map_sets import SPLITS, Entry, MapsError, MapSet, load_set, set_names
-from maexp.envs.config import STARTS
+from maexp.envs.config import DONE, STARTS
 from maexp.envs.scenarios import SCENARIOS
 
 FOLDER = Path(maexp.conf.__path__[0]) / "_suite"
 KEYS = ("name", "version", "score", "metrics", "reference", "seed", "episodes", "decision_limit", "parts")
 GENERATED, FETCHED = ("scenario", "first", "count"), ("fetched",)
 """What says which maps a part has: one or the other."""
+OWN = ("score", "done")
+"""What a part may have beside `PART_KEYS`: its score, where that is not the suite's; whose coverage ends an episode."""
 PART_KEYS = (
     "num_robots",
     "starts",
@@ -38,6 +40,8 @@ PART_KEYS = (
     "planner",
     "comm",
 )
+SCORE = "score"
+"""What counts in each part, as if it were a metric, where parts have different scores."""
 OTHER_MAPS = 10_000, 2**31
 """Between these lie the numbers of the maps of another seed."""
 
@@ -63,6 +67,8 @@ class Part:
     first: int = 0
     count: int = 0
     fetched: str = ""
+    score: str = ""
+    done: str = "union"
 
     @property
     def limit(self) -> int:
@@ -132,8 +138,14 @@ class Suite:
 
     @property
     def score(self) -> str:
-        """The metric whose mean over all episodes is the score."""
-        return self.content["score"]
+        """The metric whose mean over all episodes is the score; `SCORE` where parts have different ones."""
+        found = set(self.scores.values())
+        return SCORE if len(found) > 1 else found.pop()
+
+    @property
+    def scores(self) -> dict[str, str]:
+        """Part -> the metric that counts there."""
+        return {name: part.score or self.content["score"] for name, part in self.parts.items()}
 
     @property
     def metrics(self) -> list[str]:
@@ -230,7 +242,7 @@ def _check_content(path: Path, content: Any) -> None:
         raise UserError(f"{path}: parts must name at least one part.")
     for name, part in content["parts"].items():
         fetched = isinstance(part, dict) and "fetched" in part
-        _check_keys(path, f"parts.{name}.", part, (*(FETCHED if fetched else GENERATED), *PART_KEYS))
+        _check_keys(path, f"parts.{name}.", part, (*(FETCHED if fetched else GENERATED), *PART_KEYS), OWN)
         for count in ("num_robots", "local_steps", "macro_steps"):
             _check_count(path, f"parts.{name}.{count}", part[count])
         (_check_fetched if fetched else _check_generated)(path, f"parts.{name}", part)
@@ -238,6 +250,7 @@ def _check_content(path: Path, content: Any) -> None:
             raise UserError(f"{path}: parts.{name}.starts={part['starts']} is unknown: choose {', '.join(STARTS)}.")
         for group, kind in _configs().items():
             _check_group(path, f"parts.{name}.{group}", part[group], kind)
+        _check_own(path, f"parts.{name}", part, content)
 
 
 def _check_generated(path: Path, where: str, part: dict) -> None:
@@ -252,6 +265,25 @@ def _check_fetched(path: Path, where: str, part: dict) -> None:
     known = [f"{name}/{split}" for name in set_names() for split in SPLITS]
     if part["fetched"] not in known:
         raise UserError(f"{path}: {where}.fetched={part['fetched']} is unknown: choose {', '.join(known)}.")
+
+
+def _check_own(path: Path, where: str, part: dict, content: dict) -> None:
+    """Whether somebody knows what is scored, and what ends an episode."""
+    from maexp.envs.config import CommConfig
+
+    score = part.get("score", content["score"])
+    try:
+        comm = CommConfig(**part["comm"]).checked()
+    except ValueError as error:
+        raise UserError(f"{path}: {where}: {error}.") from error
+    if score not in content["metrics"]:
+        raise UserError(f"{path}: {where}.score={score} must be one of the metrics.")
+    if part.get("done", "union") not in DONE:
+        raise UserError(f"{path}: {where}.done={part['done']} is unknown: choose {', '.join(DONE)}.")
+    if score.startswith("base_") and not comm.has_base:
+        raise UserError(f"{path}: {where} is scored by {score} and has no base station: set its comm.base_station.")
+    if score.startswith("worst_") and not comm.limited:
+        raise UserError(f"{path}: {where} is scored by {score}, and all know the same: limit its comm.")
 
 
 def _configs() -> dict[str, type]:
