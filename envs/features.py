@@ -34,11 +34,11 @@ class Contacts:
         tells: bool [..., N, M], the candidate that is no frontier: to go to the base station and tell it.
         untold: what the robot knows and the base station did not know when they were last connected [radar discs],
             this one and the following [..., N, 1].
-        since: time since then, of the whole time.
+        since: time since then, of the whole time; never counts from the decision before the first.
         linked: bool, whether they are connected now.
         way: to the base station [radar ranges].
         spare: time that is left when the robot gets there, of the whole time.
-        mates_untold, mates_since: the same of the mate that lacks most, and of all mates on average; -1: never.
+        mates_untold, mates_since: the same of the mate that lacks most, and of all mates on average.
         far: from the candidate to the base station [radar ranges], [..., N, M].
         signal: how much more than a link needs would arrive there from the base station, by what the robot knows, the
             unknown as walls [10 dB]; of radios without a signal 1 where they hear each other and -1 where not.
