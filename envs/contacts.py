@@ -57,7 +57,9 @@ class ContactView:
         more = {name: blank for name in ZERO} | {name: torch.full_like(blank, torch.inf) for name in FAR_AWAY}
         more |= {"mask": can, "travel": way, "to": to, "way": begin, "toward": torch.zeros_like(to)}
         more |= {"value": -BETA * way, "score": -BETA * way}
-        wider = {name: torch.cat([getattr(moment, name), one.to(getattr(moment, name))], 2) for name, one in more.items()}
+        wider = {
+            name: torch.cat([getattr(moment, name), one.to(getattr(moment, name))], 2) for name, one in more.items()
+        }
         moment = replace(moment, **wider)
         return replace(moment, radio=self._contacts(moment, nav))
 
@@ -66,15 +68,15 @@ class ContactView:
         base = self.env.simulation.tensors["base"][:, None, :2]
         return to_action(self.env, base.expand(-1, self.env.num_robots, -1))
 
-    def _way_to_base(
-        self, nav: Navigation, base: torch.Tensor, to: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _way_to_base(self, nav: Navigation, base: torch.Tensor, to: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """How far it is to the base station [m], [E, N, 1], and a point near the beginning of the way, from the robot,
         [E, N, 1, 2]; guessed from the straight line where the known ground does not lead there."""
         m = nav.state["map_id"].long()
         edge, width, height = nav.cell_of_env(), nav.width[m].long(), nav.height[m].long()
         x, y = ((base[:, 0] - nav.origin[m]) / edge.unsqueeze(-1)).floor().long().unbind(-1)
-        cell = (torch.minimum(y.clamp_min(0), height - 1) * width + torch.minimum(x.clamp_min(0), width - 1)).view(-1, 1)
+        cell = (torch.minimum(y.clamp_min(0), height - 1) * width + torch.minimum(x.clamp_min(0), width - 1)).view(
+            -1, 1
+        )
         cell = cell.expand(-1, to.shape[1]).unsqueeze(-1)
         steps = nav.distance.gather(2, cell)
         reached = steps < UNREACHED

@@ -206,7 +206,9 @@ TABLE: dict[str, Feature] = {
     "own_last": Feature(lambda now: now.near(now.own_last), RANGES, "to the own latest target"),
     "mates_last": Feature(lambda now: now.near(now.mates_last), RANGES, "to the nearest latest target of another"),
     # The robot and its team, the same for all candidates.
-    "count": Feature(lambda now: now.xp.sum(now.frontiers, -1)[..., None] / 10.0, "10 candidates", "how many there are"),
+    "count": Feature(
+        lambda now: now.xp.sum(now.frontiers, -1)[..., None] / 10.0, "10 candidates", "how many there are"
+    ),
     "speed": Feature(lambda now: now.speed / now.max_speed, "of max_speed", "speed"),
     "drive": Feature(lambda now: now.drive / now.reach, RANGES, "way driven until the next decision"),
     "time_left": Feature(lambda now: now.time_left, "share of the whole time", "time left"),

@@ -115,10 +115,13 @@ def check_observation(config: ObservationConfig, planner: PlannerConfig, comm: C
     if config.radio and not config.targets:
         raise ValueError("observation.radio=true is about targets, and none are shown: add observation.targets=24")
     if config.radio and not comm.limited:
-        raise ValueError("observation.radio=true is about radios that do not reach: add comm=ir2, comm.range or the like")
+        raise ValueError(
+            "observation.radio=true is about radios that do not reach: add comm=ir2, comm.range or the like"
+        )
     if config.radio and comm.has_base and planner.name != "wavefront":
         raise ValueError(
-            f"observation.radio=true sends robots to the base station: planner={planner.name} finds no way, use wavefront"
+            f"observation.radio=true sends robots to the base station: planner={planner.name} finds no way, use "
+            "wavefront"
         )
     if config.targets and planner.name == "direct":
         raise ValueError(

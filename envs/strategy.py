@@ -40,9 +40,9 @@ class Strategy:
         name: of the strategy; None: `comm.strategy`.
 
     Attributes:
-        known: int32 [E, N], what robots know; ``linked`` bool [E, N, U], with whom they are connected; ``way`` [E, N, U],
-            how far it is back into contact [m]; ``left`` [E, N], how far they still get in the episode [m]: of the last
-            `look`.
+        known: int32 [E, N], what robots know; ``linked`` bool [E, N, U], with whom they are connected; ``way``
+            [E, N, U], how far it is back into contact [m]; ``left`` [E, N], how far they still get in the episode [m]:
+            of the last `look`.
         state: tensors that later decisions depend on; U radios, the base station's last. ``met`` int32 [E, N, U], the
             macro step in which a robot was last connected with a radio, -1: never; ``place`` [E, N, U, 2], where that
             was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what it knew

@@ -42,9 +42,7 @@ class Radio:
 
 
 @wp.func
-def count_blocked(
-    grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin: int, a: wp.vec2, b: wp.vec2
-) -> int:
+def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin: int, a: wp.vec2, b: wp.vec2) -> int:
     """Cells of the map's grid along a line that are no free ground; those of the grid start at `begin`.
 
     The line is cut in as many equal pieces as it crosses columns of cells, or rows if those are more; the middle of

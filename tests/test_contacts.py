@@ -1,4 +1,4 @@
-"""Targets that tell of radios: what robots remember and no more, the target to go and tell, and policies with and without."""
+"""Targets that tell of radios: what robots remember, the target to go and tell, policies with and without."""
 
 import math
 
@@ -180,7 +180,9 @@ def test_a_reset_of_some_envs_leaves_the_others():
     after = env.reset(td.clone().set("_reset", torch.tensor([[False], [True], [False], [True]])))
     assert torch.equal(after[TARGETS][[0, 2]], td[TARGETS][[0, 2]])
     assert torch.equal(after[MASK][[0, 2]], td[MASK][[0, 2]])
-    assert (column(after, "base_since")[[1, 3]] <= 1 / 40).all(), "never connected counts from before the first decision"
+    assert (column(after, "base_since")[[1, 3]] <= 1 / 40).all(), (
+        "never connected counts from before the first decision"
+    )
 
 
 def test_a_policy_that_was_trained_without_it_plays_the_same():
@@ -235,7 +237,9 @@ def test_exported_it_plays_on_here_and_planners_on_robots_refuse_it(tmp_path):
     assert read_contract(folder).radio
     td = play(env, env.rand_action, 2)[-1]
     again = make_policy(str(folder), env)
-    assert torch.equal(again(td.clone())["agents", "action", "preference"], policy(td)["agents", "action", "preference"])
+    assert torch.equal(
+        again(td.clone())["agents", "action", "preference"], policy(td)["agents", "action", "preference"]
+    )
     with pytest.raises(ValueError, match=r"observation\.radio=true"):
         TeamPlanner(folder)
     with pytest.raises(UserError, match=r"add observation\.radio=true"):

@@ -1,4 +1,6 @@
-"""Branches that count what the base station, or the robot that knows least, learns: what comes of them comes in the env."""
+"""Branches that count what the base station, or the worst robot, learns: what comes of them comes in the env."""
+
+from functools import partial
 
 import pytest
 import torch
@@ -12,11 +14,11 @@ from maexp.agents.training.branching import NEVER, SCORE, BranchPlayer
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, make_map
 from maexp.envs.choices import rank_by_utility
 
-REACH = 6.0
+REACH, DECISIONS, BEFORE, HORIZON = 6.0, 8, 3, 3
 
 
 def make_env(strategy: str = "return_to_base", radio: bool = True, **settings) -> ExplorationEnv:
-    settings = {"num_envs": 4, "num_robots": 2, "seed": 2, "local_steps": 10, "macro_steps": 8} | settings
+    settings = {"num_envs": 4, "num_robots": 2, "seed": 2, "local_steps": 10, "macro_steps": DECISIONS} | settings
     comm = settings.pop("comm", CommConfig(range=REACH, base_station=True, strategy=strategy, period=2))
     return ExplorationEnv(
         [make_map("maze_small", 1), room(45, 36, "rotated")],
@@ -45,57 +47,88 @@ def told(env: ExplorationEnv, learner: str) -> tuple[torch.Tensor, torch.Tensor]
     return s["known_weight"][:, :robots].amin(1), s["worst_sum"].clone()
 
 
+def play_branch(env: ExplorationEnv, strategy: str, td, likes: torch.Tensor, named: torch.Tensor) -> None:
+    """What a branch plays: a decision as named, int64 [E, N], then cost_utility with the strategy."""
+    trackers = {name: one.clone() for name, one in env.target_view.tracker.state.items()}
+    wanted = torch.where(torch.arange(9) == named.unsqueeze(-1), -NEVER, likes)
+    begin(env, td.clone(), wanted, named)
+    env.strategy.name = "return_to_base"  # whatever it was
+    follower, now = FrontierPlanner(env, rank_by_utility), env.target_view.tracker.state
+    follower.tracker.state.update(trackers | {name: now[name].clone() for name in ("chosen", "stood")})
+    for _ in range(HORIZON - 1):
+        step = env.rand_action(td.clone())
+        del step[(*ACTION, "target")]
+        step[(*ACTION, "region")], step[(*ACTION, "offset")] = follower(None)
+        env.step(step)
+    env.strategy.name = strategy
+
+
+def worth_of(env: ExplorationEnv, saved: dict, learner: str, play) -> torch.Tensor:
+    """What `play` from a saved state is worth to the learner [radar discs], float64 [E]."""
+    env.load_state_dict(saved)
+    known, summed = told(env, learner)
+    play()
+    now, total = told(env, learner)
+    s, steps = env.simulation.tensors, HORIZON * env.local_steps
+    played = s["local_step"] - BEFORE * env.local_steps
+    gained = (now - known).double()
+    over_time = total - summed - played * known.long() + (steps - played) * gained
+    after = min((DECISIONS - BEFORE - HORIZON) / HORIZON, 1.0)
+    lost = (s["collided"] != saved["collided"]).sum(-1)
+    return (over_time / steps + after * gained) / env.strategy._disc()[:, 0] - lost
+
+
 @pytest.mark.parametrize("learner", ["base", "everyone"])
 @pytest.mark.parametrize("strategy", ["return_to_base", "opportunistic"])
 def test_a_branch_is_worth_what_comes_of_it(learner, strategy):
-    """Some decisions, the first as tried, then cost_utility with the strategy: in the branch and in the env itself."""
+    """Robot by robot and candidate by candidate, to go and tell among them, in the branch and in the env itself."""
     env = make_env(strategy)
     td = env.reset()
-    for _ in range(3):
+    for _ in range(BEFORE):
         likes = prefer(td)
         td = begin(env, td, likes, likes.argmax(-1))
-    horizon = 3
-    player = BranchPlayer(env, candidates=4, horizon=horizon, seed=0, learn_from=learner)
-    likes = prefer(td)
+    likes, saved = prefer(td), env.state_dict()
+    player = BranchPlayer(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
     index, advantage = player.try_candidates(td[TARGETS], likes)
-    own, saved, disc = index[..., 0].clamp_min(0), env.state_dict(), env.strategy._disc()[:, 0]
-    trackers = {name: one.clone() for name, one in env.target_view.tracker.state.items()}
-    worth, compared, telling = {}, 0, 0
+    after = env.state_dict()
+    assert all(torch.equal(one, after[name]) for name, one in saved.items()), "the episode was touched"
+    own, worth, compared, telling = index[..., 0].clamp_min(0), {}, 0, 0
     for robot in range(2):
         for k in range(4):
-            env.load_state_dict(saved)
-            env.strategy.name = strategy
             named = own.clone()
             named[:, robot] = index[:, robot, k].clamp_min(0)
-            wanted = torch.where(torch.arange(9) == named.unsqueeze(-1), -NEVER, likes)
-            known, summed = told(env, learner)
-            begin(env, td.clone(), wanted, named)
-            if strategy == "opportunistic":
-                env.strategy.name = "return_to_base"
-            follower = FrontierPlanner(env, rank_by_utility)
-            follower.tracker.state.update({name: one.clone() for name, one in trackers.items()})
-            follower.tracker.state["chosen"] = env.target_view.tracker.state["chosen"].clone()
-            follower.tracker.state["stood"] = env.target_view.tracker.state["stood"].clone()
-            for _ in range(horizon - 1):
-                region, offset = follower(None)
-                step = env.rand_action(td.clone())
-                del step[(*ACTION, "target")]
-                step[(*ACTION, "region")], step[(*ACTION, "offset")] = region, offset
-                env.step(step)
-            now, total = told(env, learner)
-            s, steps = env.simulation.tensors, horizon * env.local_steps
-            played = s["local_step"] - 30
-            gained = (now - known).double()
-            after = min((8 - 3 - horizon) / horizon, 1.0)
-            over = total - summed - played * known.long() + (steps - played) * gained
-            lost = (s["collided"] != saved["collided"]).sum(-1)
-            worth[robot, k] = (over / steps + after * gained) / disc - lost
-            for team in range(4):
-                if index[team, robot, k] >= 0 and torch.isfinite(advantage[team, robot, k]):
-                    more = float((worth[robot, k] - worth[robot, 0])[team])
-                    print(team, robot, k, int(index[team, robot, k]), float(advantage[team, robot, k]), more)
-                    compared += k > 0
-                    telling += int(index[team, robot, k]) == 8
-                    assert float(advantage[team, robot, k]) == pytest.approx(more, abs=2e-4)
-    env.load_state_dict(saved)
+            worth[k] = worth_of(env, saved, learner, partial(play_branch, env, strategy, td, likes, named))
+            there = (index[:, robot, k] >= 0) & advantage[:, robot, k].isfinite()
+            more = (worth[k] - worth[0])[there].float()
+            torch.testing.assert_close(advantage[:, robot, k][there], more, atol=2e-4, rtol=0)
+            compared += int(there.sum()) * (k > 0)
+            telling += int((index[:, robot, k] == 8).sum())
     assert compared >= 6 and telling >= 1, "hardly anything was tried"
+
+
+def test_who_is_on_its_way_to_tell_tries_nothing():
+    env = make_env()
+    td = env.reset()
+    for _ in range(BEFORE):
+        likes = prefer(td)
+        td = begin(env, td, likes, likes.argmax(-1))
+    player, likes = BranchPlayer(env, candidates=3, horizon=1, seed=0, learn_from="base"), prefer(td)
+    tried = player.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    env.strategy.state["duty"][:] = True
+    fewer = player.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    can = env.strategy.can_tell()
+    assert can.any() and tried[can].any()
+    assert not fewer[can].any() and torch.equal(fewer[~can], tried[~can])
+
+
+@pytest.mark.parametrize(
+    "comm, learner, sentence",
+    [
+        (CommConfig(), "base", "radios that do not reach"),
+        (CommConfig(range=REACH), "base", "add comm.base_station=true"),
+        (CommConfig(range=REACH, base_station=True), "base", "observation.radio=true"),
+    ],
+)
+def test_what_nobody_could_learn_is_told(comm, learner, sentence):
+    with pytest.raises(ValueError, match=f"algorithm.learn_from={learner}.*{sentence}"):
+        BranchPlayer(make_env(radio=False, comm=comm), candidates=2, horizon=1, learn_from=learner)

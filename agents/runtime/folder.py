@@ -65,9 +65,9 @@ class LearnedChoice:
         self.contract = read_contract(folder)
         if self.contract.radio:
             raise ValueError(
-                f"{folder} was trained with observation.radio=true: it looks at when robots last heard the base station "
-                "and each other, which planners on robots do not know; use one that was trained without it, or play "
-                "this one in the simulator"
+                f"{folder} was trained with observation.radio=true: it looks at when robots last heard the base "
+                "station and each other, which planners on robots do not know; use one that was trained without it, or "
+                "play this one in the simulator"
             )
         try:
             import onnxruntime

@@ -125,8 +125,8 @@ class BranchPlayer:
         return torch.where(there, index, -1), worth - worth[..., :1]
 
     def _offer(self, index: torch.Tensor, waits: torch.Tensor) -> dict[str, torch.Tensor]:
-        """What each robot may try, as of `Rollouts.weigh`, and "tells" bool [E, N, K], which of it is to go and tell the
-        base station."""
+        """What each robot may try, as of `Rollouts.weigh`; and "tells" bool [E, N, K], which of it is to go and tell
+        the base station."""
         s, count = self.view.state, self.view.count
         place, frontier = index.clamp(0, count - 1), (index >= 0) & (index < count)
         block = torch.where(frontier, s["block"].gather(2, place), -1)

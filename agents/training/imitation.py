@@ -113,7 +113,9 @@ def widened(state: dict[str, torch.Tensor], like: dict[str, torch.Tensor]) -> di
     def widen(one: torch.Tensor, more: int) -> torch.Tensor:
         return torch.nn.functional.pad(one, (0, more)) if more > 0 else one
 
-    return {name: widen(one, like[name].shape[-1] - one.shape[-1]) if one.dim() == 2 else one for name, one in state.items()}
+    return {
+        name: widen(one, like[name].shape[-1] - one.shape[-1]) if one.dim() == 2 else one for name, one in state.items()
+    }
 
 
 def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]:

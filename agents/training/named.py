@@ -25,7 +25,15 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.resolved import flatten
-from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, looks_at_radios, model_of, restore_policy
+from maexp.agents.training.checkpoint import (
+    BEST,
+    NAME,
+    find_checkpoint,
+    is_run,
+    looks_at_radios,
+    model_of,
+    restore_policy,
+)
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 Kind = Literal["classical", "exported", "checkpoint", "start", "own"]

@@ -22,8 +22,8 @@ SETTING = "algorithm.learn_from"
 class ToldRollouts(Rollouts):
     """Rollouts in the true world that count what others are told.
 
-    A branch ends where its episode does. What is known at its end counts on as `lookahead.rest` says, for as long as the
-    episode goes on.
+    A branch ends where its episode does. What is known at its end counts on as `lookahead.rest` says, for as long as
+    the episode goes on.
 
     Args:
         env, config, tracker: as of `Rollouts`.
