@@ -110,13 +110,15 @@ class ExplorationEnv(EnvBase):
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
         shown = settings.observation.targets
-        self.strategy = None if settings.comm.strategy == "opportunistic" else Strategy(self)
+        acts = settings.comm.strategy != "opportunistic"
+        self.strategy = Strategy(self) if acts or settings.tells_of_radios else None
         self.target_view = TargetView(self, shown) if shown else None
         if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
             self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
         info, pictures = info_shapes(settings), settings.observation.pictures
-        self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown)
+        shown, radio = (shown and self.target_view.shown), settings.tells_of_radios
+        self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown, radio)
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
@@ -189,21 +191,23 @@ class ExplorationEnv(EnvBase):
             state["error"] |= bad.to(torch.int32) * ERROR_ACTION
             state["command"].copy_(torch.nan_to_num(control))
         else:
-            region, offset = self._find_goals(action)
+            region, offset, tells = self._find_goals(action)
             if self.strategy is not None:
-                region, offset = self.strategy.direct(region, offset)
+                region, offset = self.strategy.direct(region, offset, tells)
             state["region"].copy_(region)
             state["offset"].copy_(offset)
 
-    def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region and offset of the action, or of the targets that it names instead."""
+    def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Region and offset of the action, or of the targets that it names instead, and who is to tell the base
+        station."""
         if "target" not in action.keys():
             if self.target_view is not None:
                 self.target_view.forget()
-            return action["region"], action["offset"]
+            return action["region"], action["offset"], None
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
-        return self.target_view.take(action["target"], action.get("preference", None))
+        goals = self.target_view.take(action["target"], action.get("preference", None))
+        return *goals, self.target_view.tells
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors

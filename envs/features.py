@@ -26,6 +26,39 @@ FLAG = "0 or 1"
 
 
 @dataclass(frozen=True)
+class Contacts:
+    """What robots know of who was connected when, by their own memory (`maexp.envs.strategy`), and of the base station.
+    Where there is none, or nobody else, its numbers are 0. Connected is also who is so over others.
+
+    Attributes:
+        tells: bool [..., N, M], the candidate that is no frontier: to go to the base station and tell it.
+        untold: what the robot knows and the base station did not know when they were last connected [radar discs],
+            this one and the following [..., N, 1].
+        since: time since then, of the whole time; never counts from the decision before the first.
+        linked: bool, whether they are connected now.
+        way: to the base station [radar ranges].
+        spare: time that is left when the robot gets there, of the whole time.
+        mates_untold, mates_since: the same of the mate that lacks most, and of all mates on average.
+        far: from the candidate to the base station [radar ranges], [..., N, M].
+        signal: how much more than a link needs would arrive there from the base station, by what the robot knows, the
+            unknown as walls [10 dB]; of radios without a signal 1 where they hear each other and -1 where not.
+        mates_far: from the candidate to the nearest place where a mate was last heard [radar ranges], large for none.
+    """
+
+    tells: Array
+    untold: Array
+    since: Array
+    linked: Array
+    way: Array
+    spare: Array
+    mates_untold: Array
+    mates_since: Array
+    far: Array
+    signal: Array
+    mates_far: Array
+
+
+@dataclass(frozen=True)
 class Moment:
     """What is known when N robots of a team choose among M candidates each; `...` are the teams, where there are
     several. What stands for candidates that are absent is left to whoever fills it in.
@@ -53,6 +86,7 @@ class Moment:
         mates: bool [..., N, N], others that move and that a robot hears.
         time_left: share of the whole time, [..., 1, 1], or a number where there is one team.
         area: what the robots know [m^2], [..., 1 or N, 1] or a number.
+        radio: what they know of who has heard what, where they are told (``observation.radio``).
     """
 
     xp: Any
@@ -82,6 +116,17 @@ class Moment:
     mates: Array
     time_left: Array
     area: Array
+    radio: Contacts | None = None
+
+    @cached_property
+    def table(self) -> dict[str, Feature]:
+        """The features that are told."""
+        return TABLE if self.radio is None else TABLE | RADIO_TABLE
+
+    @cached_property
+    def frontiers(self) -> Array:
+        """The candidates that are frontier targets, bool [..., N, M]."""
+        return self.mask if self.radio is None else self.mask & ~self.radio.tells
 
     @cached_property
     def distance(self) -> Array:
@@ -112,9 +157,9 @@ class Moment:
         return self.xp.clip(ranges, None, FAR)
 
     def features(self) -> Array:
-        """[..., N, M, F], in the order of `FEATURES`; 0 where there is no candidate."""
+        """[..., N, M, F], in the order of `feature_names`; 0 where there is no candidate."""
         xp = self.xp
-        columns = [xp.broadcast_to(one.of(self), self.mask.shape) for one in TABLE.values()]
+        columns = [xp.broadcast_to(one.of(self), self.mask.shape) for one in self.table.values()]
         return xp.where(self.mask[..., None], xp.stack(columns, -1), 0.0)
 
 
@@ -161,7 +206,9 @@ TABLE: dict[str, Feature] = {
     "own_last": Feature(lambda now: now.near(now.own_last), RANGES, "to the own latest target"),
     "mates_last": Feature(lambda now: now.near(now.mates_last), RANGES, "to the nearest latest target of another"),
     # The robot and its team, the same for all candidates.
-    "count": Feature(lambda now: now.xp.sum(now.mask, -1)[..., None] / 10.0, "10 candidates", "how many there are"),
+    "count": Feature(
+        lambda now: now.xp.sum(now.frontiers, -1)[..., None] / 10.0, "10 candidates", "how many there are"
+    ),
     "speed": Feature(lambda now: now.speed / now.max_speed, "of max_speed", "speed"),
     "drive": Feature(lambda now: now.drive / now.reach, RANGES, "way driven until the next decision"),
     "time_left": Feature(lambda now: now.time_left, "share of the whole time", "time left"),
@@ -172,6 +219,34 @@ TABLE: dict[str, Feature] = {
 }
 FEATURES = tuple(TABLE)
 """Names of the last axis of the features."""
+
+
+def _log_discs(name: str) -> Callable[[Moment], Array]:
+    return lambda now: now.xp.log1p(now.xp.clip(getattr(now.radio, name), 0.0, None))
+
+
+RADIO_TABLE: dict[str, Feature] = {
+    "tells": Feature(lambda now: 1.0 * now.radio.tells, FLAG, "whether it is to go and tell the base station"),
+    "untold": Feature(_log_discs("untold"), f"log(1 + {DISCS})", "area that the base station lacks"),
+    "base_since": Feature(lambda now: now.radio.since, "share of the whole time", "since it was last connected"),
+    "base_linked": Feature(lambda now: 1.0 * now.radio.linked, FLAG, "whether it is connected now"),
+    "base_way": Feature(lambda now: now.xp.log1p(now.radio.way), f"log(1 + {RANGES})", "way of the robot to it"),
+    "base_spare": Feature(lambda now: now.radio.spare, "share of the whole time", "left when the robot gets there"),
+    "base_far": Feature(lambda now: now.xp.log1p(now.radio.far), f"log(1 + {RANGES})", "from the candidate to it"),
+    "base_signal": Feature(
+        lambda now: now.xp.clip(now.radio.signal, -FAR, FAR), "10 dB", "its signal at the candidate, beyond a link's"
+    ),
+    "mates_untold": Feature(_log_discs("mates_untold"), f"log(1 + {DISCS})", "area that a mate lacks at most"),
+    "mates_since": Feature(lambda now: now.radio.mates_since, "share of the whole time", "since mates were connected"),
+    "mates_far": Feature(lambda now: now.near(now.radio.mates_far), RANGES, "to where the nearest mate was heard"),
+}
+"""What is told besides with ``observation.radio``, after the others; where a policy was trained without it, it looks
+at the others alone."""
+
+
+def feature_names(radio: bool = False) -> tuple[str, ...]:
+    """Names of the last axis of the features, with those of radios or without."""
+    return (*TABLE, *RADIO_TABLE) if radio else FEATURES
 
 
 def drive_until_next(xp: Any, speed: Array, max_accel: Array, max_speed: Array, seconds: float) -> Array:

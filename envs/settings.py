@@ -49,7 +49,7 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
     settings = settings.completed(find_scenario(maps[0].scenario), maps)
     check_bodies(maps, settings.robot)
     comm, faults = settings.comm, settings.faults
-    check_observation(settings.observation, settings.planner)
+    check_observation(settings.observation, settings.planner, comm)
     check_strategy(comm, num_robots, settings.planner)
     check_base(maps, comm)
     check_noise(maps, settings.radar)
@@ -110,8 +110,19 @@ def check_noise(maps: Sequence[PointCloudMap], radars: Sequence[RadarConfig]) ->
                 )
 
 
-def check_observation(config: ObservationConfig, planner: PlannerConfig) -> None:
-    """Raise ValueError if targets are shown to a policy that steers."""
+def check_observation(config: ObservationConfig, planner: PlannerConfig, comm: CommConfig) -> None:
+    """Raise ValueError if targets are shown to a policy that steers, or tell of radios where these always reach."""
+    if config.radio and not config.targets:
+        raise ValueError("observation.radio=true is about targets, and none are shown: add observation.targets=24")
+    if config.radio and not comm.limited:
+        raise ValueError(
+            "observation.radio=true is about radios that do not reach: add comm=ir2, comm.range or the like"
+        )
+    if config.radio and comm.has_base and planner.name != "wavefront":
+        raise ValueError(
+            f"observation.radio=true sends robots to the base station: planner={planner.name} finds no way, use "
+            "wavefront"
+        )
     if config.targets and planner.name == "direct":
         raise ValueError(
             f"planner=direct takes controls, observation.targets={config.targets} shows goals: add action=regions"

@@ -4,7 +4,7 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from maexp.envs.config import EnvSettings
-from maexp.envs.features import FEATURES
+from maexp.envs.features import feature_names
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.types import REGIONS
@@ -66,8 +66,10 @@ def observation_spec(
     info: tuple[dict[str, torch.dtype], dict[str, torch.dtype]],
     pictures: bool = True,
     targets: int = 0,
+    radio: bool = False,
 ) -> Composite:
-    """Observation of every robot, with so many frontier targets to choose from, the team's map, and `info_shapes`."""
+    """Observation of every robot, with so many targets to choose from that tell of radios or not, the team's map, and
+    `info_shapes`."""
     (pictured, merged), regions = picture_shapes(envs, robots), REGIONS
 
     def picture(shape):
@@ -90,7 +92,7 @@ def observation_spec(
         device=device,
     )
     if targets:
-        observation["targets"] = real(envs, robots, targets, len(FEATURES))
+        observation["targets"] = real(envs, robots, targets, len(feature_names(radio)))
         mask = (envs, robots, targets)
         observation["targets_mask"] = Binary(targets, shape=mask, dtype=torch.bool, device=device)
     told = {name: _value((envs, 1), dtype, device) for name, dtype in info[0].items()}

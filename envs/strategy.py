@@ -29,15 +29,20 @@ PATIENCE = 3  # decisions that robots wait for others after the time agreed on
 WORTH = 1.0  # a pursuit pays where the other misses so many radar discs, and
 WAY_COST = 0.3  # as many more for every radar range of way there
 NEAR = 0.5  # a robot this near to a place is there [radar ranges]
+TELLING = ("opportunistic", "return_to_base")  # strategies that leave it to the policy to tell the base station sooner
 
 
 class Strategy:
-    """The strategy of an env's teams.
+    """The strategy of an env's teams, and what robots remember of whom they were connected with.
 
     Args:
         env: the env; only read.
+        name: of the strategy; None: `comm.strategy`.
 
     Attributes:
+        known: int32 [E, N], what robots know; ``linked`` bool [E, N, U], with whom they are connected; ``way``
+            [E, N, U], how far it is back into contact [m]; ``left`` [E, N], how far they still get in the episode [m]:
+            of the last `look`.
         state: tensors that later decisions depend on; U radios, the base station's last. ``met`` int32 [E, N, U], the
             macro step in which a robot was last connected with a radio, -1: never; ``place`` [E, N, U, 2], where that
             was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what it knew
@@ -46,8 +51,8 @@ class Strategy:
             when, where and with whom it has an appointment.
     """
 
-    def __init__(self, env: ExplorationEnv):
-        self.env, self.name, self.given_period = env, env.comm_config.strategy, env.comm_config.period
+    def __init__(self, env: ExplorationEnv, name: str | None = None):
+        self.env, self.name, self.given_period = env, name or env.comm_config.strategy, env.comm_config.period
         s, device = env.simulation.tensors, env.device
         e, n, u = *s["center"].shape[:2], s["known_weight"].shape[1]
         self.has_base, self.robots = env.comm_config.has_base, n
@@ -71,19 +76,34 @@ class Strategy:
         }
 
     @torch.no_grad()
-    def direct(self, region: torch.Tensor, offset: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region [E, N] and offset [E, N, 2] of where robots go, given where their policy sends them."""
-        self._look()
+    def direct(
+        self, region: torch.Tensor, offset: torch.Tensor, tells: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Region [E, N] and offset [E, N, 2] of where robots go, given where their policy sends them; `tells`, bool
+        [E, N]: whom it sends to tell the base station, until they have told it."""
+        self.look()
+        if tells is not None:
+            self.state["duty"] |= tells & self.can_tell()
         duty, goal = getattr(self, f"_{self.name}")()
         self.state["duty"] = duty & (self.sim["collided"] == 0)
         own_region, own_offset = to_action(self.env, goal)
         duty = self.state["duty"]
         return torch.where(duty, own_region, region), torch.where(duty.unsqueeze(-1), own_offset, offset)
 
+    def can_tell(self) -> torch.Tensor:
+        """Robots that may choose to go and tell the base station something that it does not know, bool [E, N]."""
+        if not self.has_base or self.name not in TELLING:
+            return torch.zeros_like(self.state["duty"])
+        return self._has_news(self.robots) & ~self.linked[..., self.robots] & (self.sim["collided"] == 0)
+
+    def busy(self) -> torch.Tensor:
+        """Robots that are on their way to tell, whatever they choose now, bool [E, N]."""
+        return self.state["duty"] & (self.can_tell() if self.name in TELLING else True)
+
     # What a robot knows of the others
 
-    def _look(self) -> None:
-        """Bring the memory up to date: who is connected with whom now."""
+    def look(self) -> None:
+        """Bring the memory up to date: who is connected with whom now. A second time it changes nothing."""
         self.sim = sim = self.env.simulation.believed
         s, n = self.state, self.robots
         self.step = sim["macro_step"].view(-1, 1)
@@ -134,6 +154,12 @@ class Strategy:
         return (0.5 * cost * rest).sqrt()
 
     # The strategies: bool [E, N], who is taken over, and float32 [E, N, 2], where to [m]
+
+    def _opportunistic(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Nobody but who has chosen to tell the base station, until that is done."""
+        if not self.has_base:
+            return torch.zeros_like(self.state["duty"]), self.at
+        return self.state["duty"] & self.can_tell(), self.state["place"][:, :, self.robots]
 
     def _return_to_base(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Who has something to tell reports after `comm.period`, when nothing new comes, and in time before the end.

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDictBase
 
 from maexp.envs.choices import WAY_AHEAD, value_targets
-from maexp.envs.features import AROUND, EDGE, FEATURES, NEAR, Moment
+from maexp.envs.contacts import ContactView
+from maexp.envs.features import AROUND, EDGE, NEAR, Moment, feature_names
 from maexp.envs.targets import TargetTracker, TensorScene, plan_in_turn
 from maexp.kernels.teamwork import compare_with_others, gather_gain
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 class TargetView:
     """The candidates of every robot of an env: `observe` lists them, `take` drives to some.
 
-    M candidates per robot, those of the highest value first; masked where there are fewer.
+    M candidates per robot, those of the highest value first; masked where there are fewer. With `observation.radio`
+    one more follows, the last: to go to the base station and tell it what it does not know (`maexp.envs.contacts`).
 
     Args:
         env: only read.
@@ -29,12 +31,19 @@ class TargetView:
         tracker: of the env's targets, if others look with it too.
 
     Attributes:
+        shown: candidates with that one.
+        contacts: what is told of radios; None: nothing.
+        tells: bool [E, N], who has been sent to tell the base station at the latest `take`.
         state: tensors that later decisions depend on, besides those of the tracker.
     """
 
     def __init__(self, env: ExplorationEnv, count: int, tracker: TargetTracker | None = None):
         self.env, self.count, self.tracker = env, count, tracker or TargetTracker(env)
         shape, device = (env.num_envs, env.num_robots), env.device
+        self.contacts = ContactView(env) if env.settings.tells_of_radios else None
+        self.shown = count + (self.contacts is not None)
+        self.features = len(feature_names(self.contacts is not None))
+        self.tells = torch.zeros(shape, dtype=torch.bool, device=device)
         self.state = {
             "last": torch.zeros((*shape, 2), device=device),  # where each robot's latest target was [m]
             "has_last": torch.zeros(shape, dtype=torch.bool, device=device),
@@ -48,15 +57,19 @@ class TargetView:
 
     @torch.no_grad()
     def observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-        """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them may be chosen.
+        """Candidates now: ``features`` float32 [E, N, M, F] and ``mask`` bool [E, N, M], which of them may be chosen
+        (M + 1 of `shown`).
 
         Without any (the robot has collided, or knows no way to a frontier) the first stands for driving anywhere, and
         is the one choice; its features are 0. ``mask`` int32 [E]: look at these envs only, the others show nothing.
         """
         if mask is None or bool(mask.all()):
             return self.show(self.tracker.look())[0]
-        features = torch.zeros((*self.state["mask"].shape, len(FEATURES)), device=mask.device)
-        blank = {"features": features, "mask": torch.zeros_like(self.state["mask"])}
+        shape = (*self.state["mask"].shape[:2], self.shown)
+        blank = {
+            "features": torch.zeros((*shape, self.features), device=mask.device),
+            "mask": torch.zeros(shape, dtype=torch.bool, device=mask.device),
+        }
         envs = mask.nonzero().squeeze(-1)
         if not len(envs):
             return blank
@@ -78,8 +91,11 @@ class TargetView:
         s["way"] = torch.where(some, scene.travel.gather(2, best), 0.0)
         s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
-        features = self._moment(s, scene, best, some, value.gather(2, best)).features()
-        return {"features": features, "mask": first_if_none(some)}, best
+        moment = self._moment(s, scene, best, some, value.gather(2, best))
+        if self.contacts is not None:
+            self.contacts.look()
+            moment = self.contacts.add_to(moment, nav)
+        return {"features": moment.features(), "mask": first_if_none(moment.mask)}, best
 
     def _moment(
         self,
@@ -158,16 +174,19 @@ class TargetView:
         Raises:
             ValueError: an index that is none.
         """
-        if bool(((index < 0) | (index >= self.count)).any()):
-            raise ValueError(f"action target={int(index.min())}..{int(index.max())}: give 0 to {self.count - 1}")
+        if bool(((index < 0) | (index >= self.shown)).any()):
+            raise ValueError(f"action target={int(index.min())}..{int(index.max())}: give 0 to {self.shown - 1}")
         s = self.state
         named = torch.arange(self.count, device=index.device) == index.unsqueeze(-1)
         there = s["mask"] & (s["mask"] & named).any(-1, keepdim=True)  # who names what is not there drives anywhere
         if preference is None:
             preference = -torch.arange(self.count, device=index.device).float()
+        else:
+            preference = preference[..., : self.count]
         preference = torch.where(named, torch.inf, preference.nan_to_num())
         preference = torch.where(there, preference, -torch.inf)
         chosen, waits = self.tracker.share(preference, s["way"], s["point"])
+        self.tells = index == self.count
         index = chosen.clamp_min(0).unsqueeze(-1)
         self.note(chosen, _pick(s["point"], index).squeeze(2))
         block = torch.where(chosen >= 0, s["block"].gather(2, index).squeeze(-1), -1)

@@ -42,8 +42,8 @@ class Radio:
 
 
 @wp.func
-def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), a: wp.vec2, b: wp.vec2) -> int:
-    """Cells of the map's grid along a line that are no free ground.
+def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin: int, a: wp.vec2, b: wp.vec2) -> int:
+    """Cells of the map's grid along a line that are no free ground; those of the grid start at `begin`.
 
     The line is cut in as many equal pieces as it crosses columns of cells, or rows if those are more; the middle of
     each stands for a cell. So the line there and the line back count the same.
@@ -59,7 +59,7 @@ def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), a: wp
         inside = x >= 0 and y >= 0 and x < grids.width[m] and y < grids.height[m]
         if not inside:
             blocked += 1
-        elif open[grids.cell_begin[m] + y * grids.width[m] + x] == wp.uint8(0):
+        elif open[begin + y * grids.width[m] + x] == wp.uint8(0):
             blocked += 1
     return blocked
 
@@ -90,9 +90,29 @@ def _measure_signals(
 ):
     """Received power without fading, on the first map [dBm]."""
     k = wp.tid()
-    blocked = float(count_blocked(grids, 0, open, senders[k], receivers[k])) * (grids.cell[0] / radio.cell)
+    blocked = float(count_blocked(grids, 0, open, 0, senders[k], receivers[k])) * (grids.cell[0] / radio.cell)
     clear = wp.length(receivers[k] - senders[k]) / radio.cell - blocked
     power[k] = received_power(radio, blocked, clear, 0.0, 0.0)
+
+
+@wp.kernel
+def _count_known_blocked(
+    # Map:
+    grids: NavGrids,
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    # In:
+    open: wp.array(dtype=wp.uint8),  # [env * row * cell], what is known to be free ground
+    rows: int,  # of a team: 1 where all know the same
+    cells: int,  # of a row
+    senders: wp.array(dtype=wp.vec2),  # [env]
+    receivers: wp.array3d(dtype=wp.vec2),  # [env, robot, place]
+    # Out:
+    blocked: wp.array3d(dtype=wp.int32),  # [env, robot, place]
+):
+    """Cells along the lines from a team's sender to places of its robots that are not known to be free ground."""
+    e, i, k = wp.tid()
+    begin = (e * rows + wp.min(i, rows - 1)) * cells
+    blocked[e, i, k] = count_blocked(grids, map_id[e], open, begin, senders[e], receivers[e, i, k])
 
 
 @wp.func
@@ -139,7 +159,7 @@ def _receive_signals(
             high = wp.max(i, other)
             a = point_xy(radio_at(e, low, center, base))
             b = point_xy(radio_at(e, high, center, base))
-            blocked = float(count_blocked(grids, m, open, a, b)) * (grids.cell[m] / radio.cell)
+            blocked = float(count_blocked(grids, m, open, grids.cell_begin[m], a, b)) * (grids.cell[m] / radio.cell)
             clear = wp.length(b - a) / radio.cell - blocked
             key = FADING_KEY + 2 * (low * radios + high)
             through = float(0.0)

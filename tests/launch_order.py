@@ -126,6 +126,10 @@ def setups() -> dict:
             dict(planner=wavefront, comm=CommConfig(range=9.0, base_station=True, bandwidth=400.0, delay=0.2)),
             "voronoi",
         ),
+        "told": (
+            dict(planner=wavefront, comm=base, observation=ObservationConfig(targets=6, radio=True), num_robots=4),
+            "cost_utility",
+        ),
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
         "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
         "false alarms": (

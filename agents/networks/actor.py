@@ -1,6 +1,6 @@
 """`make_policy`: the target generator as a TorchRL actor that fits an environment's specs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tensordict import TensorDict
 from tensordict.nn import InteractionType, TensorDictModule
@@ -12,6 +12,7 @@ from maexp.agents.networks.encoder import compact, pools_pictures
 from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.networks.target_generator import TargetGenerator
 from maexp.agents.settings.model import ModelConfig, model_config
+from maexp.envs.features import FEATURES
 
 MAP = ("agents", "observation", "map")
 POSE = ("agents", "observation", "pose")
@@ -40,11 +41,13 @@ class ObservationShape:
         channels: channels of each robot's picture
         side: regions along one axis (L)
         regions: whether the action is a region and an offset, or else a control vector (planner=direct)
+        radio: whether targets tell of radios
     """
 
     channels: int
     side: int
     regions: bool
+    radio: bool = False
 
 
 def observation_keys(config: ModelConfig) -> list[tuple[str, ...]]:
@@ -74,6 +77,7 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
         channels=spec[MAP].shape[-3] if MAP in spec.keys(True, True) else 0,
         side=spec[GRID].shape[-1],
         regions=(*ACTION, "control") not in actions,
+        radio=TARGETS in spec.keys(True, True) and spec[TARGETS].shape[-1] > len(FEATURES),
     )
 
 
@@ -117,12 +121,12 @@ class ActionParams(nn.Module):
 def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Module, dict[str, type]]:
     """The network of a policy, and the heads of its action."""
     if config.action == "targets":
-        return TargetChooser(config), TARGET_HEADS
+        return TargetChooser(config, shape.radio), TARGET_HEADS
     heads = REGION_HEADS if shape.regions else CONTROL_HEADS
     return TargetGenerator(config, shape.channels, shape.side, shape.regions), heads
 
 
-def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor:
+def make_policy(env, model: "str | ModelConfig" = "small", radio: bool | None = None) -> ProbabilisticActor:
     """The trainable policy of a team, for the action that `env` takes.
 
     It reads ("agents", "observation", ...) and writes ("agents", "params", ...), ("agents", "action", ...)
@@ -136,9 +140,11 @@ def make_policy(env, model: "str | ModelConfig" = "small") -> ProbabilisticActor
     Args:
         env: gives the specs and the device; not kept
         model: a name (small, paper) or a ModelConfig
+        radio: whether it looks at what targets tell of radios; None: if the env shows it
     """
     config = model_config(model)
     shape = observation_shape(env, config)
+    shape = shape if radio is None else replace(shape, radio=radio)
     network, heads = build_network(config, shape)
     joint = heads is REGION_HEADS and config.offsets == "per_region"
     named = ActionParams(network, heads)

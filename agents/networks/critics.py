@@ -129,7 +129,7 @@ def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: st
         if config.critic_encoder == "shared":
             encoder, inputs = SeenReader(config, team), [SEEN]
         else:
-            encoder, inputs = TargetReader(config, team), [TARGETS, TARGETS_MASK, COMM]
+            encoder, inputs = TargetReader(config, team, shape.radio), [TARGETS, TARGETS_MASK, COMM]
         inputs += [TIME_LEFT, ALIVE] + [COVERAGE] * team
     else:
         encoder, inputs = RobotEncoder(config, shape.channels, shape.side, team), observation_keys(config)

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
-from maexp.envs.features import FEATURES
+from maexp.envs.features import FEATURES, feature_names
 from maexp.envs.target_view import first_if_none
 
 SCORE = FEATURES.index("score")
@@ -59,12 +59,13 @@ def attend(parts: Sequence[Tensor], bias: Tensor) -> Tensor:
 
 
 class TargetEncoder(nn.Module):
-    """Every candidate as a vector that knows of the robot's other candidates and of the robots in contact."""
+    """Every candidate as a vector that knows of the robot's other candidates and of the robots in contact; `radio`: of
+    features that tell of radios too."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: ModelConfig, radio: bool = False):
         super().__init__()
-        width, heads = config.target_width, config.target_heads
-        self.inputs = nn.Sequential(nn.Linear(len(FEATURES), width), nn.ReLU(), nn.Linear(width, width))
+        width, heads, count = config.target_width, config.target_heads, len(feature_names(radio))
+        self.inputs = nn.Sequential(nn.Linear(count, width), nn.ReLU(), nn.Linear(width, width))
         self.among_targets = Attention(width, heads)
         self.among_robots = Attention(width, heads)
         self.merge = nn.Sequential(nn.LayerNorm(2 * width), nn.Linear(2 * width, width), nn.ReLU())
@@ -88,13 +89,20 @@ class TargetEncoder(nn.Module):
 
 
 class TargetChooser(nn.Module):
-    """Observations of a team to the logits of every robot's candidates, for any leading shape [*, robots]."""
+    """Observations of a team to the logits of every robot's candidates, for any leading shape [*, robots].
 
-    def __init__(self, config: ModelConfig):
+    Args:
+        config: sizes.
+        radio: it looks at what targets tell of radios, and may choose the last one, to go and tell the base station;
+            otherwise it does neither, where both are shown (``observation.radio``).
+    """
+
+    def __init__(self, config: ModelConfig, radio: bool = False):
         super().__init__()
+        self.radio = radio
         self.score_weight = config.score_weight
         self.shares = config.critic_encoder == "shared"
-        self.encoder = TargetEncoder(config)
+        self.encoder = TargetEncoder(config, radio)
         self.head = nn.Linear(config.target_width, 1)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)
@@ -116,6 +124,9 @@ class TargetChooser(nn.Module):
 
     def _look(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
         """Logits and robots of teams [batch]."""
+        if not self.radio and features.shape[-1] > len(FEATURES):
+            logits, seen = self._look(features[:, :, :-1, : len(FEATURES)], mask[..., :-1], comm)
+            return F.pad(logits, (0, 1), value=NEVER), seen
         some = first_if_none(mask)
         targets, robots = self.encoder(features, some, comm)
         logits = self.score_weight * features[..., SCORE] + OUTPUT_GAIN * self.head(targets).squeeze(-1)
@@ -129,6 +140,7 @@ class TargetReader(nn.Module):
     Args:
         config: sizes
         team: look at the candidates of all robots, whoever hears whom, and at the coverage
+        radio: they tell of radios too
 
     Attributes:
         first_rank: dimensions of its first input from the robots on
@@ -136,10 +148,10 @@ class TargetReader(nn.Module):
 
     first_rank = 3
 
-    def __init__(self, config: ModelConfig, team: bool):
+    def __init__(self, config: ModelConfig, team: bool, radio: bool = False):
         super().__init__()
         self.team = team
-        self.encoder = TargetEncoder(config)
+        self.encoder = TargetEncoder(config, radio)
         extra = 2 + team
         self.wide = nn.Sequential(nn.Linear(2 * config.target_width + extra, config.critic_hidden), nn.ReLU())
 

@@ -19,7 +19,7 @@ from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.runtime.folder import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
-from maexp.envs.features import FEATURES, TABLE
+from maexp.envs.features import RADIO_TABLE, TABLE, feature_names
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.kernels.types import DT
 
@@ -27,7 +27,7 @@ OPSET = 18
 MOST = {"batch": 4096, "robots": 64, "candidates": 1024}
 TEAM = ["batch", "robots"]
 INPUTS = {
-    "features": {"shape": [*TEAM, "candidates", len(FEATURES)], "type": "float32", "is": "see features and units"},
+    "features": {"shape": [*TEAM, "candidates", len(TABLE)], "type": "float32", "is": "see features and units"},
     "mask": {"shape": [*TEAM, "candidates"], "type": "bool", "is": "which candidates there are"},
     "comm": {"shape": [*TEAM, "robots"], "type": "bool", "is": "who hears whom"},
 }
@@ -84,14 +84,16 @@ def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: di
     own = numbers_of_env(env)
     if env.scenario.name in places:
         places[env.scenario.name] = own
+    names, rows = feature_names(chooser.radio), TABLE | RADIO_TABLE
+    features = INPUTS["features"] | {"shape": [*TEAM, "candidates", len(names)]}
     several = len(places) > 1  # lengths count in radar ranges: any will do, those of an imported floor suit robots
     return {
         "format": FORMAT,
         "name": name,
-        "inputs": INPUTS,
+        "inputs": INPUTS | {"features": features},
         "outputs": OUTPUTS,
-        "features": list(FEATURES),
-        "units": {feature: row.unit for feature, row in TABLE.items()},
+        "features": list(names),
+        "units": {name: rows[name].unit for name in names},
         "frames": "distances and bearings are the same in every frame; bearings are taken from a robot's heading",
         "candidates": env.observation_config.targets,
         "model": {
@@ -141,7 +143,7 @@ def to_onnx(chooser: TargetChooser, robots: int) -> bytes:
     """
     batch, team, count = (torch.export.Dim(name, min=1, max=most) for name, most in MOST.items())
     example = {
-        "features": torch.randn(2, max(robots, 2), 5, len(FEATURES)),
+        "features": torch.randn(2, max(robots, 2), 5, len(feature_names(chooser.radio))),
         "mask": torch.ones(2, max(robots, 2), 5, dtype=torch.bool),
         "comm": torch.ones(2, max(robots, 2), max(robots, 2), dtype=torch.bool),
     }

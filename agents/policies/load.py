@@ -46,8 +46,9 @@ def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") 
     Raises:
         UserError: it is unknown, damaged, or of another kind.
     """
-    config, weights = _read_network(*open_policy(word, setting))
-    policy = make_policy(env, config)
+    folder, contract = open_policy(word, setting)
+    config, weights = _read_network(folder, contract)
+    policy = make_policy(env, config, contract.radio)
     find_chooser(policy).load_state_dict(weights)
     return policy.to(env.device)
 
@@ -60,7 +61,7 @@ def load_chooser(word: str, setting: str = "policy") -> tuple[TargetChooser, int
     """
     folder, contract = open_policy(word, setting)
     config, weights = _read_network(folder, contract)
-    chooser = TargetChooser(config).eval()
+    chooser = TargetChooser(config, contract.radio).eval()
     chooser.load_state_dict(weights)
     return chooser, contract.candidates
 
@@ -85,7 +86,7 @@ def _read_network(folder: Path, contract: Contract) -> tuple[ModelConfig, dict[s
     except (KeyError, TypeError, ValueError, SafetensorError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{folder} holds no network that its contract tells of ({reason}): {AGAIN}.") from error
-    wrong = mismatched(TargetChooser(config).state_dict(), weights)
+    wrong = mismatched(TargetChooser(config, contract.radio).state_dict(), weights)
     if wrong:
         raise UserError(
             f"{folder / WEIGHTS} holds another network than its contract tells of ({len(wrong)} tensors differ, first "

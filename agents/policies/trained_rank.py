@@ -1,9 +1,13 @@
-"""What a trained policy thinks of targets, in place of a classical planner's rank: the base of a search."""
+"""What a trained policy thinks of targets, in place of a classical planner's rank: the base of a search.
+
+A policy that may choose to go and tell the base station (`observation.radio`) is asked about targets alone.
+"""
 
 from __future__ import annotations
 
 import torch
 
+from maexp.agents.errors import UserError
 from maexp.agents.policies.load import load_chooser
 from maexp.envs import ExplorationEnv
 from maexp.envs.target_view import TargetView
@@ -22,18 +26,23 @@ class TrainedRank:
         setting: what messages call the word.
 
     Raises:
-        UserError: there is no such policy, or it is damaged.
+        UserError: there is no such policy, it is damaged, or it looks at radios and the env shows nothing of these.
     """
 
     def __init__(self, word: str, env: ExplorationEnv, tracker: TargetTracker, setting: str):
         chooser, count = load_chooser(word, setting)
+        if chooser.radio and not env.settings.tells_of_radios:
+            raise UserError(
+                f"{setting}={word} was trained with observation.radio=true, and the env shows nothing of radios: add "
+                "observation.radio=true."
+            )
         self.chooser = chooser.to(env.device)
         self.view = TargetView(env, count, tracker)
 
     @torch.no_grad()
     def __call__(self, scene: TensorScene) -> torch.Tensor:
         seen, best = self.view.show(scene)
-        logits = self.chooser(seen["features"], seen["mask"], scene.nav.state["comm"])[0]
+        logits = self.chooser(seen["features"], seen["mask"], scene.nav.state["comm"])[0][..., : self.view.count]
         there = self.view.state["mask"]
         worth = torch.where(scene.travel.isfinite(), HIDDEN - scene.travel, -torch.inf)
         shown = torch.where(there, logits / self.chooser.score_weight, -torch.inf)

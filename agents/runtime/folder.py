@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from maexp.envs.choices import rank
-from maexp.envs.features import FEATURES
+from maexp.envs.features import FEATURES, feature_names
 
 from .features import Candidates, Motion, list_candidates
 from .scene import ArrayScene
@@ -37,6 +37,7 @@ class Contract:
         candidates: targets that each robot is shown.
         radar_range, robot_radius: [m].
         motion: how its robots moved.
+        radio: it looks at what targets tell of radios (``observation.radio``).
         content: all that the file says.
     """
 
@@ -45,6 +46,7 @@ class Contract:
     radar_range: float
     robot_radius: float
     motion: Motion
+    radio: bool = False
     content: dict[str, Any] = field(default_factory=dict, repr=False)
 
 
@@ -61,6 +63,12 @@ class LearnedChoice:
     def __init__(self, folder: str | Path):
         folder = Path(folder)
         self.contract = read_contract(folder)
+        if self.contract.radio:
+            raise ValueError(
+                f"{folder} was trained with observation.radio=true: it looks at when robots last heard the base "
+                "station and each other, which planners on robots do not know; use one that was trained without it, or "
+                "play this one in the simulator"
+            )
         try:
             import onnxruntime
         except ImportError:
@@ -115,7 +123,8 @@ def read_contract(folder: Path) -> Contract:
         raise ValueError(f"{folder / CONTRACT} is not JSON: {AGAIN}") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{folder / CONTRACT} is not a contract of the kind {FORMAT}: {AGAIN}")
-    if content.get("features") != list(FEATURES):
+    radio = content.get("features") == list(feature_names(radio=True))
+    if not radio and content.get("features") != list(FEATURES):
         raise ValueError(f"{folder} was made for other features than this version of maexp has: {AGAIN}")
     numbers = [content.get(name) for name in NUMBERS]
     count = content.get("candidates")
@@ -124,7 +133,8 @@ def read_contract(folder: Path) -> Contract:
         raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {AGAIN}")
     read_checked(folder, content, NETWORK)
     radar_range, robot_radius, *motion = map(float, numbers)
-    return Contract(str(content.get("name", folder.name)), count, radar_range, robot_radius, Motion(*motion), content)
+    name = str(content.get("name", folder.name))
+    return Contract(name, count, radar_range, robot_radius, Motion(*motion), radio, content)
 
 
 def read_checked(folder: Path, content: dict[str, Any], file: str) -> bytes:

@@ -119,6 +119,10 @@ class ExpertSettings(AlgorithmSettings):
         4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
     )
     branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
+    learn_from: Literal["union", "base", "everyone"] = setting(
+        "union",
+        "whose knowledge a branch is worth: the team's, the base station's, or that of the robot that knows least",
+    )
     epochs: int = setting(2, "how often a branched decision is learned from, on average", low=1)
     memory: int = setting(20_000, "decisions kept to learn from, of every team size", low=1)
     weight_decay: float = setting(0.1, "of the weights, as in AdamW", low=0)

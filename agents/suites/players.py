@@ -68,7 +68,8 @@ class Player:
         found = self.found
         if found is None:
             return ObservationConfig(pictures=False)
-        return ObservationConfig(map=found.map or "seen", pictures=found.pictures, targets=found.targets or 0)
+        shown = {"map": found.map or "seen", "pictures": found.pictures, "targets": found.targets or 0}
+        return ObservationConfig(**shown, radio=found.radio)
 
     def open(self, env: ExplorationEnv) -> AbstractContextManager[Callable]:
         """The policy for an env; at the end of the context it has done with its guests."""

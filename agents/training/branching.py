@@ -32,6 +32,7 @@ from maexp.agents.networks.distributions import ACTION
 from maexp.agents.policies.lookahead import list_candidates
 from maexp.agents.policies.rollouts import Rollouts, branches_of, pick_places
 from maexp.agents.settings.algorithms import ExpertSettings
+from maexp.agents.training.told import ToldRollouts
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.features import FEATURES
 from maexp.envs.fields import check_settings, setting
@@ -71,13 +72,19 @@ class BranchPlayer:
         env: of the teams; shows targets.
         candidates, horizon: as in `BranchingConfig`.
         seed: of what is tried; None: torch's own generator draws.
+        learn_from: as in `ExpertSettings`.
     """
 
-    def __init__(self, env: ExplorationEnv, candidates: int, horizon: int, seed: int | None = None):
+    def __init__(
+        self, env: ExplorationEnv, candidates: int, horizon: int, seed: int | None = None, learn_from: str = "union"
+    ):
         self.env, self.view = env, env.target_view
         config = replace(env.lookahead_config, candidates=candidates, horizon=horizon)
         branches = branches_of(env, config, self.view.tracker, true_world=True)
-        self.rollouts = Rollouts(branches, config, self.view.tracker)
+        if learn_from == "union":
+            self.rollouts = Rollouts(branches, config, self.view.tracker)
+        else:
+            self.rollouts = ToldRollouts(env, branches, config, self.view.tracker, learn_from)
         self.draw = None if seed is None else torch.Generator().manual_seed(seed)
 
     def try_candidates(
@@ -94,31 +101,56 @@ class BranchPlayer:
             int64 [E, N, K], the candidates tried, the own choice first, -1 = none; float32 [E, N, K], how much more
             than the own choice they were worth [radar discs], NaN where they were not played.
         """
-        s, tracker = self.view.state, self.view.tracker
-        preference = torch.where(s["mask"], preference, -torch.inf)
-        own, waits = tracker.share(preference, s["way"], s["point"])
+        s, tracker, count = self.view.state, self.view.tracker, self.view.count
+        if self.env.strategy is not None:
+            self.env.strategy.look()
+        liked = torch.where(s["mask"], preference[..., :count], -torch.inf)
+        tells = torch.zeros_like(s["has_last"])
+        if self.view.contacts is not None:
+            tells = self.env.strategy.can_tell() & (preference[..., count] > liked.amax(-1))
+            liked = liked.masked_fill(tells.unsqueeze(-1), -torch.inf)  # who tells leaves the targets to others
+        own, waits = tracker.share(liked, s["way"], s["point"])
+        own = torch.where(tells, count, own)
         index = list_candidates(self.rank_for_trial(features), own, self.rollouts.config.candidates)
-        place, there = index.clamp_min(0), index >= 0
-        block = torch.where(there, s["block"].gather(2, place), -1)
-        region, offset = self.rollouts.goals(block, s["cell"].gather(2, place), pick_places(s["toward"], place), waits)
+        there, mine = index >= 0, self._offer(index, waits)
         active = self.env.simulation.tensors["active"] != 0
         active = active if among is None else active & among
         there = there & active.view(-1, 1, 1)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & there[..., :1]
-        mine = {"region": region, "offset": offset, "block": block, "wanted": there}
+        if isinstance(self.rollouts, ToldRollouts) and self.env.strategy is not None:
+            there[..., 1:] &= ~self.env.strategy.busy().unsqueeze(-1)  # whatever they choose is not what they do
         worth = torch.full(index.shape, torch.nan)
         teams = active.nonzero().squeeze(-1)
         for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
-            worth[some] = self._weigh(some, {name: one[some] for name, one in mine.items()})
+            worth[some] = self._weigh(some, {name: one[some] for name, one in (mine | {"wanted": there}).items()})
         return torch.where(there, index, -1), worth - worth[..., :1]
+
+    def _offer(self, index: torch.Tensor, waits: torch.Tensor) -> dict[str, torch.Tensor]:
+        """What each robot may try, as of `Rollouts.weigh`; and "tells" bool [E, N, K], which of it is to go and tell
+        the base station."""
+        s, count = self.view.state, self.view.count
+        place, frontier = index.clamp(0, count - 1), (index >= 0) & (index < count)
+        block = torch.where(frontier, s["block"].gather(2, place), -1)
+        toward = pick_places(s["toward"], place)
+        region, offset = self.rollouts.goals(block, s["cell"].gather(2, place), toward, waits)
+        tells = index == count
+        if self.view.contacts is not None:
+            where = self.view.contacts.goals()
+            region = torch.where(tells, where[0].unsqueeze(-1), region)
+            offset = torch.where(tells.unsqueeze(-1), where[1].unsqueeze(2), offset)
+        return {"region": region, "offset": offset, "block": block, "tells": tells}
 
     def rank_for_trial(self, features: torch.Tensor) -> torch.Tensor:
         """What each robot tries first, float32 [E, N, M]: the best of a classical score whose weight of the way is
-        drawn for every robot, so that near candidates are tried as well as those where there is much to see."""
+        drawn for every robot, so that near candidates are tried as well as those where there is much to see. To tell
+        the base station is always tried."""
         mask = self.view.state["mask"]
         beta = torch.empty(mask.shape[:2]).uniform_(0.0, 0.3, generator=self.draw).unsqueeze(-1)
         value = features[..., SCORE] - beta * features[..., TRAVEL].expm1()
-        return torch.where(mask, value, -torch.inf)
+        if self.view.contacts is None:
+            return torch.where(mask, value, -torch.inf)
+        tells = torch.where(self.env.strategy.can_tell(), -NEVER, -torch.inf).unsqueeze(-1)
+        return torch.cat([torch.where(mask, value[..., :-1], -torch.inf), tells], -1)
 
     def _weigh(self, teams: torch.Tensor, mine: dict[str, torch.Tensor]) -> torch.Tensor:
         """What each robot's candidates are worth while the others keep to their own choices, float32 [T, N, K]."""
@@ -144,7 +176,8 @@ class BranchingActor(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase, env: ExplorationEnv, settings: ExpertSettings):
         super().__init__()
         self.policy, self.share = policy, settings.branch_share
-        self.player = BranchPlayer(env, settings.candidates, settings.branch_horizon)
+        horizon, learn_from = settings.branch_horizon, settings.learn_from
+        self.player = BranchPlayer(env, settings.candidates, horizon, learn_from=learn_from)
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]
 
     @torch.no_grad()

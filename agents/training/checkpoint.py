@@ -144,6 +144,11 @@ def model_of(saved: dict) -> ModelConfig:
     return replace(SIZES[values.pop("preset", "small")], **values)
 
 
+def looks_at_radios(saved: dict) -> bool:
+    """Whether the policy of a checkpoint looks at what targets tell of radios."""
+    return bool(flatten(saved["settings"]).get("observation.radio", False))
+
+
 def check_action(saved: dict, cfg: LearnerSettings) -> None:
     """Refuse weights trained for the other kind of action: goals and controls have tensors of the same shapes.
 
@@ -164,7 +169,7 @@ def restore_policy(env: ExplorationEnv, model: str | ModelConfig, saved: dict) -
     Raises:
         UserError: its weights belong to another network.
     """
-    policy = make_policy(env, model)
+    policy = make_policy(env, model, looks_at_radios(saved))
     load_matching(policy, saved["policy"])
     return policy
 

@@ -100,8 +100,20 @@ def take_weights(run: TrainingRun) -> bool:
         return False
     with blame_input():
         env = make_env(cfg, run.suite.train[:1], run.sizes[0], 1, device=choose_device(cfg, "train_device"))
-        load_matching(run.learner.policy, teacher.make(env).state_dict())
+        own = run.learner.policy
+        load_matching(own, widened(teacher.make(env).state_dict(), own.state_dict()))
     return True
+
+
+def widened(state: dict[str, torch.Tensor], like: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Weights of a policy that is told nothing of radios for one that is: the inputs that it has besides weigh 0."""
+
+    def widen(one: torch.Tensor, more: int) -> torch.Tensor:
+        return torch.nn.functional.pad(one, (0, more)) if more > 0 else one
+
+    return {
+        name: widen(one, like[name].shape[-1] - one.shape[-1]) if one.dim() == 2 else one for name, one in state.items()
+    }
 
 
 def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]:

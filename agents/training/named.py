@@ -25,7 +25,15 @@ from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.resolved import flatten
-from maexp.agents.training.checkpoint import BEST, NAME, find_checkpoint, is_run, model_of, restore_policy
+from maexp.agents.training.checkpoint import (
+    BEST,
+    NAME,
+    find_checkpoint,
+    is_run,
+    looks_at_radios,
+    model_of,
+    restore_policy,
+)
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 Kind = Literal["classical", "exported", "checkpoint", "start", "own"]
@@ -42,6 +50,7 @@ class NamedPolicy:
         build: env -> policy on tensordicts.
         kind: what its word named.
         targets: frontier targets that it is shown; None: it takes what there is.
+        radio: it looks at what these tell of radios.
         pictures: whether it looks, or may look, at pictures; `map` is what these show, None: as set.
         direct: whether it gives controls (planner=direct) and no goals; None: not known.
         source: text that changes with the policy itself, "" for what comes with the package.
@@ -54,6 +63,7 @@ class NamedPolicy:
     build: Callable[[ExplorationEnv], Callable]
     kind: Kind
     targets: int | None = None
+    radio: bool = False
     pictures: bool = False
     map: str | None = None
     direct: bool | None = False
@@ -82,6 +92,11 @@ class NamedPolicy:
                 f"policy {self.name} looks at {self.targets} targets, and the env shows {shown.targets}: "
                 f"make it with observation=ObservationConfig(targets={self.targets}), as a word "
                 f"observation.targets={self.targets}."
+            )
+        if self.radio and not shown.radio:
+            raise UserError(
+                f"policy {self.name} was trained with observation.radio=true, and the env shows nothing of radios: "
+                "add observation.radio=true."
             )
         check_planner(env.planner_config.name, [self])
         return self.build(env)
@@ -119,6 +134,7 @@ def find_player(word: str, setting: str = "policy", name: str | None = None) -> 
         lambda env: load_policy_folder(word, env, setting),
         "exported",
         targets=contract.candidates,
+        radio=contract.radio,
         source=str(contract.content["sha256"]),
         model=read_model(word, setting),
     )
@@ -133,6 +149,7 @@ def _from_checkpoint(word: str, name: str) -> NamedPolicy:
         lambda env: restore_policy(env, model, saved).to(env.device),
         "checkpoint",
         targets=None if regions else settings["observation.targets"],
+        radio=not regions and looks_at_radios(saved),
         pictures=regions,
         map=settings.get("observation.map") if regions else None,
         direct=direct,
@@ -230,6 +247,7 @@ def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> Non
             told = ", ".join(f"{word} {count}" for word, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
         cfg.observation.targets = next(iter(counts.values()))
+    cfg.observation.radio = cfg.observation.radio or any(one.radio for one in players)
     shown = {one.name: one.map for one in players if one.map is not None}
     if len(set(shown.values())) > 1:
         told = ", ".join(f"{word} {what}" for word, what in shown.items())

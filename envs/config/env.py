@@ -93,6 +93,11 @@ class EnvSettings:
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
     @property
+    def tells_of_radios(self) -> bool:
+        """Whether robots are told of radios, and may choose to go and tell the base station."""
+        return self.observation.radio and self.limited
+
+    @property
     def episode_steps(self) -> int:
         """Local steps of a whole episode."""
         return (self.local_steps or 0) * (self.macro_steps or 0)

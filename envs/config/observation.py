@@ -23,3 +23,8 @@ class ObservationConfig(Group):
     targets: int = setting(
         0, "frontier targets that a robot is shown, to choose from; 0: none", low=0, high=MOST_TARGETS
     )
+    radio: bool = setting(
+        False,
+        "targets tell of radios too: who was connected when, what the base station lacks, its signal; and one more "
+        "target is to go and tell it (docs/conditions.md)",
+    )
