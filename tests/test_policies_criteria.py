@@ -33,7 +33,7 @@ def test_more_to_see_is_better_and_out_of_reach_is_never_wanted():
 
 
 def test_the_first_metres_of_a_way_count_most():
-    """A radar range more costs a sixth of a disc at first, a thirtieth of one six ranges on."""
+    """A radar range more costs a seventh of a disc at first, and less than a thirtieth after six."""
     gain = [0.5, 0.6]
     assert best(one_robot([0.0, REACH], gain)) == [0]
     assert best(one_robot([6.0 * REACH, 7.0 * REACH], gain)) == [1]
@@ -120,11 +120,11 @@ def test_all_terms_together_are_those_of_plain_loops(seed):
     np.testing.assert_allclose(rank_by_criteria(replace(tensors, **shown))[0].numpy(), expected, atol=1e-5)
 
 
-def test_the_first_of_equal_wishes_counts():
-    """Two targets alike: the other robot keeps away from the first alone."""
+def test_the_first_of_equal_wishes_counts_and_none_that_is_out_of_reach():
+    """Two targets alike, and one that the other robot would like best and does not get to."""
     scene = pair(15.0)
     scene.points[0, :, 1] = torch.tensor([-15.0, 0.0])
     scene.travel[0, 1] = torch.tensor([5.0, 5.0, INF])
-    scene.gain[0, 1] = 0.8
-    gaps = choices._gap_to_plans(scene, scene.gain.clone(), scene.travel.isfinite())[0, 0]
+    score = torch.tensor([[[0.0, 0.0, 0.0], [-0.8, -0.8, 0.5]]])
+    gaps = choices._gap_to_plans(scene, score, scene.travel.isfinite())[0, 0]
     torch.testing.assert_close(gaps[:2], torch.tensor([0.0, 3.0]))
