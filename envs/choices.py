@@ -23,6 +23,12 @@ REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pul
 WAY_AHEAD = 3.0  # cells from a robot to the point that tells where its way begins
 FAR = 1e5  # longer than any way [m]: puts targets that a robot takes for want of better ones behind all others
 
+# Weights of multi_criteria, in discs of unknown cells (docs/log/2026-11-25-planner-weights.md).
+WAY = 0.2  # taken off for log(1 + radar ranges of travel): the first metres of a way count most
+BEYOND = 0.3  # for each radar range from the target to the middle of what is to be seen: open ground before corners
+APART = 0.06  # for each radar range to the nearest target that another robot wants
+FARTHEST = 4.0  # radar ranges up to which that distance counts
+
 
 class Scene(Protocol):
     """What targets are chosen from. N robots, K targets each; lengths in metres; `...` are the teams, where there are
@@ -38,6 +44,7 @@ class Scene(Protocol):
         points: [..., N, K, 2] or [K, 2], where the targets are.
         size: [..., N, K] or [K], frontier cells behind each.
         gain: [..., N, K] or [K], unknown cells in radar range and sight of each, as a share of the radar's disc.
+        middle: [..., N, K, 2] or [K, 2], the middle of those, from the target.
     """
 
     xp: Any
@@ -49,6 +56,7 @@ class Scene(Protocol):
     points: Array
     size: Array
     gain: Array
+    middle: Array
 
     def ways_ahead(self, cells: float) -> Array:
         """[..., N, K, 2], from each robot to the point so many cells along its way to each target."""
@@ -89,6 +97,20 @@ def rank_nearest(scene: Scene) -> Array:
 def rank_by_utility(scene: Scene) -> Array:
     """Unknown area around the target against the way there; a target taken lowers what others near it offer."""
     return _rank_in_turn(scene, scene.gain, value_targets(scene), scene.xp.isfinite(scene.travel))
+
+
+def rank_by_criteria(scene: Scene) -> Array:
+    """A weighted sum of criteria: what is to be seen, the way there, what lies beyond, how far the others stay.
+
+    In the manner of Basilico and Amigoni (2011). Robots choose in turn as in `rank_by_utility`; then each keeps away
+    from where the others would go.
+    """
+    xp, some = scene.xp, scene.xp.isfinite(scene.travel)
+    travel = xp.where(some, scene.travel, 0.0) / scene.radar_range
+    beyond = xp.linalg.norm(scene.middle, axis=-1) / scene.radar_range
+    value = scene.gain - WAY * xp.log1p(travel) + BEYOND * beyond
+    score = scene.in_turn(scene.gain, xp.where(some, value, -xp.inf))
+    return rank(scene, score + APART * _gap_to_plans(scene, score, some), some)
 
 
 def rank_by_tree(scene: Scene) -> Array:
@@ -137,6 +159,22 @@ def rank_by_force(scene: Scene) -> Array:
     return rank(scene, pull * (1.0 + along), worth)
 
 
+def _gap_to_plans(scene: Scene, score: Array, some: Array) -> Array:
+    """From each target to the nearest one that another robot would take by the `score` [radar ranges], at most
+    `FARTHEST`, [..., N, K]."""
+    xp = scene.xp
+    score = xp.where(some, score, -xp.inf)
+    best = some & (score == xp.amax(score, axis=-1, keepdims=True))
+    best = best & (xp.cumsum(best, axis=-1) == 1)  # of equals the first
+    plan = xp.sum(xp.where(best[..., None], scene.points, 0.0), axis=-2)
+    plan = xp.where(xp.any(some, axis=-1)[..., None], plan, xp.inf)
+    plans = scene.heard(plan, xp.inf)[..., None, :, :]  # [..., N or 1, 1, N, 2]
+    gap = xp.linalg.norm(scene.points[..., None, :] - plans, axis=-1) / scene.radar_range
+    number = xp.cumsum(scene.alive | True, axis=-1)
+    others = number[..., :, None] != number[..., None, :]
+    return xp.clip(xp.amin(xp.where(others[..., :, None, :], gap, xp.inf), axis=-1), None, FARTHEST)
+
+
 def of_each(xp: Any, values: Array) -> Array:
     """What is each robot's own of values in the team of those that it hears: `Scene.heard` -> [..., N, K]."""
     index = xp.arange(values.shape[-2])
@@ -170,6 +208,7 @@ def rank(scene: Scene, score: Array, among: Array) -> Array:
 CLASSICAL: dict[str, Callable[[Scene], Array]] = {
     "nearest_frontier": rank_nearest,
     "cost_utility": rank_by_utility,
+    "multi_criteria": rank_by_criteria,
     "potential_field": rank_by_force,
     "rrt_frontiers": rank_by_tree,
     "voronoi": rank_by_area,

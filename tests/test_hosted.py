@@ -224,7 +224,7 @@ def test_goals_in_metres_are_the_bits_of_the_planners(policy, monkeypatch):
     assert not torch.equal(before, env.simulation.tensors["center"])
 
 
-@pytest.mark.parametrize("policy", ["nearest_frontier", "cost_utility", "voronoi", "potential_field"])
+@pytest.mark.parametrize("policy", ["nearest_frontier", "cost_utility", "multi_criteria", "voronoi", "potential_field"])
 def test_our_planners_through_a_process_take_the_targets_that_they_take_inside(policy, monkeypatch):
     """At every moment of an episode: the runtime's planner, through observation, wire and process, sends each robot
     where the env's planner sends it. (`hungarian`: of assignments alike, any.)"""

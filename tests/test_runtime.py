@@ -88,7 +88,7 @@ def test_targets_ways_and_gains_are_those_of_the_kernels(name):
 def test_robots_take_the_targets_that_the_policies_take(name):
     for now in cases(name):
         nav = now.nav
-        for policy in ("nearest_frontier", "cost_utility", "voronoi", "potential_field", "hungarian"):
+        for policy in ("nearest_frontier", "cost_utility", "multi_criteria", "voronoi", "potential_field", "hungarian"):
             # Of several assignments with the same total any will do, and others are then in each other's way.
             distinct = policy != "hungarian"
             plan = TeamPlanner(policy, distinct=distinct, **now.settings).plan(**now.call)
