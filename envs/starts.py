@@ -131,11 +131,10 @@ def check_starts(env, poses) -> np.ndarray:
     poses = np.broadcast_to(poses, (envs, robots, 3)).copy()
     poses[..., 2] = (poses[..., 2] + math.pi) % (2.0 * math.pi) - math.pi
     shown = poses[:1] if np.array_equal(poses, np.broadcast_to(poses[:1], poses.shape)) else poses
-    _blame(env, shown, ~np.isfinite(shown).all(-1), lambda e, i: "is not finite: give numbers")
+    _blame(shown, ~np.isfinite(shown).all(-1), lambda e, i: "is not finite: give numbers")
     for m in env.maps:
         wall = _in_wall(env, m, shown)
         _blame(
-            env,
             shown,
             wall,
             lambda e, i, m=m: (
@@ -148,13 +147,11 @@ def check_starts(env, poses) -> np.ndarray:
             ),
         )
     with_other = _on_top(env, shown)
-    _blame(
-        env, shown, with_other.any(-1), lambda e, i: f"collides with robot {with_other[e, i].argmax()}: move them apart"
-    )
+    _blame(shown, with_other.any(-1), lambda e, i: f"collides with robot {with_other[e, i].argmax()}: move them apart")
     return poses.astype(np.float32)
 
 
-def _blame(env, poses: np.ndarray, wrong: np.ndarray, why) -> None:
+def _blame(poses: np.ndarray, wrong: np.ndarray, why) -> None:
     """ValueError for the first wrong pose, if there is one."""
     if wrong.any():
         e, i = np.unravel_index(wrong.argmax(), wrong.shape)

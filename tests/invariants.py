@@ -224,7 +224,7 @@ class Watch:
     def _count(self, life: Life, now: dict, old: dict, visible: np.ndarray) -> None:
         """Coverage, reward terms and milestones of this local step, by counting flags."""
         env, weight = self.env, life.place.weight
-        cfg, total = env.reward_config, life.place.weight.sum()
+        cfg, total = env.settings.reward, life.place.weight.sum()
         before = life.covered / total
         team = life.seen.any(0)
         found = (visible & ~team) @ weight

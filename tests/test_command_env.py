@@ -45,11 +45,11 @@ def test_the_env_is_that_of_maexp_train(tmp_path):
     (collector,) = run.experience.collectors
     env = make_env(*WORDS)
     assert env.observation_config.targets == 24 and not env.observation_config.pictures
-    assert env.reward_config != RewardConfig(), "action=targets brings reward=time"
+    assert env.settings.reward != RewardConfig(), "action=targets brings reward=time"
     same(env, collector.env)
-    assert make_env(*WORDS, "reward=default").reward_config == RewardConfig()
+    assert make_env(*WORDS, "reward=default").settings.reward == RewardConfig()
     plain = ExplorationEnv(run.suite.train, 3, 2, seed=4)
-    assert plain.reward_config == RewardConfig() and plain.observation_config.pictures
+    assert plain.settings.reward == RewardConfig() and plain.observation_config.pictures
 
 
 def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
@@ -62,7 +62,7 @@ def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
     again = make_env("resume=run")
     assert (again.radar_configs[0].range, again.num_envs, again.num_robots) == (8.0, 3, 2)
     held_out = make_env("checkpoint=run", "num_envs=2", verb="evaluate")
-    assert held_out.reward_config == again.reward_config and held_out.num_envs == 2
+    assert held_out.settings.reward == again.settings.reward and held_out.num_envs == 2
     cfg = compose_config("evaluate", [*words, "policy=voronoi", "episodes=2"])
     first, second = (
         evaluate_all(cfg, env, [find_player("voronoi")], tmp_path / f"kept_{place}")[0].episodes["coverage_auc"]

@@ -151,7 +151,7 @@ def test_settings_reach_the_env_and_the_networks():
     assert (env.num_envs, env.num_robots, env.macro_steps) == (2, 2, 4)
     assert {one.range for one in env.radar_configs} == {7.0}
     assert {one.max_speed for one in env.robot_configs} == {3.0}
-    assert (env.planner_config.name, env.reward_config.collision, env.comm_config.range) == ("dwa", 5.0, 9.0)
+    assert (env.planner_config.name, env.settings.reward.collision, env.comm_config.range) == ("dwa", 5.0, 9.0)
     assert model_settings(cfg).channels == 8
     assert make_learner(cfg, env).updater.settings.lr == 0.5
 

@@ -181,7 +181,7 @@ def branch(env, state, plan, robot: int, crash: bool) -> torch.Tensor:
         td = drive(env, td, control)
         earned.append(td["agents", "reward"][:, robot, 0])
     earned = torch.stack(earned)
-    earned[0] -= crash * V * env.reward_config.collision
+    earned[0] -= crash * V * env.settings.reward.collision
     return earned
 
 

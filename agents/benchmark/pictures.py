@@ -74,7 +74,7 @@ def draw_overview(coverage: dict[str, list], path) -> Path:
         for ax in axes[len(coverage) :]:
             ax.set_axis_off()
         figure.supxlabel("final coverage [%], 95 % interval", fontsize=9)
-        figure.legend(handles=_kinds(figure, coverage), loc="outside upper right", ncols=3, fontsize=8)
+        figure.legend(handles=_kinds(coverage), loc="outside upper right", ncols=3, fontsize=8)
         return save(figure, path)
 
 
@@ -84,7 +84,7 @@ def _draw_point(ax, row: int, found: dict, colour: str, marker: str) -> None:
     ax.errorbar(100 * found["mean"], row, xerr=reach(found, 100), **look)
 
 
-def _kinds(figure: Figure, coverage: dict[str, list]) -> list:
+def _kinds(coverage: dict[str, list]) -> list:
     from matplotlib.lines import Line2D
 
     have = {row[1] for rows in coverage.values() for row in rows}

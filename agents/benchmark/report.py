@@ -54,7 +54,7 @@ class Report:
             for suite in self.suites:
                 self.results(scenario, policy, suite)
 
-    def update(self, done: list[Cell], running: list[Cell]) -> None:
+    def update(self, done: list[Cell]) -> None:
         """Write the tables when a scenario has been through all its policies with a seed."""
         blocks = {(one.seed, one.scenario) for one in done}
         blocks = {one for one in blocks - self._written if self._is_whole(one)}

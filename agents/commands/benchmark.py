@@ -136,7 +136,7 @@ def confirm(cfg: BenchmarkSettings, expected: Estimate) -> None:
 def watch(pool: WorkerPool, progress: "BenchmarkProgress", report: Report) -> None:
     """Show how far it is; write the tables whenever a scenario has been through all policies."""
     progress.look(pool)
-    report.update(pool.outcome.done, pool.running())
+    report.update(pool.outcome.done)
 
 
 def conclude(report: Report, outcome: Outcome, where: Path, left: int) -> int:

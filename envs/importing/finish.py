@@ -37,7 +37,7 @@ def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOpt
     if (radius := options.robot_radius) is not None:
         told = f"round, {2 * radius:g} m across, collides {radius:g} m and starts {START_CLEARANCE * radius:g} m"
         report.add("robot", f"{told} from walls (robot.radius={radius:g})")
-    _tell_of_density(cleaned.start.cell, source, scenario, report)
+    _tell_of_density(cleaned.start.cell, source, report)
     _warn_of_coarse_cells(cleaned, scenario, options, report)
     report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
     cleaned.tell(report)
@@ -56,7 +56,7 @@ def _grid_at(source: Source, cell: float, report: ImportReport) -> Grid:
     return refine(grid, cell)
 
 
-def _tell_of_density(cell: float, source: Source, scenario: Scenario, report: ImportReport) -> None:
+def _tell_of_density(cell: float, source: Source, report: ImportReport) -> None:
     if cell < source.finest * (1 - 1e-6):
         report.add(
             "density",

@@ -75,7 +75,7 @@ def _plan_rooms(width: int, depth: int, is_office: bool, rng: np.random.Generato
     else:
         _lay_corridor(inside, 0, largest, rng, rooms)
     rooms = _drop_corner(rooms, inside, rng)
-    return _assign_offices(rooms, rng) if is_office else _assign_flat(rooms, rng)
+    return _assign_offices(rooms) if is_office else _assign_flat(rooms, rng)
 
 
 def _cut(room: Room, axis: int, at: int, wall: int = INNER_WALL) -> tuple[Room, Room]:
@@ -178,7 +178,7 @@ def _assign_flat(rooms: list[Room], rng: np.random.Generator) -> list[Room]:
     return [replace(room, kind=kinds.get(k, room.kind)) for k, room in enumerate(rooms)]
 
 
-def _assign_offices(rooms: list[Room], rng: np.random.Generator) -> list[Room]:
+def _assign_offices(rooms: list[Room]) -> list[Room]:
     """Kinds of an office floor."""
     order = _by_area(rooms)
     kinds = {k: "office" for k in order}
