@@ -116,7 +116,7 @@ class Moment:
     mates: Array
     time_left: Array
     area: Array
-    radio: Contacts | None = None
+    radio: Any = None  # `Contacts`
 
     @cached_property
     def table(self) -> dict[str, Feature]:
