@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -10,6 +11,8 @@ from maexp.envs.config.lookahead import LookaheadConfig
 from maexp.envs.fields import check_settings
 
 LOOKAHEAD = "lookahead"
+SEARCH = "maexp.agents.policies.foresight", "Foresight"
+"""Named, not imported: it stands above the runtime, which does without what the simulator needs."""
 
 
 def read_lookahead(given: LookaheadConfig | Mapping[str, Any] | None) -> LookaheadConfig:
@@ -32,16 +35,15 @@ def read_lookahead(given: LookaheadConfig | Mapping[str, Any] | None) -> Lookahe
 
 
 def load_foresight() -> Any:
-    """The class `maexp.agents.policies.foresight.Foresight`.
+    """The class of `SEARCH`.
 
     Raises:
         ValueError: Warp or torch is not installed.
     """
     try:
-        from maexp.agents.policies.foresight import Foresight
+        return getattr(importlib.import_module(SEARCH[0]), SEARCH[1])
     except ImportError as error:
         raise ValueError(
             f"policy={LOOKAHEAD!r} plays the future in the simulator, and {error.name or error} is not installed: "
             "install maexp with all it needs, or choose another policy"
         ) from error
-    return Foresight
