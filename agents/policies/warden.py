@@ -22,6 +22,7 @@ MARK = "MAEXP_GUEST"  # variable of the environment by which a process and all t
 ROUNDS = 100
 LOOK = 0.5  # seconds between two looks at the run
 SURE = 3.0  # seconds for which nothing may be left: a process that was just being started has no mark yet
+_WARDENS: list[subprocess.Popen] = []  # kept: they outlive us
 
 
 @cache
@@ -30,23 +31,10 @@ def watch(run: int) -> str:
     mark = uuid4().hex
     others = {name: value for name, value in os.environ.items() if name != MARK}  # the run may be a policy's own
     if Path("/proc/self/environ").exists():
-        command = [sys.executable, "-E", "-S", __file__, str(run), mark]
-        nothing = subprocess.DEVNULL
-        _WARDENS.append(
-            subprocess.Popen(
-                command,
-                stdin=nothing,
-                stdout=nothing,
-                stderr=nothing,
-                cwd="/",
-                env=others,
-                start_new_session=True,
-            )
-        )
+        command = [sys.executable, "-E", "-S", str(Path(__file__).resolve()), str(run), mark]
+        files = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        _WARDENS.append(subprocess.Popen(command, cwd="/", env=others, start_new_session=True, **files))
     return mark
-
-
-_WARDENS: list[subprocess.Popen] = []  # kept: they outlive us
 
 
 def end_marked(mark: str) -> bool:
