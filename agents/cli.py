@@ -189,6 +189,7 @@ def overview() -> str:
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
     from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
+    from maexp.agents.settings.checks import check_ranges
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.settings.resolved import describe_radius, without_hydra
@@ -215,6 +216,7 @@ def run_verb(name: str, words: list[str]) -> int:
     recipe = getattr(home, "prepare", Recipe)(overrides)
     composed = compose_recipe(name, recipe)
     cfg = without_hydra(composed)
+    check_ranges(cfg, name)
     if {"-c", "--cfg"} & set(flags):
         print_settings(cfg, name)
         return 0

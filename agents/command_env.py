@@ -5,7 +5,7 @@ from typing import Literal
 from maexp.agents import build
 from maexp.agents.commands.evaluate import find_teams
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.settings.checks import team_sizes
+from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_recipe
 from maexp.agents.settings.overrides import find_override, make_overrides
 from maexp.agents.settings.resolved import without_hydra
@@ -42,6 +42,7 @@ def make_env(
     place = find_override(overrides, RUNS[verb])
     recipe = Recipe(overrides) if place is None else continue_run(*find_checkpoint(place), overrides, verb)
     cfg = without_hydra(compose_recipe(verb, recipe))
+    check_counts(cfg, "num_envs")
     sizes = team_sizes(cfg.num_robots)
     if len(sizes) > 1 or cfg.scenario.also:
         several = f"num_robots={cfg.num_robots}" if len(sizes) > 1 else f"scenario.also={list(cfg.scenario.also)}"

@@ -126,6 +126,7 @@ def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, 
 def test_ctrl_c_in_the_evaluation_after_a_training(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = [*SMALL, "total_frames=8", "episodes=4", "classical=[cost_utility]", "evaluate_every=0"]
+    small += ["evaluate_episodes=2"]
     assert main(["train", *small, "hydra.run.dir=whole"]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)

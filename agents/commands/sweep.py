@@ -132,7 +132,7 @@ def _run_job(cfg: TrainSettings) -> None:
     if list_checkpoints(where / "checkpoints"):
         recipe = train.prepare([f"resume={quote(str(where))}"])
         cfg, overrides = without_hydra(compose_recipe("train", recipe)), without(recipe.words, "hydra", "resume")
-    check_ranges(cfg, "train")  # Hydra composed these settings, not compose_config
+    check_ranges(cfg, "train")  # Hydra made these settings, so that the command has not checked them
     train.check(cfg)
     if train.run(cfg, where, overrides):
         raise KeyboardInterrupt

@@ -23,7 +23,8 @@ def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = ""
 def check_ranges(cfg: DictConfig, verb: str) -> None:
     """Raise UserError for the first setting of a verb, or of its collector, that is out of the range of its field.
 
-    What belongs to an env, an algorithm or a network is checked where that is made.
+    What belongs to an env, an algorithm or a network is checked where that is made. A verb checks what it is run with:
+    settings that only tell it of a run may hold what another verb needs, as episodes=0.
     """
     for kind, node, prefix in ((SCHEMAS[verb], cfg, ""), (CollectorSettings, cfg.get("collector"), "collector.")):
         for one in fields(kind) if node is not None else ():

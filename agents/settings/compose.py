@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents.errors import UserError
-from maexp.agents.settings.checks import check_ranges
+from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.runs import Recipe
 
 KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
@@ -78,7 +78,7 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
         whole: a setting that is left open is an error.
 
     Raises:
-        UserError: an override that does not fit, or a value out of its range.
+        UserError: an override that does not fit, or a seed that is none.
     """
     from maexp.agents.settings.schema import register_schema
 
@@ -92,7 +92,8 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
         raise UserError(explain(error, verb)) from error
     if missing and whole:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
-    check_ranges(cfg, verb)
+    if cfg.get("seed") is not None:
+        check_seed(cfg.seed)
     return cfg
 
 

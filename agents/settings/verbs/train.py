@@ -20,7 +20,7 @@ class TrainSettings(LearnerSettings):
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none", low=0)
     classical: Any = setting(None, "policies played beside the trained team")
     warm_start: str | None = setting(None, "policy to imitate first: a name, a folder, a run or module:function")
-    warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated", low=1, high=10**12)
+    warm_start_frames: int = setting(9_600, "macro steps of teams in which it is imitated", low=1)
     resume: str | None = setting(None, "folder of a run to go on with (its settings are kept)")
     checkpoint_every: int = setting(10, "iterations between two checkpoints", low=1)
     checkpoint_keep: int = setting(3, "newest checkpoints kept, besides the best", low=1)
