@@ -53,12 +53,18 @@ def test_robots_without_a_way_get_no_stop(example):
     assert example["plan"](corridor([40, 60], [10, 90], lost=[0]), False)[0] == []
 
 
-def test_the_first_stop_is_liked_best_and_none_out_of_reach(example):
+def test_the_longest_tour_is_short_rather_than_all_together(example):
+    """A robot could visit both, with 30 m of way; two need 35 m, and 25 m at most."""
+    assert example["plan"](corridor([50, 15], [40, 60]), False) == [[1], [0]]
+
+
+def test_the_first_stop_is_liked_best_and_none_out_of_reach(example, monkeypatch):
     scene = corridor([40, 60], [10, 30, 70, 90])
-    scene.travel[0, 3] = INF
+    scene.travel[0, 0] = INF  # it could go on to there, but must not begin with it
+    monkeypatch.setitem(example["rank_by_tours"].__globals__, "plan", lambda scene, fades: [[1, 0], [2, 3]])
     score = CHOICES["tours"](scene)
-    assert score.argmax(1).tolist() == [1, 2] and score[0, 3] == -INF
-    assert score[0].argsort()[::-1].tolist() == [1, 0, 2, 3], "its own tour, then the nearest of the rest"
+    assert score.argmax(1).tolist() == [1, 2] and score[0, 0] == -INF
+    assert score[0].argsort()[::-1].tolist() == [1, 2, 3, 0] and score[0, 2] < -1e5, "then those of others, by the way"
 
 
 def test_two_opt_turns_parts_round(example):
