@@ -81,7 +81,7 @@ def test_the_values_are_those_of_the_env_and_the_learner():
         for one, radar in zip(map(asdict, env.robot_configs), env.radar_configs, strict=True)
     ] == [{"radius": None} | one for one in shown["robot"]["team"]]
     assert shown["planner"].items() <= asdict(env.planner_config).items()
-    assert shown["reward"] == asdict(env.reward_config) and shown["comm"] == asdict(env.comm_config)
+    assert shown["reward"] == asdict(env.settings.reward) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])
     learner = make_learner(cfg, env)
     mine = {name: value for name, value in asdict(learner.updater.settings).items() if value is not None}
