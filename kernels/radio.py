@@ -100,10 +100,11 @@ def _count_known_blocked(
     # Map:
     grids: NavGrids,
     map_id: wp.array(dtype=wp.int32),  # [env]
-    # In:
-    open: wp.array(dtype=wp.uint8),  # [env * row * cell], what is known to be free ground
+    # Settings:
     rows: int,  # of a team: 1 where all know the same
     cells: int,  # of a row
+    # In:
+    open: wp.array(dtype=wp.uint8),  # [env * row * cell], what is known to be free ground
     senders: wp.array(dtype=wp.vec2),  # [env]
     receivers: wp.array3d(dtype=wp.vec2),  # [env, robot, place]
     # Out:

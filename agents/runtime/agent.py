@@ -11,7 +11,7 @@ from maexp.envs.features import drive_until_next
 
 from .frontiers import look_around
 from .grid import read_grid
-from .planner import TeamPlanner
+from .planner import Plan, TeamPlanner
 
 
 class TeamAgent:
@@ -56,16 +56,9 @@ class TeamAgent:
             time_left=observation["time_left"],
             now=observation["time"],
         )
-        rows, goals = np.flatnonzero(plan.active), np.full((len(plan.names), 2), np.nan)
-        if len(rows):
-            grid = observation["grid"][robot], observation["resolution"], observation["origin"]
-            known = read_grid(*grid, 50.0, [])
-            at, speed = observation["poses"][robot, rows, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
-            limits = (self.episode[name] for name in ("max_accel", "max_speed", "decision_seconds"))
-            drive, target = drive_until_next(np, speed[rows], *limits), plan.goals[rows]
-            _, middle = look_around(known, known.cells(known.from_map(target)), self.episode["radar_range"], True)
-            goals[rows] = go_beyond(target, middle, at, drive)
-        return goals
+        grid = observation["grid"][robot], observation["resolution"], observation["origin"]
+        at, speed = observation["poses"][robot, :, :2], np.linalg.norm(observation["velocities"][robot], axis=-1)
+        return np.where(plan.active[:, None], extend_goals(plan, grid, at, speed, self.episode), np.nan)
 
 
 def planner_options(episode: dict[str, Any]) -> dict[str, Any]:
@@ -82,6 +75,24 @@ def planner_options(episode: dict[str, Any]) -> dict[str, Any]:
         "seed": episode["seed"],
         "patience": 3.0 * episode["decision_seconds"],
     }
+
+
+def extend_goals(plan: Plan, grid: tuple, at: np.ndarray, speed: np.ndarray, episode: dict[str, Any]) -> np.ndarray:
+    """The goals of a plan, those of active robots as of `go_beyond`, float64 [N, 2] [m].
+
+    Args:
+        grid: values [H, W], resolution [m] and origin [m] of what the plan was made on.
+        at, speed: of the robots, [N, 2] [m] and [N] [m/s].
+        episode: of the arena.
+    """
+    goals, rows = plan.goals.copy(), np.flatnonzero(plan.active)
+    if len(rows):
+        known, target = read_grid(*grid, 50.0, []), goals[rows]
+        limits = (episode[name] for name in ("max_accel", "max_speed", "decision_seconds"))
+        drive = drive_until_next(np, speed[rows], *limits)
+        _, middle = look_around(known, known.cells(known.from_map(target)), episode["radar_range"], True)
+        goals[rows] = go_beyond(target, middle, at[rows], drive)
+    return goals
 
 
 def go_beyond(target: np.ndarray, middle: np.ndarray, at: np.ndarray, drive: np.ndarray) -> np.ndarray:

@@ -17,15 +17,15 @@ CELLS_PER_RADIUS = 2.0  # of the smallest robot, at least
 CORNERS = np.ones((3, 3), bool)  # cells that touch at a corner are connected
 
 
-def coarsen(grid: KnownGrid, radius: float, many: int = MANY_CELLS) -> KnownGrid:
-    """A grid of ``many`` cells in blocks of 3 x 3, 5 x 5, ... cells: as few as needed, as large as robots of ``radius``
-    [m] allow, so that no passage closes that they fit through. Others as they are.
+def coarsen(grid: KnownGrid, radius: float, many: int | None = None) -> KnownGrid:
+    """A grid of ``many`` cells (`MANY_CELLS`) in blocks of 3 x 3, 5 x 5, ... cells: as few as needed, as large as
+    robots of ``radius`` [m] allow, so that no passage closes that they fit through. Others as they are.
 
     A block with an obstacle in any of its cells is one, otherwise it is what its middle cell is: so goals and ways lie
     where the fine grid is known to be free. Blocks are counted from the map frame's origin: the same ones as the grid
     grows.
     """
-    largest, side = radius / (CELLS_PER_RADIUS * grid.cell), 1
+    largest, side, many = radius / (CELLS_PER_RADIUS * grid.cell), 1, many or MANY_CELLS
     while grid.known.size > many * side**2 and side + 2 <= largest:
         side += 2
     parts = None if side == 1 else _parts(grid, radius)

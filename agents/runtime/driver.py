@@ -12,7 +12,7 @@ import numpy as np
 
 from maexp.envs.fields import setting
 
-from .agent import go_beyond, planner_options
+from .agent import extend_goals, planner_options
 from .frames import (
     NOWHERE,
     Frames,
@@ -188,17 +188,17 @@ class TeamDriver:
             time_left=self._time_left(now),
             now=round(now - self.begun, 6),
         )
-        goals = plan.goals if self.episode is None else self._go_beyond(plan, what, poses)
+        goals = plan.goals if self.episode is None else self._extend(plan, what, poses)
         return Decision(self._give_orders(plan, goals, now), plan, [*notes, *plan.notes])
 
     def _time_left(self, now: float) -> float:
         limit = self.settings.time_limit if self.episode is None else self.episode["seconds"]
         return 1.0 if limit is None else max(1.0 - round(now - self.begun, 6) / limit, 0.0)
 
-    def _go_beyond(self, plan: Plan, grid: tuple, poses: dict[str, Pose | None]) -> np.ndarray:
+    def _extend(self, plan: Plan, grid: tuple, poses: dict[str, Pose | None]) -> np.ndarray:
         at = np.array([(np.nan, np.nan) if pose is None else pose[:2] for pose in poses.values()])
         speed = np.array([self.speeds.get(name, 0.0) for name in self.robots])
-        return go_beyond(plan, grid, at, speed, self.episode)
+        return extend_goals(plan, grid, at, speed, self.episode)
 
     def _merge(self, notes: list[str]) -> OccupancyGrid | None:
         """The team's map in its frame; None until there is one."""
