@@ -128,7 +128,8 @@ class GridBeliefs(Beliefs):
 
 def room_for(shape: tuple[int, int]) -> tuple[int, int]:
     """Cells along y and x for a grid that may still grow a little."""
-    return tuple(max(LEAST_ROOM, round(ROOM * size)) for size in shape)  # type: ignore[return-value]
+    height, width = (max(LEAST_ROOM, round(ROOM * size)) for size in shape)
+    return height, width
 
 
 def outline_map(shape: tuple[int, int], cell: float, robots: int) -> PointCloudMap:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from maexp.agents.policies.lookahead import list_candidates
+from maexp.agents.policies.lookahead import list_candidates, value_in_turn
 from maexp.agents.policies.rollouts import GUESSES, Rollouts, check_rollout_policy, search_in_turn
 from maexp.agents.runtime.agent import go_beyond
 from maexp.agents.runtime.coarse import coarsen
@@ -18,7 +18,6 @@ from maexp.agents.runtime.grid import KnownGrid
 from maexp.agents.runtime.scene import ArrayScene
 from maexp.agents.runtime.sharing import Shares
 from maexp.agents.runtime.team import Team
-from maexp.envs.choices import value_targets
 from maexp.envs.config import LookaheadConfig, RobotConfig
 from maexp.envs.features import drive_until_next
 from maexp.envs.grid_team import GridTeam, room_for
@@ -152,7 +151,7 @@ class Foresight:
         robots, count, steps = scene.robots, self.config.candidates, self.team.env.local_steps
         index = list_candidates(torch.from_numpy(preference)[None], torch.from_numpy(own)[None], count)[0].numpy()
         there, place = index >= 0, index.clip(0)
-        value = np.take_along_axis(preference if in_discs else scene.in_turn(scene.gain, _value(scene)), place, 1)
+        value = np.take_along_axis(preference if in_discs else value_in_turn(scene), place, 1)
         counts = there & there[:, :1]
         value = np.where(counts, value, 0.0)
         value = np.where(counts, value - value[:, :1], 0.0) * self.discs
@@ -204,8 +203,3 @@ def imagined_steps(radar_range: float, motion: Motion) -> int:
     """Local steps of an imagined decision."""
     seconds = max(motion.seconds, min(AHEAD * radar_range / motion.max_speed, MOST_STEPS * DT))
     return max(1, round(seconds / DT))
-
-
-def _value(scene: ArrayScene) -> np.ndarray:
-    """What targets are worth to `cost_utility` by themselves, float [n, K]; -inf: out of reach."""
-    return np.where(np.isfinite(scene.travel), value_targets(scene), -np.inf)

@@ -21,7 +21,7 @@ from maexp.agents.policies.rollouts import (
 )
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
-from maexp.envs.choices import value_targets
+from maexp.envs.choices import Array, Scene, value_targets
 from maexp.envs.targets import TensorScene
 
 
@@ -88,7 +88,7 @@ class LookaheadPlanner(FrontierPlanner):
         toward, point = (pick_places(one, place) for one in (scene.middle, scene.points))
         block = torch.where(index >= 0, block, -1)
         region, offset = self.rollouts.goals(block, cell, toward, waits)
-        value = (preference if self.trained else _value(scene)).gather(2, place)
+        value = (preference if self.trained else value_in_turn(scene)).gather(2, place)
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & (own >= 0).unsqueeze(-1)
         return {
@@ -120,7 +120,8 @@ def list_candidates(preference: torch.Tensor, own: torch.Tensor, count: int) -> 
     return torch.cat([own.unsqueeze(-1), place[..., 1:]], -1)
 
 
-def _value(scene: TensorScene) -> torch.Tensor:
-    """What targets are worth to `cost_utility` when it is the robot's turn [radar discs], float32 [E, N, T]."""
-    value = torch.where(scene.travel.isfinite(), value_targets(scene), -torch.inf)
-    return scene.in_turn(scene.gain, value)
+def value_in_turn(scene: Scene) -> Array:
+    """What targets are worth to `cost_utility` when it is the robot's turn [radar discs], [..., N, K]; -inf: out of
+    reach."""
+    xp = scene.xp
+    return scene.in_turn(scene.gain, xp.where(xp.isfinite(scene.travel), value_targets(scene), -xp.inf))
