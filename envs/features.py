@@ -1,7 +1,8 @@
 """What a learned choice among frontier targets sees of each, for tensors of many teams as for NumPy arrays of one.
 
 Lengths count in radar ranges and areas in radar discs, so that one policy fits every scenario and team size. The
-features of a candidate contain what the classical planner `cost_utility` would think of it: a policy starts from there.
+features of a candidate contain what the classical planner `cost_utility` would think of it, and what others weigh: a
+policy starts from there.
 
 A feature is a row of `TABLE`: a name, what a function makes of the `Moment`, a unit and a line of meaning. Simulator
 (`maexp.envs.target_view`) and robots (`maexp.agents.runtime.features`) fill in the moment. Imports neither torch nor

@@ -47,8 +47,8 @@ def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
     )
 
 
-def build(env: ExplorationEnv, **settings):
-    model = replace(model_config("small"), action="targets")
+def build(env: ExplorationEnv, starts_from: str = "multi_criteria", **settings):
+    model = replace(model_config("small"), action="targets", starts_from=starts_from)
     settings = ROW.configure(candidates=3, branch_horizon=1, **settings)
     policy, critic = make_policy(env, model), ROW.make_critic(env, model, settings)
     return policy, ROW.make_updater(ROW.make_loss(policy, critic, settings), settings), settings
@@ -100,10 +100,10 @@ def test_memory_and_headroom():
     assert nothing["branched"] == 84 and "advantage_error" not in nothing
 
 
-def test_untrained_it_acts_as_cost_utility_and_tries_without_touching_the_episode():
+def test_untrained_it_acts_as_the_planner_and_tries_without_touching_the_episode():
     """The same episodes with and without branches, and those of the planner that it starts from."""
     env = make_env()
-    policy, _, settings = build(env)
+    policy, _, settings = build(env, "cost_utility")
     actor = BranchingActor(policy, env, replace(settings, branch_share=1.0))
     with torch.no_grad():
         env.set_seed(3)

@@ -115,7 +115,7 @@ def test_a_single_candidate_is_the_rollout_policy():
     env = ExplorationEnv(make_map("maze_small", 1), num_envs=2, num_robots=3, seed=0)
     found = actions(env, LookaheadConfig(candidates=1), 3)
     env = ExplorationEnv(make_map("maze_small", 1), num_envs=2, num_robots=3, seed=0)
-    td = env.rollout(3, POLICIES["cost_utility"](env))
+    td = env.rollout(3, POLICIES["multi_criteria"](env))
     for step in range(3):
         assert torch.equal(found[2 * step], td["agents", "action", "region"][:, step])
         assert torch.equal(found[2 * step + 1], td["agents", "action", "offset"][:, step])
@@ -174,8 +174,8 @@ def test_imagined_decisions_may_be_longer_than_the_env_s(true_world):
         for steps in (20, 4, 4)
     )
     found = [
-        actions(env, LookaheadConfig(horizon=2, prior=0.0, local_steps=steps), 1, true_world)
-        for env, steps in ((long, None), (short, 20), (myopic, None))
+        actions(env, LookaheadConfig("cost_utility", horizon=2, prior=0.0, local_steps=steps), 1, true_world)
+        for env, steps in ((long, None), (short, 20), (myopic, None))  # no target so near that it is driven beyond
     ]
     assert all(torch.equal(a, b) for a, b in zip(found[0], found[1], strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(found[0], found[2], strict=True))

@@ -10,11 +10,12 @@ from worlds import ways_to_blocks
 
 from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.target_chooser import score_by_criteria
 from maexp.agents.policies import POLICIES
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
-from maexp.envs.choices import BETA
+from maexp.envs.choices import BETA, rank_by_criteria
 from maexp.envs.features import FEATURES
 
 MAPS = [make_map("maze_small", k) for k in (0, 3)]
@@ -239,10 +240,33 @@ def test_all_algorithms_learn_to_choose(name):
 
 def test_an_untrained_policy_is_the_classical_planner():
     env = make_env()
-    policy = make_policy(env, ModelConfig(action="targets"))
+    policy = make_policy(env, ModelConfig(action="targets", starts_from="cost_utility"))
     for td in play(env, 3):
         some = td[MASK].any(-1)
         assert torch.equal(policy(td.clone())[ACTION][some], choose(td)[some])
+
+
+def test_by_the_features_of_a_robot_alone_multi_criteria_thinks_the_same():
+    """One robot has nobody to keep away from, and nobody claims anything before it."""
+    env = make_env(4, num_robots=1)
+    view, seen = env.target_view, 0
+    for _ in play(env, 4):
+        scene = view.tracker.look()
+        shown, best = view.show(scene)
+        there = view.state["mask"]
+        planned, learned = rank_by_criteria(scene).gather(2, best), score_by_criteria(shown["features"])
+        assert torch.allclose(planned[there], learned[there], atol=1e-5)
+        seen += int(there.sum())
+    assert seen > 8
+
+
+def test_beside_others_a_policy_starts_from_what_they_leave_and_keeps_apart():
+    features = torch.zeros(2, len(FEATURES))
+    row = {"gain": 0.8, "claimed": 0.25, "travel": math.log(3.0), "unknown_far": 0.5, "plan_gap": 2.0, "score": 9.0}
+    for name, value in row.items():
+        features[0, FEATURES.index(name)] = value
+    expected = 0.8 * 0.75 - 0.2 * math.log(3.0) + 0.3 * 0.5 + 0.06 * 2.0
+    assert score_by_criteria(features).tolist() == pytest.approx([expected, 0.0], abs=1e-6)
 
 
 def test_choices_are_drawn_in_a_collector_and_the_likeliest_elsewhere():

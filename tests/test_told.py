@@ -12,7 +12,7 @@ from maexp.agents.networks.distributions import ACTION
 from maexp.agents.policies.classical import FrontierPlanner
 from maexp.agents.training.branching import NEVER, SCORE, BranchPlayer
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, make_map
-from maexp.envs.choices import rank_by_utility
+from maexp.envs.choices import rank_by_criteria
 
 REACH, DECISIONS, BEFORE, HORIZON = 6.0, 8, 3, 3
 
@@ -48,12 +48,12 @@ def told(env: ExplorationEnv, learner: str) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def play_branch(env: ExplorationEnv, strategy: str, td, likes: torch.Tensor, named: torch.Tensor) -> None:
-    """What a branch plays: a decision as named, int64 [E, N], then cost_utility with the strategy."""
+    """What a branch plays: a decision as named, int64 [E, N], then multi_criteria with the strategy."""
     trackers = {name: one.clone() for name, one in env.target_view.tracker.state.items()}
     wanted = torch.where(torch.arange(9) == named.unsqueeze(-1), -NEVER, likes)
     begin(env, td.clone(), wanted, named)
     env.strategy.name = "return_to_base"  # whatever it was
-    follower, now = FrontierPlanner(env, rank_by_utility), env.target_view.tracker.state
+    follower, now = FrontierPlanner(env, rank_by_criteria), env.target_view.tracker.state
     follower.tracker.state.update(trackers | {name: now[name].clone() for name in ("chosen", "stood")})
     for _ in range(HORIZON - 1):
         step = env.rand_action(td.clone())

@@ -26,7 +26,8 @@ STEEP = 0.5  # error from which it counts linearly [radar discs]: a robot lost i
 class ExpertUpdater(Updater):
     """Regression on the branches found so far: as many minibatches after a batch as its decisions fill, `epochs` times.
 
-    What a target is worth to the policy is its logit over `model.score_weight`: at first the value of `cost_utility`.
+    What a target is worth to the policy is its logit over `model.score_weight`: at first what the planner
+    `model.starts_from` thinks of it.
 
     Attributes:
         memory: the decisions that were branched at, by the number of robots.

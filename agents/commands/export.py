@@ -41,9 +41,9 @@ def run(cfg: ExportSettings, where: Path, overrides: list[str]) -> int:
     with blame_input():
         env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out[:1], sizes[0], 1)
         policy = find_trained(cfg).make(env)
-        find_chooser(policy)
+        starts_from = find_chooser(policy).starts_from
         name, trained = cfg.name or out.absolute().name, describe_training(cfg, saved)
-        card = write_card(name, trained, result_files(cfg, path), cfg.note)
+        card = write_card(name, trained, starts_from, result_files(cfg, path), cfg.note)
         export_policy(policy, env, out, name, card, trained)
     remove_if_empty(where)
     files = ", ".join(f"{file.name} ({file.stat().st_size / 1024:.0f} kB)" for file in sorted(out.iterdir()))

@@ -1,8 +1,8 @@
 """Choice among frontier targets: networks over the candidates of every robot (`maexp.envs.target_view`).
 
 Candidates of one robot attend to each other, then robots in contact to each other, so that one set of weights serves
-any number of candidates and any team. What the classical planner thinks of a candidate goes straight into its logit: an
-untrained policy makes that planner's choices, and learns where to differ.
+any number of candidates and any team. What a classical planner thinks of a candidate goes straight into its logit: an
+untrained policy makes that planner's choices, and learns where to differ (`model.starts_from`).
 """
 
 from collections.abc import Sequence
@@ -13,15 +13,34 @@ from torch.nn import functional as F
 
 from maexp.agents.networks.target_generator import contact_bias
 from maexp.agents.settings.model import ModelConfig
+from maexp.envs.choices import APART, BEYOND, WAY
 from maexp.envs.features import FEATURES, feature_names
 from maexp.envs.target_view import first_if_none
 
 SCORE = FEATURES.index("score")
+GAIN, CLAIMED, TRAVEL = (FEATURES.index(name) for name in ("gain", "claimed", "travel"))
+UNKNOWN_FAR, PLAN_GAP = (FEATURES.index(name) for name in ("unknown_far", "plan_gap"))
 NEARNESS = FEATURES.index("nearness")  # above 0 for every target
 OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
 NEVER = -1e9  # logit of what cannot be chosen
 PART = 96  # teams that are learned from together
 COUNT = 10.0  # candidates that sums are measured in
+
+
+def score_by_utility(features: Tensor) -> Tensor:
+    """What `cost_utility` thinks of targets [radar discs], [*, M] of [*, M, F]."""
+    return features[..., SCORE]
+
+
+def score_by_criteria(features: Tensor) -> Tensor:
+    """What `multi_criteria` would think of them, were the others to choose as `cost_utility` does."""
+    gain = features[..., GAIN] * (1.0 - features[..., CLAIMED])
+    beyond, apart = BEYOND * features[..., UNKNOWN_FAR], APART * features[..., PLAN_GAP]
+    return gain - WAY * features[..., TRAVEL] + beyond + apart
+
+
+STARTS = {"cost_utility": score_by_utility, "multi_criteria": score_by_criteria}
+"""Classical planner -> what it thinks of targets by their features: values of `model.starts_from`."""
 
 
 class Attention(nn.Module):
@@ -100,7 +119,7 @@ class TargetChooser(nn.Module):
     def __init__(self, config: ModelConfig, radio: bool = False):
         super().__init__()
         self.radio = radio
-        self.score_weight = config.score_weight
+        self.starts_from, self.score_weight = config.starts_from, config.score_weight
         self.shares = config.critic_encoder == "shared"
         self.encoder = TargetEncoder(config, radio)
         self.head = nn.Linear(config.target_width, 1)
@@ -129,7 +148,8 @@ class TargetChooser(nn.Module):
             return F.pad(logits, (0, 1), value=NEVER), seen
         some = first_if_none(mask)
         targets, robots = self.encoder(features, some, comm)
-        logits = self.score_weight * features[..., SCORE] + OUTPUT_GAIN * self.head(targets).squeeze(-1)
+        planned = self.score_weight * STARTS[self.starts_from](features)
+        logits = planned + OUTPUT_GAIN * self.head(targets).squeeze(-1)
         seen = torch.cat((add_up(targets, real_ones(features, mask)), robots), dim=-1) if self.shares else robots
         return logits.masked_fill(~some, NEVER), seen
 

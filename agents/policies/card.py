@@ -20,11 +20,12 @@ RESULTS = ("results.json", "summary.json")  # of maexp evaluate, of maexp train
 NEXT = "coverage_auc"  # differences are told in it
 
 
-def write_card(name: str, trained: dict[str, Any], files: list[Path], note: str | None = None) -> str:
+def write_card(name: str, trained: dict[str, Any], starts_from: str, files: list[Path], note: str | None = None) -> str:
     """The card.
 
     Args:
         trained: how it was trained, as in the contract, with the names of its scenarios.
+        starts_from: the planner, as of `ModelConfig`.
         files: results of its evaluations.
         note: what else is to be known of the training.
     """
@@ -34,7 +35,7 @@ def write_card(name: str, trained: dict[str, Any], files: list[Path], note: str 
         f"# {name}",
         "",
         "Chooses which frontier target each robot of a team goes to next. It starts from what the classical planner "
-        "`cost_utility` thinks of a target, and has learned where to differ.",
+        f"`{starts_from}` thinks of a target, and has learned where to differ.",
         "",
         "## Training",
         "",

@@ -99,6 +99,7 @@ def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: di
         "model": {
             "target_width": chooser.head.in_features,
             "target_heads": chooser.encoder.among_targets.heads,
+            "starts_from": chooser.starts_from,
             "score_weight": chooser.score_weight,
         },
         **(numbers_of(find_scenario("pointcloud")) if several else own),

@@ -10,8 +10,8 @@ from maexp.envs.fields import check_settings, setting
 class ModelConfig:
     """What a policy chooses, and the sizes that it shares with the critics.
 
-    `target_...` and `score_weight` belong to a policy that chooses among targets, the other sizes but `critic_hidden`
-    to one that chooses regions.
+    `target_...`, `starts_from` and `score_weight` belong to a policy that chooses among targets, the other sizes but
+    `critic_hidden` to one that chooses regions.
     """
 
     action: Literal["regions", "targets"] = setting(
@@ -19,6 +19,9 @@ class ModelConfig:
     )
     target_width: int = setting(48, "features per target", low=1, high=4096)
     target_heads: int = setting(2, "of the attention over targets; divide target_width", low=1, high=64)
+    starts_from: Literal["cost_utility", "multi_criteria"] = setting(
+        "multi_criteria", "planner whose choices an untrained policy makes"
+    )
     score_weight: float = setting(50.0, "of the classical value of a target in its logit", low=0)
     stem: Literal["pool", "conv"] = setting(
         "pool", "how the picture becomes small: pool averages 4 x 4 pixels, conv learns two strided convolutions"
@@ -58,9 +61,9 @@ class ModelConfig:
     def policy(self) -> dict[str, object]:
         """What a policy's network is made from: two policies that agree in this can take each other's weights."""
         if self.action == "targets":
-            names = ("action", "target_width", "target_heads", "score_weight")
+            names = ("action", "target_width", "target_heads", "starts_from", "score_weight")
         else:
-            critics = ("target_width", "target_heads", "score_weight", "critic_hidden", "critic_encoder")
+            critics = ("target_width", "target_heads", "starts_from", "score_weight", "critic_hidden", "critic_encoder")
             names = tuple(one.name for one in fields(self) if one.name not in critics)
         return {name: getattr(self, name) for name in names}
 

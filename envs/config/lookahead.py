@@ -27,7 +27,7 @@ class LookaheadConfig(Group):
     group = "lookahead"
 
     rollout_policy: str = setting(
-        "cost_utility",
+        "multi_criteria",
         "chooses where no branch is better, and plays on; or a trained one, for which cost_utility plays on",
     )
     candidates: int = setting(
