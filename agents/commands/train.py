@@ -21,7 +21,7 @@ from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
-from maexp.agents.training.imitation import check_warm_start, warm_start
+from maexp.agents.training.imitation import check_warm_start, starts_as, warm_start
 from maexp.agents.training.logs import check_logger, log_results
 from maexp.agents.training.named import NamedPolicy, find_players, suit_observation
 from maexp.agents.training.train import (
@@ -40,10 +40,10 @@ NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
 
 def prepare(overrides: list[str]) -> Recipe:
-    """For resume=RUN: that run's settings, then the new ones."""
+    """For resume=RUN: that run's settings, then the new ones; for warm_start=POLICY: what that one starts from."""
     place = find_override(overrides, "resume")
     if place is None:
-        return Recipe(overrides)
+        return Recipe(overrides, starts_as(find_override(overrides, "warm_start")))
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
     return continue_run(*_resumable(place), overrides, "train")
