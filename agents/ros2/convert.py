@@ -48,7 +48,7 @@ def fill_map(message, frame: str, now: int, values: np.ndarray, resolution: floa
     info = message.info
     info.map_load_time, info.resolution = message.header.stamp, resolution
     info.height, info.width = values.shape
-    fill_pose(info.origin, origin[0], origin[1], 0.0)
+    fill_pose(info.origin, *[*origin, 0.0][:3])
     message.data = values.ravel().tolist()
 
 
