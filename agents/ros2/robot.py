@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from maexp.agents.errors import UserError
 from maexp.agents.ros2.convert import SECOND, fill_map
 from maexp.agents.ros2.dds import Wire
 from maexp.agents.ros2.team import Ros2Team
-from maexp.agents.runtime.frames import read_map, read_time
 from maexp.agents.runtime.robot_driver import RobotDriver
-from maexp.agents.runtime.words import read_word, write_word
+from maexp.agents.runtime.words import write_word
 
 LISTEN = 1.0  # seconds by the wall that mates are waited for in an arena, whose clock stands meanwhile
 
@@ -49,30 +49,19 @@ class Ros2Robot(Ros2Team):
         super()._take_others()
         for name, reader in self.grids.items():
             for message in reader.take():
-                self._hear_map(name, message)
+                self._hear(f"/{name}/maexp/map", self.driver.take_known, name, message)
         for name, reader in self.words.items():
             for message in reader.take():
-                self._hear(name, message.data)
+                if self._hear(f"/{name}/maexp/word", self.driver.take_word, name, message.data):
+                    self.near.add(name)
 
-    def _hear_map(self, name: str, message) -> None:
-        frame = message.header.frame_id.lstrip("/")
+    def _hear(self, topic: str, take: Callable, name: str, what: Any) -> Any:
+        """What the driver makes of what a mate has told; nonsense is noted."""
         try:
-            if frame != self.driver.settings.global_frame:
-                raise ValueError(f"a map in the frame {frame} is not known")
-            self.driver.hear_map(name, read_time(message.header.stamp), read_map(message))
+            return take(name, what)
         except ValueError as error:
-            self._note(f"/{name}/maexp/map: {error}")
-
-    def _hear(self, name: str, text: str) -> None:
-        try:
-            word = read_word(text)
-            if word.name != name:
-                raise ValueError(f"a word of {word.name!r} came")
-        except ValueError as error:
-            self._note(f"/{name}/maexp/word: {error}")
-            return
-        if self.driver.hear(word):
-            self.near.add(name)
+            self._note(f"{topic}: {error}")
+            return None
 
     def _note(self, sentence: str) -> None:
         """Told once; what others wrote does nothing to a terminal."""

@@ -6,9 +6,10 @@ from dataclasses import replace
 from typing import Any
 
 from .driver import DriverSettings, TeamDriver
-from .frames import OccupancyGrid, Pose, merge_grids
+from .frames import OccupancyGrid, Pose, merge_grids, read_map, read_time
 from .planner import Plan
 from .robot import RobotPlanner, Word
+from .words import read_word
 
 
 class RobotDriver(TeamDriver):
@@ -54,9 +55,27 @@ class RobotDriver(TeamDriver):
         self.planner.hear(replace(word, time=self._since(word.time)))
         return True
 
-    def hear_map(self, name: str, time: float, grid: OccupancyGrid) -> None:
-        """Take in what a mate knew at a time [s], in the team's frame."""
-        self.told[name] = time, grid
+    def take_word(self, name: str, text: str) -> bool:
+        """What came on a mate's /NAME/maexp/word, as `write_word` writes it; whether it counts.
+
+        Raises:
+            ValueError: it is none, or not its.
+        """
+        word = read_word(text)
+        if word.name != name:
+            raise ValueError(f"a word of {word.name!r} came")
+        return self.hear(word)
+
+    def take_known(self, name: str, message) -> None:
+        """What came on a mate's /NAME/maexp/map, a nav_msgs/OccupancyGrid in the team's frame.
+
+        Raises:
+            ValueError: it is in another frame, or none.
+        """
+        frame = message.header.frame_id.lstrip("/")
+        if frame != self._root:
+            raise ValueError(f"a map in the frame {frame} is not known")
+        self.told[name] = read_time(message.header.stamp), read_map(message)
 
     def has_heard(self, name: str, now: float) -> bool:
         """Whether a mate has spoken at `now` [s] or since."""
