@@ -297,7 +297,7 @@ def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypa
     seen = {}
     for name in ("a", "b"):
         maps = ["/a/map", "/b/map"]
-        ros = StandIn(robots=["a", "b"], robot=name, radar_range=3.0, robot_radius=[0.2], map_topics=maps)
+        ros = StandIn(robots=["a", "b"], only=name, radar_range=3.0, robot_radius=[0.2], map_topics=maps)
         ros.parameters["offsets"] = [0.0] * 6
         for module, stand_in in ros.modules().items():
             monkeypatch.setitem(sys.modules, module, stand_in)

@@ -64,20 +64,20 @@ def test_words_that_are_none(change):
 
 
 def test_bad_settings_are_named():
-    with pytest.raises(ValueError, match="robot=c is none of the team: robots=a,b"):
-        RobotDriver(DriverSettings(**SETTINGS, robot="c"))
-    with pytest.raises(ValueError, match="robot= must name"):
+    with pytest.raises(ValueError, match="only=c is none of the team: robots=a,b"):
+        RobotDriver(DriverSettings(**SETTINGS, only="c"))
+    with pytest.raises(ValueError, match="only= must name"):
         RobotDriver(DriverSettings(**SETTINGS))
     with pytest.raises(ValueError, match="memory=0.0 must be a number of seconds"):
-        RobotDriver(DriverSettings(**SETTINGS, robot="a", memory=0.0))
-    driver = RobotDriver(DriverSettings(**SETTINGS, robot="b"))
+        RobotDriver(DriverSettings(**SETTINGS, only="a", memory=0.0))
+    driver = RobotDriver(DriverSettings(**SETTINGS, only="b"))
     assert driver.listened == ("/b/map",) and driver.mates == ("a",) and list(driver.own) == ["b"]
     assert not driver.hear(replace(WORD, name="stranger")) and driver.hear(WORD)
     assert isinstance(driver.planner, RobotPlanner) and driver.planner.mates == ("a",)
 
 
 def test_what_was_told_before_an_episode_does_not_count():
-    driver = RobotDriver(DriverSettings(**SETTINGS, robot="b"))
+    driver = RobotDriver(DriverSettings(**SETTINGS, only="b"))
     episode = {"robots": ["a", "b"], "seconds": 60.0, "radar_range": 5.0, "robot_radius": 0.3, "max_speed": 1.0}
     episode |= {"max_accel": 1.0, "decision_seconds": 2.0, "seed": 0}
     driver.hear(replace(WORD, time=5.0))
@@ -116,7 +116,7 @@ class Places:
 
 def robot(name: str, **changes) -> Ros2Robot:
     told: list[str] = []
-    made = Ros2Robot(RobotDriver(DriverSettings(**SETTINGS | {"robot": name} | changes)), Wire(), 5.0, told.append)
+    made = Ros2Robot(RobotDriver(DriverSettings(**SETTINGS | {"only": name} | changes)), Wire(), 5.0, told.append)
     made.notes = told
     return made
 
@@ -234,11 +234,11 @@ def play_served(suite: Path, where: Path, programs: list[str]) -> list[tuple[int
             patch.setenv(name, value)
         others = []
         for k, program in enumerate(programs):
-            words = ["ros2", "team", "robots=robot1,robot2,robot3", f"robot=robot{k + 1}", "answer=300"]
+            words = ["ros2", "team", "robots=robot1,robot2,robot3", f"only=robot{k + 1}", "answer=300"]
             command = [sys.executable, "-c", program, *words, "policy=cost_utility"]
             others.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=where.parent))
         try:
-            words = [f"hydra.run.dir={where}", "answer=240", "stands=240"]
+            words = [f"hydra.run.dir={where}", "answer=120", "stands=120"]
             assert main(["ros2", "serve", str(suite), *words]) == 0
             said = [other.communicate(timeout=120)[0] for other in others]
         finally:

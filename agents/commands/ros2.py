@@ -59,7 +59,7 @@ def check(cfg: Ros2Settings) -> None:
 def make_driver(cfg: Ros2Settings) -> TeamDriver:
     """Of the whole team, or of the one robot that is named."""
     settings = driver_settings(cfg)
-    return RobotDriver(settings) if settings.robot else TeamDriver(settings)
+    return RobotDriver(settings) if settings.only else TeamDriver(settings)
 
 
 def driver_settings(cfg: Ros2Settings) -> DriverSettings:

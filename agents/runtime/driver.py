@@ -38,8 +38,8 @@ class DriverSettings:
     """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
 
     robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
-    robot: str = setting("", "the one that is driven, by what it has heard of the others; default: all, by one plan")
-    memory: float = setting(10.0, "with robot: how long a mate counts after its last word [s]")
+    only: str = setting("", "drives this robot alone, by what it has heard of the others; default: all, by one plan")
+    memory: float = setting(10.0, "with only: how long a mate counts after its last word [s]")
     policy: str = setting("cost_utility", "a planner, a trained policy that ships or the folder of one, lookahead")
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
     global_frame: str = setting("map", "all maps and poses are brought into this frame")
@@ -110,8 +110,8 @@ class TeamDriver:
         robots, count = settings.robots, len(settings.robots)
         if not count or len(set(robots)) < count or not all(robots):
             raise ValueError(f"robots={','.join(robots)} must name the robots of the team, each once")
-        if settings.robot and settings.robot not in robots:
-            raise ValueError(f"robot={settings.robot} is none of the team: robots={','.join(robots)}")
+        if settings.only and settings.only not in robots:
+            raise ValueError(f"only={settings.only} is none of the team: robots={','.join(robots)}")
         self.topics = settings.map_topics or tuple(f"/{name}/map" for name in robots)
         if len(self.topics) not in (1, count):
             raise ValueError(f"map_topics={','.join(self.topics)} must be one for the team, or one for each robot")
@@ -119,7 +119,7 @@ class TeamDriver:
             if len(getattr(settings, name)) not in sizes:
                 wanted = " or ".join(map(str, sizes[1:]))
                 raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
-        self.driven: tuple[str, ...] = (settings.robot,) if settings.robot else robots
+        self.driven: tuple[str, ...] = (settings.only,) if settings.only else robots
         self.listened = tuple(dict.fromkeys(map(self.topic_of, self.driven)))
         self.shared, self.own = Frames(), {name: Frames() for name in self.driven}
         self.begin()

@@ -13,7 +13,7 @@ from .words import read_word
 
 
 class RobotDriver(TeamDriver):
-    """A `TeamDriver` of one robot of a team, `settings.robot`, without a central planner.
+    """A `TeamDriver` of one robot of a team, `settings.only`, without a central planner.
 
     Words carry times of ROS, by the clock that all robots share, and places in the team's frame.
 
@@ -25,10 +25,10 @@ class RobotDriver(TeamDriver):
     """
 
     def __init__(self, settings: DriverSettings):
-        if not settings.robot:
-            raise ValueError("robot= must name the one that is driven")
-        self.name = settings.robot
-        self.mates = tuple(name for name in settings.robots if name != settings.robot)
+        if not settings.only:
+            raise ValueError("only= must name the robot that is driven")
+        self.name = settings.only
+        self.mates = tuple(name for name in settings.robots if name != settings.only)
         self.words: dict[str, Word] = {}  # the last of each mate
         self.told: dict[str, tuple[float, OccupancyGrid]] = {}  # what it knows, in the team's frame, and since when [s]
         super().__init__(settings)

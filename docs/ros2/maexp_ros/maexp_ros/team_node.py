@@ -44,7 +44,7 @@ class TeamNode(Node):
         values = {name: self.get_parameter(name).value for name in PARAMETERS}
         action = values.pop("action")
         settings = read_settings(values)
-        self.driver: TeamDriver = RobotDriver(settings) if settings.robot else TeamDriver(settings)
+        self.driver: TeamDriver = RobotDriver(settings) if settings.only else TeamDriver(settings)
         driver = self.driver
         self.frame = driver.settings.global_frame
         for topic in driver.listened:
