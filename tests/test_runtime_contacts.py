@@ -17,6 +17,7 @@ from maexp.agents.runtime import RobotPlanner, TeamPlanner, Word
 from maexp.agents.runtime.contacts import BASE as STATION
 from maexp.agents.runtime.contacts import Memory, count_blocked, read_comm
 from maexp.agents.runtime.features import list_candidates
+from maexp.agents.runtime.frames import OccupancyGrid
 from maexp.agents.runtime.grid import KnownGrid
 from maexp.envs import CommConfig, ExplorationEnv
 from maexp.envs.features import FEATURES, RADIO_TABLE, feature_names
@@ -296,6 +297,22 @@ def test_robots_take_over_what_a_mate_tells_of_itself(folder):
     assert book.memories["a"].met["b"].place == (3.0, 3.0) and STATION not in book.memories["a"].met
     one.plan(world.grid(), CELL, (0.0, 0.0), (3.2, 3.0), now=1.0, connected={STATION})
     assert book.memories["a"].linked and book.memories["a"].met["b"].used == pytest.approx(0.0)
+
+
+def test_the_base_station_is_heard_as_mates_are(folder):
+    """Its word connects the robot with it and brings its map, and nobody plans for it."""
+    world, robot = World(), RobotPlanner("a", folder, **SETTINGS | RADIO)
+    like(robot.team, 5.0)
+    known = OccupancyGrid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
+    call = (world.grid(), CELL, (0.0, 0.0), (3.0, 3.0))
+    assert robot.plan(*call, now=0.0, share=True).tells.all()
+    robot.hear(Word(STATION, (1.0, 1.0, 0.0), 0.0, 0.5, known))
+    plan = robot.plan(*call, now=1.0, share=True)
+    book = robot.team.book
+    assert plan.done and not plan.tells.any() and book.memories["a"].linked and book.crew == {"a"}
+    assert book.memories["a"].met[STATION].known > 0.5 * (world.truth == 0).sum() * CELL**2
+    robot.plan(*call, now=2.0, share=True)
+    assert not book.memories["a"].linked, "nothing was heard since"
 
 
 def test_blocked_cells_along_a_line():

@@ -67,7 +67,7 @@ class Memory:
     known: float = 0.0
     linked: bool = False
     tells: bool = False
-    met: Mapping[Hashable, Contact] = field(default_factory=dict)
+    met: Mapping[Any, Contact] = field(default_factory=dict)
 
     def since(self, radio: Hashable, used: float, decision: float) -> float:
         """Share of the whole time since they were connected; never counts from the decision before the first."""
@@ -95,7 +95,7 @@ class ContactBook:
     def __init__(self, comm: CommConfig, time_limit: float, motion: Motion, patience: float, pause: float):
         self.comm, self.time_limit, self.motion = comm, time_limit, motion
         self.patience, self.pause = patience, pause
-        self.base = None if comm.base_station is False else np.array(comm.base_station)
+        self.base: Any = None if comm.base_station is False else np.array(comm.base_station)
         self.forget()
 
     def forget(self) -> None:
@@ -165,7 +165,7 @@ class ContactBook:
             free = self.given.get(team.names[robot], -math.inf) <= self.now
             if self.base is not None and memory is not None and free and self._has_news(memory):
                 end = self._nearest(scene, row)
-                gap = np.linalg.norm(scene.grid.centers(end) - scene.at[row]) if end >= 0 else 0.0
+                gap = np.linalg.norm(scene.grid.centers(np.array(end)) - scene.at[row]) if end >= 0 else 0.0
                 result[row] = end if gap > team.radius[robot] else -1
         return result
 

@@ -72,10 +72,11 @@ class RobotPlanner:
         """Forget the past: mates, their maps, what was given up."""
         self.team.reset()
         self.heard, self.grids, self._word = {}, {}, None
-        self._lately: set[Hashable] = set()
+        self._lately = set()
 
     def hear(self, word: Word) -> None:
-        """Take in a mate's word; one that is older than its last changes nothing.
+        """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last
+        changes nothing.
 
         Raises:
             ValueError: it comes from a robot of this one's name.
@@ -127,7 +128,7 @@ class RobotPlanner:
             own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             own = merge_grids([own, *self.grids.values()])
             grid, resolution, origin = own.values, own.resolution, own.origin
-        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory}
+        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
@@ -143,7 +144,7 @@ class RobotPlanner:
     def _take_memories(self) -> None:
         """What mates have told of radios takes the place of what was guessed of them."""
         if self.team.book is not None:
-            self.team.book.crew |= {self.name, *self.mates, *self.heard}
+            self.team.book.crew |= {self.name, *self.mates, *self.heard} - {BASE}
             told = {name: one.memory for name, one in self.heard.items() if one.memory is not None}
             self.team.book.memories |= told
 

@@ -62,7 +62,7 @@ def _number(value: Any, most: float = FURTHEST) -> float:
     return float(value)
 
 
-def _numbers(values: Any, count: int) -> tuple[float, ...]:
+def _numbers(values: Any, count: int) -> Any:
     if not isinstance(values, list) or len(values) != count:
         raise ValueError
     return tuple(map(_number, values))
