@@ -267,8 +267,13 @@ def test_it_is_left_where_the_robot_stands_still_or_is_there(folder):
     assert tells == [True] * 6 + [False] * 2
     assert any("a gave up telling the base station: it did not move for 5 s" in one for one in notes)
     planner.reset()
-    plan = planner.plan(world.grid(), CELL, (0.0, 0.0), {"a": (1.0, 1.0)}, now=0.0)
-    assert not plan.tells.any(), "it is there, and nobody hears it: it goes on"
+    places, tells = [(3.0, 3.0), (1.0, 1.0), (3.0, 3.0), (3.0, 3.0)], []
+    for place, now in zip(places, (0.0, 5.0, 20.0, 5.0 + planner.watch.pause), strict=True):
+        plan = planner.plan(world.grid(), CELL, (0.0, 0.0), {"a": place}, now=now)
+        tells.append(bool(plan.tells[0]))
+        gave = any("gave up telling the base station: nothing was heard of it" in one for one in plan.notes)
+        assert gave == (place == (1.0, 1.0)), plan.notes
+    assert tells == [True, False, False, True], "it is there, and nobody hears it: it goes on for a while"
 
 
 def test_when_nothing_is_left_to_be_seen_what_is_known_is_told(folder):

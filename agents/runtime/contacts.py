@@ -104,6 +104,7 @@ class ContactBook:
         self.crew: set[Hashable] = set()
         self.stood: dict[Hashable, tuple[np.ndarray, float]] = {}  # where and since when robots that tell do not move
         self.given: dict[Hashable, float] = {}  # until when robots have given telling up
+        self.seen: set[Hashable] = set()  # robots whose memory was brought up to date at the last look
 
     def look(self, team: Team, grid: KnownGrid, used: float, links: Links, now: float) -> list[str]:
         """Bring the memory up to date; returns what was given up.
@@ -116,7 +117,7 @@ class ContactBook:
         """
         known = float(np.count_nonzero(grid.known == FREE)) * grid.cell**2
         self.crew |= set(team.names)
-        self.used, self.now, notes = used, now, []
+        self.used, self.now, self.seen, notes = used, now, set(links), []
         places = {name: tuple(at) for name, at in zip(team.names, team.at.tolist(), strict=True) if at[0] == at[0]}
         places = {name: one.at for name, one in self.memories.items()} | places
         if self.base is not None:
@@ -150,15 +151,21 @@ class ContactBook:
         if np.linalg.norm(team.at[robot] - at) >= STEP * team.radius[robot]:
             self.stood[name] = team.at[robot], self.now
         elif self.now - since >= self.patience:
-            del self.stood[name]
-            self.given[name] = self.now + self.pause
-            self.memories[name] = replace(self.memories[name], tells=False)
-            return [f"{team.title(robot)} gave up telling the base station: it did not move for {self.patience:g} s"]
+            return [self._give_up(team, robot, f"it did not move for {self.patience:g} s")]
         return []
 
-    def ends(self, team: Team, scene: ArrayScene) -> np.ndarray:
+    def _give_up(self, team: Team, robot: int, why: str) -> str:
+        """A robot goes on exploring for a while."""
+        name = team.names[robot]
+        self.stood.pop(name, None)
+        self.given[name] = self.now + self.pause
+        self.memories[name] = replace(self.memories[name], tells=False)
+        return f"{team.title(robot)} gave up telling the base station: {why}"
+
+    def ends(self, team: Team, scene: ArrayScene, notes: list[str]) -> np.ndarray:
         """Where the ways of robots end that may go and tell the base station, int64 [n] of the scene's robots: the
-        cell nearest to it that they get to; -1: they may not, or are there already."""
+        cell nearest to it that they get to; -1: they may not, or are there already. Who has come there in vain gives it
+        up for a while; a note of that is added."""
         result = np.full(len(scene.robots), -1)
         for row, robot in enumerate(scene.robots):
             memory = self.memories.get(team.names[robot])
@@ -167,6 +174,8 @@ class ContactBook:
                 end = self._nearest(scene, row)
                 gap = np.linalg.norm(scene.grid.centers(np.array(end)) - scene.at[row]) if end >= 0 else 0.0
                 result[row] = end if gap > team.radius[robot] else -1
+                if memory.tells and result[row] < 0 and team.names[robot] in self.seen:  # others say themselves
+                    notes.append(self._give_up(team, robot, "nothing was heard of it where the way ends"))
         return result
 
     def _nearest(self, scene: ArrayScene, row: int) -> int:

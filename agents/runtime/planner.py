@@ -211,7 +211,7 @@ class TeamPlanner:
             notes.append("the grid holds no free cell yet: robots stay where they are")
             return self._finish(_stay(team, notes))
         notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
-        ends = np.full(len(scene.robots), -1) if self.book is None else self.book.ends(team, scene)
+        ends = np.full(len(scene.robots), -1) if self.book is None else self.book.ends(team, scene, notes)
         shares, events = self._choose(team, scene, time_left, ends)
         plan = _describe(team, scene, shares.taken, notes + events)
         self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
