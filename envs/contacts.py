@@ -7,27 +7,22 @@ is of the true map, or of what others have learned since they were last heard.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
 
-from maexp.envs.choices import BETA, WAY_AHEAD
-from maexp.envs.features import Contacts, Moment
+from maexp.envs.choices import WAY_AHEAD
+from maexp.envs.features import DETOUR, Contacts, Moment, add_telling, predict_margin
 from maexp.envs.navigation import Navigation, to_action
 from maexp.envs.simulation import radio_struct
-from maexp.envs.strategy import DETOUR
 from maexp.kernels.constants import FREE, STRAIGHT, UNREACHED
 from maexp.kernels.launches import launch_named, view
-from maexp.kernels.radio import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS, _count_known_blocked
+from maexp.kernels.radio import _count_known_blocked
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
-
-ZERO = ("gain", "gain_near", "gain_around", "size", "claimed", "planned")
-FAR_AWAY = ("plan_gap", "own_last", "mates_last", "rival")
 
 
 class ContactView:
@@ -52,15 +47,7 @@ class ContactView:
         base = nav.state["base"][:, None, :2]
         to = (base - moment.at).unsqueeze(2)
         way, begin = self._way_to_base(nav, base, to)
-        way = torch.where(can, way / moment.reach, 0.0)
-        blank = torch.zeros_like(way)
-        more = {name: blank for name in ZERO} | {name: torch.full_like(blank, torch.inf) for name in FAR_AWAY}
-        more |= {"mask": can, "travel": way, "to": to, "way": begin, "toward": torch.zeros_like(to)}
-        more |= {"value": -BETA * way, "score": -BETA * way}
-        wider = {
-            name: torch.cat([getattr(moment, name), one.to(getattr(moment, name))], 2) for name, one in more.items()
-        }
-        moment = replace(moment, **wider)
+        moment = add_telling(moment, can, way, begin, to)
         return replace(moment, radio=self._contacts(moment, nav))
 
     def goals(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -124,20 +111,9 @@ class ContactView:
 
     def _signal(self, nav: Navigation, base: torch.Tensor, point: torch.Tensor, gap: torch.Tensor) -> torch.Tensor:
         """As of `Contacts`, float32 [E, N, M]."""
-        comm, margin = self.comm, torch.ones_like(gap)
-        if comm.signal or comm.line_of_sight:
-            blocked = self._count_blocked(nav, base, point)
-        if comm.signal:
-            walls = blocked * (nav.cell_of_env().view(-1, 1, 1) / self.cell)
-            clear = gap / self.cell - walls
-            margin = torch.full_like(gap, comm.power - LOSS - comm.threshold)
-            margin = margin - torch.where(walls > 0.0, BLOCKED_LOSS * walls.clamp_min(1.0).log10(), 0.0)
-            margin = (margin - CLEAR_LOSS * (clear / CLEAR_CELLS).clamp_min(1.0).log10()) / 10.0
-        if comm.line_of_sight:
-            margin = torch.where(blocked > 0, margin.clamp_max(-1.0), margin)
-        if math.isfinite(comm.range):
-            margin = torch.where(gap > comm.range, margin.clamp_max(-1.0), margin)
-        return margin
+        counts = self.comm.signal or self.comm.line_of_sight
+        blocked = self._count_blocked(nav, base, point) if counts else torch.zeros_like(gap)
+        return predict_margin(torch, self.comm, self.cell, gap, blocked, nav.cell_of_env().view(-1, 1, 1))
 
     def _count_blocked(self, nav: Navigation, base: torch.Tensor, point: torch.Tensor) -> torch.Tensor:
         """Cells that are not known to be free between the base station and points, int32 [E, N, M]."""

@@ -13,17 +13,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from maexp.envs.choices import LEAST_GAIN, Array
+from maexp.envs.choices import BETA, LEAST_GAIN, Array
+from maexp.envs.config.comm import CommConfig
+from maexp.kernels.constants import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS
 
 FAR = 4.0  # lengths between targets and robots count up to so many radar ranges
 NEAR, AROUND = 1.0, 2.5  # radar ranges within which the gain of other candidates is added up
+PACE = 0.7  # share of its greatest speed that a robot counts on for its way back
+DETOUR = 1.5  # how much longer than the straight line it takes its way back to be
 EDGE = 1e-4  # added to these: many points of a grid are just so far apart, and rounding must not decide
 RANGES, DISCS, COSINE, SINE = "radar ranges", "radar discs", "cosine, from the heading", "sine, left of the heading"
 FLAG = "0 or 1"
+ZERO = ("gain", "gain_near", "gain_around", "size", "claimed", "planned")
+FAR_AWAY = ("plan_gap", "own_last", "mates_last", "rival")
+"""What the target to tell the base station has nothing of, and is far from."""
 
 
 @dataclass(frozen=True)
@@ -253,3 +260,46 @@ def feature_names(radio: bool = False) -> tuple[str, ...]:
 def drive_until_next(xp: Any, speed: Array, max_accel: Array, max_speed: Array, seconds: float) -> Array:
     """How far robots get until the next decision [m], from their speeds [m/s]."""
     return xp.clip(speed * seconds + 0.5 * max_accel * seconds**2, None, max_speed * seconds)
+
+
+def add_telling(moment: Moment, can: Array, way: Array, begin: Array, to: Array) -> Moment:
+    """The moment with one candidate more, [..., N, M + 1]: to go and tell the base station.
+
+    Args:
+        can: bool [..., N, 1], robots that have this choice.
+        way: [..., N, 1], how far it is [m].
+        begin, to: [..., N, 1, 2], from the robot to a point near the beginning of the way, and to the base station [m].
+    """
+    xp = moment.xp
+    way = xp.where(can, way / moment.reach, 0.0)
+    blank = xp.zeros_like(way)
+    more = dict.fromkeys(ZERO, blank) | {name: xp.full_like(blank, xp.inf) for name in FAR_AWAY}
+    more |= {"mask": can, "travel": way, "to": to, "way": begin, "toward": xp.zeros_like(to)}
+    more |= {"value": -BETA * way, "score": -BETA * way}
+    axis = can.ndim - 1
+    wider = {name: xp.concatenate([getattr(moment, name), one], axis) for name, one in more.items()}
+    return replace(moment, **wider)
+
+
+def predict_margin(xp: Any, comm: CommConfig, cell: float, gap: Array, blocked: Array, edge: Array) -> Array:
+    """How much more than a link needs would arrive over straight lines [10 dB], without fading; of radios without a
+    signal 1 where they hear each other and -1 where not.
+
+    Args:
+        cell: edge of a cell of the signal's model [m].
+        gap: length of the lines [m].
+        blocked: cells along them that are no free ground; any where neither signal nor line of sight counts.
+        edge: of these cells [m], a number or to be broadcast.
+    """
+    margin = xp.ones_like(gap)
+    if comm.signal:
+        walls = blocked * (edge / cell)
+        clear = gap / cell - walls
+        margin = xp.full_like(gap, comm.power - LOSS - comm.threshold)
+        margin = margin - xp.where(walls > 0.0, BLOCKED_LOSS * xp.log10(xp.clip(walls, 1.0, None)), 0.0)
+        margin = (margin - CLEAR_LOSS * xp.log10(xp.clip(clear / CLEAR_CELLS, 1.0, None))) / 10.0
+    if comm.line_of_sight:
+        margin = xp.where(blocked > 0, xp.clip(margin, None, -1.0), margin)
+    if math.isfinite(comm.range):
+        margin = xp.where(gap > comm.range, xp.clip(margin, None, -1.0), margin)
+    return margin

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from maexp.envs.features import DETOUR, PACE
 from maexp.envs.navigation import to_action
 from maexp.kernels import unpack_flags
 from maexp.kernels.types import DT
@@ -22,8 +23,6 @@ from maexp.kernels.types import DT
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
 
-PACE = 0.7  # share of its greatest speed that a robot counts on for its way back
-DETOUR = 1.5  # how much longer than the straight line it takes its way back to be
 IDLE = 2  # decisions without anything new after which a robot has nothing better to do than to tell
 PATIENCE = 3  # decisions that robots wait for others after the time agreed on
 WORTH = 1.0  # a pursuit pays where the other misses so many radar discs, and

@@ -16,5 +16,11 @@ MARGIN_CELLS = 0.5  # distance kept from obstacles beyond the collision threshol
 COMFORT = 2.0  # cells nearer to obstacles than this many clearances are tight: taken where a detour is long
 SNAP_CELLS = 4  # how far a search may start from a robot that stands on a blocked cell, in cells along x and y
 
+# Signals (`maexp.kernels.radio`).
+LOSS = 31.0  # along the first cells [dB]
+BLOCKED_LOSS = 40.0  # of ten times as many blocked cells [dB]
+CLEAR_LOSS = 20.0  # of ten times as many clear cells [dB]
+CLEAR_CELLS = 35.0  # up to so many cost nothing more
+
 # Targets.
 RAYS = 48  # rays that look around from a target

@@ -11,6 +11,7 @@ logarithm is absent where nothing blocks, the second where no more than 35 cells
 
 import warp as wp
 
+from maexp.kernels.constants import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
@@ -20,10 +21,6 @@ from maexp.kernels.types import ROBOTS_PER_WORD, Maps, point_xy
 
 wp.set_module_options(MODULE_OPTIONS)
 
-LOSS = 31.0  # along the first cells [dB]
-BLOCKED_LOSS = 40.0  # of ten times as many blocked cells [dB]
-CLEAR_LOSS = 20.0  # of ten times as many clear cells [dB]
-CLEAR_CELLS = 35.0  # up to so many cost nothing more
 FADING_KEY = 1 << 24  # apart from the numbers that policies draw
 UNION = 0
 BASE = 1

@@ -204,7 +204,7 @@ def test_weights_are_taken_by_a_policy_that_is_told():
     env = make(3, 4, PLACE, comm=CommConfig(range=6.0))  # no base station: nobody may
     td = play(env, env.rand_action, 2)[-1]
     universal = make_policy("universal", env)
-    size = ModelConfig(action="targets")
+    size = ModelConfig(action="targets", starts_from="cost_utility")
     policy = make_policy(env, size)
     policy.load_state_dict(widened(universal.state_dict(), policy.state_dict()))
     assert chooser_of(policy).radio and not chooser_of(universal).radio
@@ -228,7 +228,7 @@ def test_settings_that_do_not_go_together(settings, told):
         ExplorationEnv(WORLD, 1, 1, observation=ObservationConfig(radio=True), comm=CommConfig(range=3.0))
 
 
-def test_exported_it_plays_on_here_and_planners_on_robots_refuse_it(tmp_path):
+def test_exported_it_plays_on_here_and_planners_on_robots_ask_for_the_radios(tmp_path):
     env, plain = make(2, 3, PLACE, comm=HERE), make(2, 3, PLACE, told=False, comm=HERE)
     policy = make_policy(env, ModelConfig(action="targets"))
     torch.nn.init.normal_(chooser_of(policy).head.weight)

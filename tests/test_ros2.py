@@ -122,6 +122,18 @@ def test_grids_of_several_robots_are_merged():
     assert np.array_equal(alike.values, values) and alike.origin == (0.03, 0.01, 0.0)
 
 
+@pytest.mark.parametrize("cell", [0.05, 0.1, 0.07])
+def test_grids_that_go_to_and_fro_do_not_grow(cell):
+    """Robots merge what others have merged, again and again: rounding must not add a row each time."""
+    low, high = -2.5 * cell, 23 * cell
+    own = [frames.OccupancyGrid(floor(), cell, (low, high, 0.0)), frames.OccupancyGrid(floor(), cell, (high, low, 0.0))]
+    told, sizes = list(own), set()
+    for _ in range(30):
+        told = [frames.merge_grids([one, other]) for one, other in zip(own, told[::-1], strict=True)]
+        sizes.add(told[0].values.shape)
+    assert len(sizes) == 1 and (told[0].values >= 0).sum() > (floor() >= 0).sum()
+
+
 def test_goals_and_markers_are_real_messages(conversion):
     way = np.array([[1.0, 1.0], [2.0, 1.0], [2.0, 3.0]])
     pose = blank("geometry_msgs/msg/PoseStamped")
@@ -158,6 +170,7 @@ class StandIn:
     def __init__(self, **parameters):
         self.parameters, self.now, self.told = parameters, 100.0, []
         self.topics, self.sent, self.published, self.cancelled = {}, [], [], []
+        self.told_mates = {}
         self.waiting, self.ready, self.accepts = [], True, True
 
     def place(self, name: str, x: float, y: float, yaw: float = 0.0) -> None:
@@ -180,7 +193,8 @@ class StandIn:
                 ros.topics[topic] = call
 
             def create_publisher(self, kind, topic, depth):
-                return SimpleNamespace(publish=ros.published.append)
+                kept = ros.published if topic == "~/markers" else ros.told_mates.setdefault(topic, [])
+                return SimpleNamespace(publish=kept.append)
 
             def create_timer(self, period, call):
                 ros.timer = (period, call)
@@ -234,7 +248,8 @@ class StandIn:
             "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
             "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
-            "nav_msgs.msg": module(OccupancyGrid=STORE.types[GRID], Odometry=made("nav_msgs/msg/Odometry")),
+            "std_msgs.msg": module(String=made("std_msgs/msg/String")),
+            "nav_msgs.msg": module(OccupancyGrid=made(GRID), Odometry=made("nav_msgs/msg/Odometry")),
             "nav2_msgs.action": module(NavigateToPose=goal),
             "visualization_msgs.msg": module(
                 Marker=made("visualization_msgs/msg/Marker"), MarkerArray=made("visualization_msgs/msg/MarkerArray")
@@ -276,6 +291,39 @@ def test_the_node_sends_goals(team):
         ros.waiting.pop()(None)
     node.decide()
     assert len(ros.sent) == 2 * before  # nav2 ended them: sent anew
+
+
+def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypatch):
+    seen = {}
+    for name in ("a", "b"):
+        maps = ["/a/map", "/b/map"]
+        ros = StandIn(robots=["a", "b"], only=name, radar_range=3.0, robot_radius=[0.2], map_topics=maps)
+        ros.parameters["offsets"] = [0.0] * 6
+        for module, stand_in in ros.modules().items():
+            monkeypatch.setitem(sys.modules, module, stand_in)
+        for module in [one for one in sys.modules if one.startswith("maexp_ros.")]:
+            del sys.modules[module]
+        seen[name] = importlib.import_module("maexp_ros.team_node").TeamNode(), ros
+    (node, ros), (other, others) = seen["a"], seen["b"]
+    assert "/b/map" not in ros.topics and "/b/odom" not in ros.topics and list(node.clients_of) == ["a"]
+    half = floor()
+    half[:, 30:] = -1
+    ros.topics["/a/map"](passed_on(grid(half, 0.1)))
+    others.topics["/b/map"](passed_on(grid(floor(), 0.1)))
+    for here, name, y in ((ros, "a", 1.5), (others, "b", 4.0)):
+        here.place(name, 1.0, y)
+    other.decide()
+    shown = others.told_mates["/b/maexp/map"][-1]
+    shown.data = np.array(shown.data, np.int8)  # as rosbags has it
+    ros.topics["/b/maexp/map"](passed_on(shown))
+    ros.topics["/b/maexp/word"](passed_on(others.told_mates["/b/maexp/word"][-1]))
+    node.decide()
+    known = frames.read_map(ros.told_mates["/a/maexp/map"][-1])
+    assert np.array_equal(known.values, floor())
+    assert node.driver.planner.heard["b"].pose == pytest.approx((1.0, 4.0, 0.0))
+    assert [name for name, _ in ros.sent + others.sent] == ["/a/navigate_to_pose", "/b/navigate_to_pose"]
+    ros.topics["/b/maexp/word"](SimpleNamespace(data="nonsense"))
+    assert "/b/maexp/word: what came is no word of a robot" in ros.told
 
 
 def test_what_is_missing_is_said(team):
@@ -334,10 +382,10 @@ def test_the_package_is_whole():
     for part in ("launch/team.launch.py", "config/team.yaml", "rviz/team.rviz"):
         assert (PACKAGE / part).is_file() and any(node.value == part for node in calls), part
     assert (PACKAGE / "resource" / "maexp_ros").is_file() and "team = maexp_ros.team_node:main" in setup
-    for name in ("maexp_ros/team_node.py", "launch/team.launch.py"):
+    for name in ("maexp_ros/team_node.py", "maexp_ros/mates.py", "launch/team.launch.py"):
         tree = ast.parse((PACKAGE / name).read_text())
         modules = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-        ours = {"__future__", "dataclasses", "functools", "pathlib", "maexp"}
+        ours = {"__future__", "collections", "dataclasses", "functools", "pathlib", "mates", "maexp"}
         assert {module.split(".")[0] for module in modules} - ours <= wanted, name
     yaml.safe_load((PACKAGE / "rviz" / "team.rviz").read_text())
 

@@ -9,6 +9,7 @@ from typing import Any
 from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.driver import DriverSettings, TeamDriver, read_settings
+from maexp.agents.runtime.robot_driver import RobotDriver
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import Ros2Settings
 from maexp.agents.suites.suite import load_suite, suite_names
@@ -52,7 +53,13 @@ def check(cfg: Ros2Settings) -> None:
     with blame_input():
         read_domain(cfg.domain)
         if cfg.task == "team":
-            TeamDriver(driver_settings(cfg))
+            make_driver(cfg)
+
+
+def make_driver(cfg: Ros2Settings) -> TeamDriver:
+    """Of the whole team, or of the one robot that is named."""
+    settings = driver_settings(cfg)
+    return RobotDriver(settings) if settings.only else TeamDriver(settings)
 
 
 def driver_settings(cfg: Ros2Settings) -> DriverSettings:
@@ -98,9 +105,9 @@ def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
 
 
 def _team(cfg: Ros2Settings, wire: Any) -> int:
-    from maexp.agents.ros2.team import Ros2Team
+    from maexp.agents.ros2.robot import make_team
 
-    course = Ros2Team(TeamDriver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
+    course = make_team(make_driver(cfg), wire, cfg.answer, _tell, cfg.goals).run()
     each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" * bool(course.plans)
     print(f"{course.plans} decisions{each}; {course.episodes} episodes of an arena.")
     return 0

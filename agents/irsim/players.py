@@ -123,5 +123,5 @@ class ForeignTeam:
             end = reached[(gap**2).sum(-1).argmin()]
             ways[robot] = trace_from(team.at[robot], known, passable[row], distance[row], end)
             ends[robot], active[robot] = ways[robot][-1], True
-        waits = np.zeros(len(goals), bool)
-        return Plan(team.names, ends, active, waits, ways, np.zeros((0, 2)), False, tuple(notes))
+        none = np.zeros(len(goals), bool)
+        return Plan(team.names, ends, active, none, ways, np.zeros((0, 2)), False, tuple(notes), none.copy())

@@ -8,7 +8,7 @@ import numpy as np
 
 from maexp.agents.irsim.floor import FloorCells
 from maexp.agents.ros2.messages import CLASSES
-from maexp.agents.runtime.frames import NOWHERE, Pose, fill_pose, fill_turn
+from maexp.agents.runtime.frames import NOWHERE, OccupancyGrid, Pose, fill_grid, fill_pose, fill_turn
 
 SECOND = 10**9
 BEAMS = 360
@@ -44,12 +44,9 @@ def transform(parent: str, child: str, now: int, pose: Pose = NOWHERE):
 
 def fill_map(message, frame: str, now: int, values: np.ndarray, resolution: float, origin: tuple) -> None:
     """A nav_msgs/OccupancyGrid of int8 [H, W]."""
-    fill_header(message.header, frame, now)
-    info = message.info
-    info.map_load_time, info.resolution = message.header.stamp, resolution
-    info.height, info.width = values.shape
-    fill_pose(info.origin, origin[0], origin[1], 0.0)
-    message.data = values.ravel().tolist()
+    fill_grid(message, frame, OccupancyGrid(values, resolution, (*origin, 0.0)[:3]))
+    fill_time(message.header.stamp, now)
+    message.info.map_load_time = message.header.stamp
 
 
 def fill_odometry(message, frames: tuple[str, str], now: int, pose: Pose, velocity: tuple[float, float]) -> None:

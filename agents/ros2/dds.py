@@ -77,6 +77,7 @@ TOPICS = {
     "episode": Kind(
         "std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18", 1, latched=True
     ),
+    "word": Kind("std_msgs/msg/String", "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18", 1),
     "status": Kind(
         "action_msgs/msg/GoalStatusArray",
         "6c1684b00f177d37438febe6e709fc4e2b0d4248dca4854946f9ed8b30cda83e",
@@ -85,7 +86,8 @@ TOPICS = {
     ),
     "feedback": Kind(f"{NAVIGATE}_FeedbackMessage"),
 }
-"""By the last part of the topic's name. `episode` is ours: what an arena tells of an episode, as JSON."""
+"""By the last part of the topic's name. Ours are `episode`, what an arena tells of an episode, and `word`,
+what a robot tells its mates; both as JSON."""
 EPISODE = "/maexp/episode"
 SERVICES = {
     "send_goal": f"{NAVIGATE}_SendGoal",

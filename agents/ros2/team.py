@@ -58,8 +58,8 @@ class Ros2Team:
         goals: str = "goal_pose",
     ):
         self.driver, self.wire, self.answer, self.tell = driver, wire, answer, tell
-        robots = driver.settings.robots
-        self.maps = {topic: wire.reader(topic, "map") for topic in driver.topics}
+        robots = driver.driven
+        self.maps = {topic: wire.reader(topic, "map") for topic in driver.listened}
         self.frames = {
             (place, still): wire.reader(f"{'' if place is None else f'/{place}'}/{'tf_static' if still else 'tf'}")
             for place in (None, *robots)

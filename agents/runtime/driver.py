@@ -38,6 +38,8 @@ class DriverSettings:
     """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
 
     robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
+    only: str = setting("", "drives this robot alone, by what it has heard of the others; default: all, by one plan")
+    memory: float = setting(10.0, "with only: how long a mate counts after its last word [s]")
     policy: str = setting("cost_utility", "a planner, a trained policy that ships or the folder of one, lookahead")
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
     global_frame: str = setting("map", "all maps and poses are brought into this frame")
@@ -95,6 +97,10 @@ class TeamDriver:
     Args:
         settings: of the team.
 
+    Attributes:
+        driven: names of the robots that it decides for; ``robots`` of those that take part now.
+        listened: topics of the maps that it takes.
+
     Raises:
         ValueError: a setting is out of range, or the policy unknown.
     """
@@ -104,6 +110,8 @@ class TeamDriver:
         robots, count = settings.robots, len(settings.robots)
         if not count or len(set(robots)) < count or not all(robots):
             raise ValueError(f"robots={','.join(robots)} must name the robots of the team, each once")
+        if settings.only and settings.only not in robots:
+            raise ValueError(f"only={settings.only} is none of the team: robots={','.join(robots)}")
         self.topics = settings.map_topics or tuple(f"/{name}/map" for name in robots)
         if len(self.topics) not in (1, count):
             raise ValueError(f"map_topics={','.join(self.topics)} must be one for the team, or one for each robot")
@@ -111,7 +119,9 @@ class TeamDriver:
             if len(getattr(settings, name)) not in sizes:
                 wanted = " or ".join(map(str, sizes[1:]))
                 raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
-        self.shared, self.own = Frames(), {name: Frames() for name in robots}
+        self.driven: tuple[str, ...] = (settings.only,) if settings.only else robots
+        self.listened = tuple(dict.fromkeys(map(self.topic_of, self.driven)))
+        self.shared, self.own = Frames(), {name: Frames() for name in self.driven}
         self.begin()
 
     def begin(self, episode: dict[str, Any] | None = None, now: float | None = None) -> None:
@@ -122,15 +132,18 @@ class TeamDriver:
                 that it names take part.
             now: when it begins [s]; None: with the first decision.
         """
-        self.episode, given = episode, self.settings.robots
-        self.robots = given if episode is None else tuple(name for name in given if name in episode["robots"])
-        self.planner = TeamPlanner(self.settings.policy, **self._options())
+        self.episode = episode
+        self.robots = tuple(name for name in self.driven if episode is None or name in episode["robots"])
+        self.planner: Any = self._make_planner()
         self.maps: dict[str, Any] = {}
         self.speeds: dict[str, float] = {}
         self.goals: dict[str, np.ndarray] = {}  # that robots drive to
         self.sent: dict[str, float] = {}  # when [s]
         self.places: dict[str, np.ndarray] = {}  # where robots were seen last
         self.begun = now
+
+    def _make_planner(self) -> Any:
+        return TeamPlanner(self.settings.policy, **self._options())
 
     def _options(self) -> dict[str, Any]:
         given, own = self.settings, {} if self.episode is None else planner_options(self.episode)
@@ -181,19 +194,22 @@ class TeamDriver:
         poses = {name: self._find(name, now, notes) for name in self.robots}
         self.places |= {name: np.array(pose[:2]) for name, pose in poses.items() if pose is not None}
         what = grid.values, grid.resolution, grid.origin
-        plan = self.planner.plan(
-            *what,
-            poses,
-            velocities=[self.speeds.get(name, 0.0) for name in self.robots],
-            time_left=self._time_left(now),
-            now=round(now - self.begun, 6),
-        )
+        plan = self._plan(what, poses, self._time_left(now), now)
         goals = plan.goals if self.episode is None else self._extend(plan, what, poses)
         return Decision(self._give_orders(plan, goals, now), plan, [*notes, *plan.notes])
 
+    def _plan(self, grid: tuple, poses: dict[str, Pose | None], time_left: float, now: float) -> Plan:
+        """Of the robots that take part, at `now` [s]."""
+        speeds = [self.speeds.get(name, 0.0) for name in self.robots]
+        return self.planner.plan(*grid, poses, velocities=speeds, time_left=time_left, now=self._since(now))
+
+    def _since(self, now: float) -> float:
+        """Time since it began [s]."""
+        return round(now - (0.0 if self.begun is None else self.begun), 6)
+
     def _time_left(self, now: float) -> float:
         limit = self.settings.time_limit if self.episode is None else self.episode["seconds"]
-        return 1.0 if limit is None else max(1.0 - round(now - self.begun, 6) / limit, 0.0)
+        return 1.0 if limit is None else max(1.0 - self._since(now) / limit, 0.0)
 
     def _extend(self, plan: Plan, grid: tuple, poses: dict[str, Pose | None]) -> np.ndarray:
         at = np.array([(np.nan, np.nan) if pose is None else pose[:2] for pose in poses.values()])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +41,8 @@ class Candidates:
     Attributes:
         features: float32 [n, M, F], in the order of `FEATURES`; 0 where there is no candidate.
         mask: bool [n, M], which there are.
-        target: int64 [n, M], their numbers among the targets.
+        target: int64 [n, M], their numbers among the targets. Where radios are told of, features and mask have one
+            candidate more, the last: to go and tell the base station.
     """
 
     features: np.ndarray
@@ -49,7 +51,14 @@ class Candidates:
 
 
 def list_candidates(
-    scene: ArrayScene, count: int, heading, speed, last, time_left: float, motion: Motion
+    scene: ArrayScene,
+    count: int,
+    heading,
+    speed,
+    last,
+    time_left: float,
+    motion: Motion,
+    telling: Callable[[Moment], Moment] | None = None,
 ) -> Candidates:
     """The candidates of every robot of a scene with at least one target.
 
@@ -59,6 +68,7 @@ def list_candidates(
         last: where each robot's latest target was on the grid, [n, 2] [m]; NaN = it had none.
         time_left: share of the time for the whole exploration.
         motion: how the robots move.
+        telling: adds what is known of radios (`maexp.agents.runtime.contacts.ContactBook.add_to`); None: nothing.
     """
     value = value_targets(scene).astype(np.float32)
     best = np.argsort(-value, axis=1, kind="stable")[:, :count]
@@ -66,7 +76,8 @@ def list_candidates(
     mask = np.isfinite(np.take_along_axis(scene.travel, target, 1))
     mask[:, best.shape[1] :] = False
     moment = _moment(scene, target, mask, np.take_along_axis(value, target, 1), heading, speed, last, time_left, motion)
-    return Candidates(moment.features().astype(np.float32), mask, target)
+    moment = moment if telling is None else telling(moment)
+    return Candidates(moment.features().astype(np.float32), moment.mask, target)
 
 
 def _moment(scene: ArrayScene, target, mask, value, heading, speed, last, time_left: float, motion: Motion) -> Moment:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from maexp.envs.choices import rank
-from maexp.envs.features import FEATURES, feature_names
+from maexp.envs.features import FEATURES, Moment, feature_names
 
 from .features import Candidates, Motion, list_candidates
 from .scene import ArrayScene
@@ -63,12 +64,6 @@ class LearnedChoice:
     def __init__(self, folder: str | Path):
         folder = Path(folder)
         self.contract = read_contract(folder)
-        if self.contract.radio:
-            raise ValueError(
-                f"{folder} was trained with observation.radio=true: it looks at when robots last heard the base "
-                "station and each other, which planners on robots do not know; use one that was trained without it, or "
-                "play this one in the simulator"
-            )
         try:
             import onnxruntime
         except ImportError:
@@ -83,8 +78,9 @@ class LearnedChoice:
             reason = " ".join(str(error).split())[:200]
             raise ValueError(f"{folder / NETWORK} is not a network that onnxruntime runs ({reason})") from None
         taken = {one.name: one.shape for one in self.session.get_inputs()}
-        if tuple(taken) != INPUTS or taken["features"][3:] != [len(FEATURES)]:
-            raise ValueError(f"{folder / NETWORK} takes {taken}, not {len(FEATURES)} features a candidate: {AGAIN}")
+        width = len(feature_names(self.contract.radio))
+        if tuple(taken) != INPUTS or taken["features"][3:] != [width]:
+            raise ValueError(f"{folder / NETWORK} takes {taken}, not {width} features a candidate: {AGAIN}")
         if "logits" not in (given := [one.name for one in self.session.get_outputs()]):
             raise ValueError(f"{folder / NETWORK} gives {', '.join(given)}, and no logits: {AGAIN}")
 
@@ -98,17 +94,31 @@ class LearnedChoice:
         }
         return self.session.run(["logits"], inputs)[0][0]
 
-    def rank(self, scene: ArrayScene, heading, speed, last, time_left: float, motion: Motion) -> np.ndarray:
-        """What every robot thinks of every target, float [n, K]; the arguments of `list_candidates`.
+    def rank(
+        self,
+        scene: ArrayScene,
+        heading,
+        speed,
+        last,
+        time_left: float,
+        motion: Motion,
+        telling: Callable[[Moment], Moment] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What every robot thinks of every target, float [n, K], and of going to tell the base station, float [n], -inf
+        where that is no choice; the arguments of `list_candidates`.
 
         Targets that the policy was not shown come behind the others.
         """
-        candidates = list_candidates(scene, self.contract.candidates, heading, speed, last, time_left, motion)
+        candidates = list_candidates(scene, self.contract.candidates, heading, speed, last, time_left, motion, telling)
         logits, shown = np.zeros(scene.travel.shape), np.zeros(scene.travel.shape, bool)
-        robot, place = np.nonzero(candidates.mask)
+        count, found = candidates.target.shape[1], self.logits(candidates)
+        robot, place = np.nonzero(candidates.mask[:, :count])
         target = candidates.target[robot, place]
-        logits[robot, target], shown[robot, target] = self.logits(candidates)[robot, place], True
-        return rank(scene, logits, shown)
+        logits[robot, target], shown[robot, target] = found[robot, place], True
+        tell = np.full(len(found), -np.inf)
+        if telling is not None:
+            tell = np.where(candidates.mask[:, count], found[:, count], -np.inf)
+        return rank(scene, logits, shown), tell
 
 
 def read_contract(folder: Path) -> Contract:

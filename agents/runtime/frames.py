@@ -46,6 +46,14 @@ def read_map(message) -> OccupancyGrid:
     return OccupancyGrid(values.reshape(info.height, info.width), float(f"{info.resolution:.7g}"), origin)
 
 
+def fill_grid(message, frame: str, grid: OccupancyGrid) -> None:
+    """Writes a grid of a frame into a nav_msgs/OccupancyGrid; the time is left to the caller."""
+    message.header.frame_id, info = frame, message.info
+    info.resolution, (info.height, info.width) = float(grid.resolution), grid.values.shape
+    fill_pose(info.origin, *grid.origin)
+    message.data = grid.values.ravel().tolist()
+
+
 def read_time(stamp) -> float:
     """Seconds of a builtin_interfaces/Time."""
     return stamp.sec + 1e-9 * stamp.nanosec
@@ -137,7 +145,7 @@ def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
         return OccupancyGrid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
     cell = min(grid.resolution for grid in grids)
     corners = np.concatenate([_corners(grid) for grid in grids])
-    low = np.floor(corners.min(axis=0) / cell) * cell
+    low = np.floor(corners.min(axis=0) / cell + 1e-6) * cell
     columns, rows = np.ceil((corners.max(axis=0) - low) / cell - 1e-6).astype(int)
     x, y = np.meshgrid(low[0] + (np.arange(columns) + 0.5) * cell, low[1] + (np.arange(rows) + 0.5) * cell)
     merged = np.full((rows, columns), -1, dtype=np.int8)

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from maexp.kernels.constants import FREE, UNREACHED
 
 from .choices import CHOICES
 from .coarse import coarsen
+from .contacts import Links, open_book, read_links
 from .features import Motion
 from .folder import Contract, LearnedChoice
 from .grid import MAX_CELLS, KnownGrid, read_grid
@@ -46,6 +48,7 @@ class Plan:
         targets: float64 [K, 2], all candidates, for drawing.
         done: no robot can reach a place from which it would see more.
         notes: what was ignored or given up, a sentence each.
+        tells: bool [N], robots that go and tell the base station; their goals are as near to it as they get.
     """
 
     names: tuple[Hashable, ...]
@@ -56,6 +59,7 @@ class Plan:
     targets: np.ndarray
     done: bool
     notes: tuple[str, ...]
+    tells: np.ndarray
 
 
 class TeamPlanner:
@@ -82,6 +86,9 @@ class TeamPlanner:
         drive: how the robots move, for "lookahead": "differential", "omnidirectional" or, as a car, "ackermann".
         deadline: after so many seconds of a call, robots that "lookahead" has not searched for keep to its
             ``rollout_policy`` [s]; None: all have their turn, and plans repeat bit for bit.
+        comm: for policies trained with ``observation.radio=true``: how far radios reach, and where the base station is
+            in the map's frame [m], a `maexp.envs.CommConfig` or a mapping of its fields by name.
+        time_limit: for the whole exploration [s]; such policies need it.
     """
 
     def __init__(
@@ -105,6 +112,8 @@ class TeamPlanner:
         lookahead: Any = None,
         drive: Literal["differential", "omnidirectional", "ackermann"] = "differential",
         deadline: float | None = None,
+        comm: Any = None,
+        time_limit: float | None = None,
     ):
         for name, word, words in (("spare", spare, SPARE), ("drive", drive, ROBOT_KINDS)):
             if word not in words:
@@ -131,6 +140,11 @@ class TeamPlanner:
             raise ValueError(f"occupied={occupied!r} must be at most 100, as the cells of a grid are")
         self.least_area = least_area if least_area is None else _positive("least_area", least_area, zero=True)
         self.watch = Watch(_positive("patience", patience), _positive("pause", pause))
+        self.time_limit = time_limit if time_limit is None else _positive("time_limit", time_limit)
+        radio = self.learned is not None and self.learned.contract.radio
+        if radio and self.search is not None:
+            raise ValueError(f"lookahead.rollout_policy={base} was trained with observation.radio=true: choose another")
+        self.book = open_book(base, radio, comm, self.time_limit, self.motion, self.watch)
         self.foresight = None
         if self.search is not None:
             limit = math.inf if deadline is None else _positive("deadline", deadline)
@@ -145,6 +159,9 @@ class TeamPlanner:
         self.last: dict[Hashable, np.ndarray] = {}  # where each robot's latest target was in the map's frame
         self.home: dict[Hashable, np.ndarray] = {}  # where each robot was first seen there
         self.said: frozenset[str] = frozenset()
+        self.begun: float | None = None  # time of the first call [s]
+        if self.book is not None:
+            self.book.forget()
 
     def plan(
         self,
@@ -154,10 +171,11 @@ class TeamPlanner:
         poses,
         *,
         velocities=None,
-        time_left: float = 1.0,
+        time_left: float | None = None,
         radar_range: float | None = None,
         robot_radius=None,
         now: float | None = None,
+        connected: bool | Links = False,
     ) -> Plan:
         """Goals of all robots.
 
@@ -167,9 +185,13 @@ class TeamPlanner:
             origin: x, y [m] and, if given, yaw [rad] of the grid's lower left corner in the map's frame.
             poses: {name: (x, y, yaw) or None}, or numbers [N, 2] or [N, 3]; map's frame [m, rad].
             velocities: speeds [m/s] or (vx, vy), one for each robot; None: standing.
-            time_left: share of the time for the whole exploration that is left, 1 to 0.
+            time_left: share of the time for the whole exploration that is left, 1 to 0; None: of `time_limit` since the
+                first call, and 1 without that.
             radar_range, robot_radius: instead of those of this planner.
             now: time of the call [s]; None: a clock's.
+            connected: whether the robots are connected with the base station now, and all with each other; or {name:
+                the names that this robot is connected with over any number of others, "base_station" for that}. Only
+                policies trained with ``observation.radio=true`` look at it.
 
         Raises:
             ValueError: an argument cannot be used. Odd cells and poses are ignored, and `Plan.notes` says so.
@@ -180,17 +202,26 @@ class TeamPlanner:
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
         _check_reach(reach, known)
+        time_left = self._time_left(time_left, now)
+        if self.book is not None:
+            notes += self.book.look(team, known, 1.0 - time_left, read_links(connected, team), now)
         known = coarsen(known, team.radius.min(initial=math.inf))
-        time_left = min(max(_finite("time_left", time_left), 0.0), 1.0)
         scene = self._look(known, team, reach, notes)
         if not (known.known == FREE).any():
             notes.append("the grid holds no free cell yet: robots stay where they are")
             return self._finish(_stay(team, notes))
         notes += self.watch.look(team, scene.robots, scene.targets, scene.travel, scene.near, now)
-        shares, events = self._choose(team, scene, time_left)
+        ends = np.full(len(scene.robots), -1) if self.book is None else self.book.ends(team, scene, notes)
+        shares, events = self._choose(team, scene, time_left, ends)
         plan = _describe(team, scene, shares.taken, notes + events)
         self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
-        return self._finish(self._send_away(plan, team, scene, shares))
+        return self._finish(self._send_away(self._send_to_tell(plan, team, scene, ends), team, scene, shares))
+
+    def _time_left(self, given: float | None, now: float) -> float:
+        self.begun = now if self.begun is None else self.begun
+        if given is None:
+            given = 1.0 if self.time_limit is None else 1.0 - (now - self.begun) / self.time_limit
+        return min(max(_finite("time_left", given), 0.0), 1.0)
 
     def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> ArrayScene:
         shift = self._shift(grid, notes)
@@ -208,8 +239,12 @@ class TeamPlanner:
         x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
         return int(x), int(y)
 
-    def _choose(self, team: Team, scene: ArrayScene, time_left: float) -> tuple[Shares, list[str]]:
-        """The target of each robot of the scene, and what happened."""
+    def _choose(self, team: Team, scene: ArrayScene, time_left: float, ends) -> tuple[Shares, list[str]]:
+        """The target of each robot of the scene, and what happened; who goes to tell the base station has none.
+
+        Args:
+            ends: of `ContactBook.ends`.
+        """
         notes = []
         allowed = self.watch.allowed(team, scene.robots, scene.targets)
         if not np.isfinite(scene.travel[allowed]).any() and self.watch.try_again():
@@ -217,9 +252,10 @@ class TeamPlanner:
             allowed = self.watch.allowed(team, scene.robots, scene.targets)
         travel = np.where(allowed, scene.travel, np.inf).astype(np.float32)
         parked = np.array([self.watch.tracks[team.names[robot]].parked for robot in scene.robots], bool)
-        preference = np.full(travel.shape, -np.inf)
+        preference, tell = np.full(travel.shape, -np.inf), np.where((ends >= 0) & ~parked, 0.0, -np.inf)
         if travel.size and not parked.all():
-            preference[~parked] = self._ask(team, replace(scene, travel=travel).of(~parked), time_left, notes)
+            asked = replace(scene, travel=travel).of(~parked)
+            preference[~parked], tell[~parked] = self._ask(team, asked, time_left, ends[~parked] >= 0, notes)
         travel[parked] = scene.travel[parked]
         preference[parked] = -travel[parked]
         preference[~np.isfinite(travel)] = -np.inf
@@ -227,6 +263,10 @@ class TeamPlanner:
         rows = np.flatnonzero(held >= 0)
         rows = rows[np.isfinite(travel[rows, held[rows]])]
         preference[rows, held[rows]] = np.inf
+        if self.book is not None:
+            tells = (tell > preference.max(-1, initial=-np.inf)) | self.book.on_duty(team, scene.robots)
+            self.book.send(team, scene.robots, tells & (ends >= 0))
+            preference[tells & (ends >= 0)] = -np.inf
         shares = Shares(preference, travel, scene.points, team.radius[scene.robots], self.distinct)
         some = shares.reached.any(-1)
         shares.settle_for(np.flatnonzero(some & ~parked))
@@ -236,8 +276,10 @@ class TeamPlanner:
         notes += self.watch.settle(team, scene.robots, scene.targets, travel, shares, scene.radar_range)
         return shares, notes
 
-    def _ask(self, team: Team, scene: ArrayScene, time_left: float, notes: list[str]) -> np.ndarray:
-        """What the policy thinks of each target for each robot of the scene, float [n, K]; notes are added."""
+    def _ask(self, team: Team, scene: ArrayScene, time_left: float, can: np.ndarray, notes: list[str]):
+        """What the policy thinks of each target for each robot of the scene, float [n, K], and of going to tell the
+        base station, float [n], -inf for those that cannot, bool [n]; notes are added."""
+        tell = np.full(len(can), -np.inf)
         heading = team.yaw - scene.grid.yaw
         if self.learned is None:
             preference = CHOICES[str(self.base)](scene)
@@ -245,10 +287,25 @@ class TeamPlanner:
             robots = scene.robots
             last = [self.last.get(team.names[robot], (np.nan, np.nan)) for robot in robots]
             before = scene.grid.from_map(np.array(last))
-            preference = self.learned.rank(scene, heading[robots], team.speed[robots], before, time_left, self.motion)
-        if self.foresight is None:
-            return preference
-        return self.foresight.improve(scene, preference, team, self.motion, self.learned is not None, notes)
+            telling = None
+            if self.book is not None:
+                telling = partial(self.book.add_to, scene=scene, names=[team.names[k] for k in robots], can=can)
+            now = heading[robots], team.speed[robots], before, time_left, self.motion
+            preference, tell = self.learned.rank(scene, *now, telling)
+        if self.foresight is not None:
+            preference = self.foresight.improve(scene, preference, team, self.motion, self.learned is not None, notes)
+        return preference, tell
+
+    def _send_to_tell(self, plan: Plan, team: Team, scene: ArrayScene, ends: np.ndarray) -> Plan:
+        """The plan with the ways of robots that go and tell the base station, to cells `ends`, int64 [n]."""
+        if self.book is None:
+            return plan
+        for row in np.flatnonzero(self.book.on_duty(team, scene.robots)).tolist():
+            robot = scene.robots[row]
+            way = trace_from(team.at[robot], scene.grid, scene.passable[row], scene.distance[row], ends[row])
+            plan.ways[robot], plan.goals[robot] = way, way[-1]
+            plan.active[robot] = plan.tells[robot] = True
+        return replace(plan, done=plan.done and not plan.tells.any())
 
     def _send_away(self, plan: Plan, team: Team, scene: ArrayScene, shares: Shares) -> Plan:
         """The plan with what robots do for which no target is left."""
@@ -309,6 +366,7 @@ def _stay(team: Team, notes: list[str]) -> Plan:
         targets=np.zeros((0, 2)),
         done=False,
         notes=tuple(notes),
+        tells=np.zeros(count, bool),
     )
 
 

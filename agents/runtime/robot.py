@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Collection, Hashable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from .contacts import BASE, Memory
 from .frames import OccupancyGrid, merge_grids
 from .planner import Plan, TeamPlanner
 
@@ -22,6 +23,7 @@ class Word:
         speed: [m/s]
         time: of the pose, by a clock that all robots share [s].
         grid: what it knows, its own and heard; None: the caller merges grids.
+        memory: what it knows of radios; None: its policy does not look at that.
     """
 
     name: Hashable
@@ -29,6 +31,7 @@ class Word:
     speed: float
     time: float
     grid: OccupancyGrid | None = None
+    memory: Memory | None = None
 
 
 class RobotPlanner:
@@ -42,24 +45,38 @@ class RobotPlanner:
         name: of the robot; the robots' names must sort, for all plan for the team in the same order.
         policy, settings: of `TeamPlanner`, the same for all robots.
         memory: a mate counts so long after its last word [s]; what it told of the map stays.
+        mates: names of the others; policies that look at radios count those, too, that were never heard.
     """
 
-    def __init__(self, name: Hashable, policy: Any = "cost_utility", *, memory: float = 10.0, **settings: Any):
+    def __init__(
+        self,
+        name: Hashable,
+        policy: Any = "cost_utility",
+        *,
+        memory: float = 10.0,
+        mates: Collection[Hashable] = (),
+        **settings: Any,
+    ):
         if not memory > 0.0:
             raise ValueError(f"memory={memory!r} must be a number of seconds above 0")
-        self.name, self.memory = name, memory
+        if BASE in (name, *mates):
+            raise ValueError(f"{BASE!r} names the base station: give the robot another name")
+        self.name, self.memory, self.mates = name, memory, mates
         self.team = TeamPlanner(policy, **settings)
         self.heard: dict[Hashable, Word] = {}
         self.grids: dict[Hashable, OccupancyGrid] = {}
         self._word: Word | None = None
+        self._lately: set[Hashable] = set()  # heard since the last plan
 
     def reset(self) -> None:
         """Forget the past: mates, their maps, what was given up."""
         self.team.reset()
         self.heard, self.grids, self._word = {}, {}, None
+        self._lately = set()
 
     def hear(self, word: Word) -> None:
-        """Take in a mate's word; one that is older than its last changes nothing.
+        """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last
+        changes nothing.
 
         Raises:
             ValueError: it comes from a robot of this one's name.
@@ -69,6 +86,7 @@ class RobotPlanner:
         last = self.heard.get(word.name)
         if last is None or word.time >= last.time:
             self.heard[word.name] = word
+            self._lately.add(word.name)
             if word.grid is not None:
                 self.grids[word.name] = word.grid
 
@@ -77,7 +95,17 @@ class RobotPlanner:
         return self._word
 
     def plan(
-        self, grid, resolution: float, origin, pose, *, speed: float = 0.0, now: float, share: bool = False, **more: Any
+        self,
+        grid,
+        resolution: float,
+        origin,
+        pose,
+        *,
+        speed: float = 0.0,
+        now: float,
+        share: bool = False,
+        connected: Collection[Hashable] | None = None,
+        **more: Any,
     ) -> Plan:
         """A plan of one row, this robot's.
 
@@ -88,6 +116,8 @@ class RobotPlanner:
             now: the time, by the clock of all robots [s].
             share: whether grids that were heard join this one, and its word holds what came of it; else the caller
                 merges them.
+            connected: names of those that it is connected with now over any number of others, "base_station" for that;
+                None: those heard since the last plan. Only policies trained with ``observation.radio=true`` look at it.
             more: other arguments of `TeamPlanner.plan`.
 
         Raises:
@@ -98,14 +128,25 @@ class RobotPlanner:
             own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             own = merge_grids([own, *self.grids.values()])
             grid, resolution, origin = own.values, own.resolution, own.origin
-        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory}
+        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
-        plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, **more)
+        links = {self.name: set(self._lately if connected is None else connected)}
+        self._lately.clear()
+        self._take_memories()
+        plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, connected=links, **more)
         if pose is not None:
-            self._word = Word(self.name, tuple(map(float, pose)), speed, now, own if share else None)
+            knows = None if self.team.book is None else self.team.book.memories.get(self.name)
+            self._word = Word(self.name, tuple(map(float, pose)), speed, now, own if share else None, knows)
         return _row(plan, names.index(self.name))
+
+    def _take_memories(self) -> None:
+        """What mates have told of radios takes the place of what was guessed of them."""
+        if self.team.book is not None:
+            self.team.book.crew |= {self.name, *self.mates, *self.heard} - {BASE}
+            told = {name: one.memory for name, one in self.heard.items() if one.memory is not None}
+            self.team.book.memories |= told
 
 
 def _row(plan: Plan, row: int) -> Plan:
@@ -118,4 +159,5 @@ def _row(plan: Plan, row: int) -> Plan:
         active=plan.active[one],
         waits=plan.waits[one],
         ways=plan.ways[one],
+        tells=plan.tells[one],
     )

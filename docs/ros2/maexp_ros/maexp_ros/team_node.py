@@ -17,8 +17,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from maexp.agents.runtime.driver import DriverSettings, Order, TeamDriver, read_settings
 from maexp.agents.runtime.frames import fill_pose
+from maexp.agents.runtime.robot_driver import RobotDriver
 
 from . import conversion
+from .mates import Mates
 
 OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
 PARAMETERS = {name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()} | {
@@ -33,7 +35,7 @@ def latched(depth: int) -> QoSProfile:
 
 
 class TeamNode(Node):
-    """One node for the whole team; its parameters are those of config/team.yaml."""
+    """One node for the whole team, or for one robot of it; its parameters are those of config/team.yaml."""
 
     def __init__(self):
         super().__init__("team")
@@ -41,28 +43,34 @@ class TeamNode(Node):
             self.declare_parameter(name, default)
         values = {name: self.get_parameter(name).value for name in PARAMETERS}
         action = values.pop("action")
-        self.driver = driver = TeamDriver(read_settings(values))
+        settings = read_settings(values)
+        self.driver: TeamDriver = RobotDriver(settings) if settings.only else TeamDriver(settings)
+        driver = self.driver
         self.frame = driver.settings.global_frame
-        for topic in driver.topics:
+        for topic in driver.listened:
             self.create_subscription(OccupancyGrid, topic, partial(driver.take_map, topic), latched(1))
-        for robot in (None, *driver.robots):
+        for robot in (None, *driver.driven):
             place = "" if robot is None else f"/{robot}"
             moving, still = (partial(driver.take_frames, robot=robot, still=one) for one in (False, True))
             self.create_subscription(TFMessage, f"{place}/tf", moving, QoSProfile(depth=100))
             self.create_subscription(TFMessage, f"{place}/tf_static", still, latched(100))
-        for robot in driver.robots:
+        for robot in driver.driven:
             take = partial(driver.take_odometry, robot)
             self.create_subscription(Odometry, f"/{robot}/odom", take, QoSProfile(depth=10))
-        self.clients_of = {name: ActionClient(self, NavigateToPose, f"/{name}/{action}") for name in driver.robots}
+        self.clients_of = {name: ActionClient(self, NavigateToPose, f"/{name}/{action}") for name in driver.driven}
+        self.mates = Mates(self, driver, latched(1)) if isinstance(driver, RobotDriver) else None
         self.handles: dict[str, object] = {}  # of goals that nav2 has accepted
         self.markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self.finished = False
         self.create_timer(driver.settings.period, self.decide)
 
     def decide(self) -> None:
-        """Plan for all and send each robot its goal, where that has changed."""
+        """Plan and send each robot its goal, where that has changed."""
+        now = self.get_clock().now()
         try:
-            decision = self.driver.decide(self.get_clock().now().nanoseconds * 1e-9)
+            if self.mates is not None:
+                self.mates.tell(now)
+            decision = self.driver.decide(now.nanoseconds * 1e-9)
         except ValueError as error:
             self.get_logger().error(f"no plan: {error}", throttle_duration_sec=10.0)
             return

@@ -1,0 +1,106 @@
+"""One robot of a ROS 2 team over DDS, without a central planner: it tells its mates what it knows, and hears them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from maexp.agents.errors import UserError
+from maexp.agents.ros2.convert import SECOND, fill_map
+from maexp.agents.ros2.dds import Wire
+from maexp.agents.ros2.team import Ros2Team
+from maexp.agents.runtime.robot_driver import RobotDriver
+from maexp.agents.runtime.words import write_word
+
+LISTEN = 1.0  # seconds by the wall that mates are waited for in an arena, whose clock stands meanwhile
+
+
+class Ros2Robot(Ros2Team):
+    """A `RobotDriver` on DDS.
+
+    Before each decision it publishes what it knows on /NAME/maexp/map, and its pose on /NAME/maexp/word. Mates are
+    heard as long as their words come. In an arena it waits for those that it has heard at the decision before.
+
+    Args:
+        listen: how long [s by the wall].
+        others: of `Ros2Team`.
+    """
+
+    driver: RobotDriver
+
+    def __init__(self, driver: RobotDriver, wire: Wire, *others, listen: float = LISTEN, **more):
+        super().__init__(driver, wire, *others, **more)
+        self.listen = listen
+        places = {name: f"/{name}/maexp" for name in (driver.name, *driver.mates)}
+        self.words = {name: wire.reader(f"{places[name]}/word") for name in driver.mates}
+        self.grids = {name: wire.reader(f"{places[name]}/map") for name in driver.mates}
+        self.says, self.shows = (wire.writer(f"{places[driver.name]}/{one}") for one in ("word", "map"))
+        self.told: float | None = None  # time of the last word [s]
+        self.since = 0.0  # when it was told [s by the wall]
+        self.near = set(driver.mates)  # who is waited for
+        self.noted: set[str] = set()
+
+    def _begin(self, episode: dict) -> None:
+        super()._begin(episode)
+        self.told, self.near = None, set(self.driver.mates) & set(episode["robots"])
+
+    def _take_others(self) -> None:
+        super()._take_others()
+        for name, reader in self.grids.items():
+            for message in reader.take():
+                self._hear(f"/{name}/maexp/map", self.driver.take_known, name, message)
+        for name, reader in self.words.items():
+            for message in reader.take():
+                if self._hear(f"/{name}/maexp/word", self.driver.take_word, name, message.data):
+                    self.near.add(name)
+
+    def _hear(self, topic: str, take: Callable, name: str, what: Any) -> Any:
+        """What the driver makes of what a mate has told; nonsense is noted."""
+        try:
+            return take(name, what)
+        except ValueError as error:
+            self._note(f"{topic}: {error}")
+            return None
+
+    def _note(self, sentence: str) -> None:
+        """Told once; what others wrote does nothing to a terminal."""
+        sentence = "".join(one if one.isprintable() else "?" for one in sentence[:300])
+        if sentence not in self.noted:
+            self.noted.add(sentence)
+            self.tell(sentence)
+
+    def _due(self) -> float | None:
+        """As of a team; after this robot has told the others of the moment, and in an arena has heard them."""
+        now = super()._due()
+        if now is None or not self.driver.maps:
+            return now
+        if self.told != now:
+            self._tell_mates(now)
+        if self.driver.episode is None:
+            return now
+        missing = {name for name in self.near if not self.driver.has_heard(name, now)}
+        if missing and time.monotonic() - self.since < self.listen:
+            return None
+        self.near -= missing
+        return now
+
+    def _tell_mates(self, now: float) -> None:
+        """What this robot knows, and where it is."""
+        self.told, self.since = now, time.monotonic()
+        try:
+            known = self.driver.known([])
+        except ValueError as error:
+            raise UserError(f"{error}.") from error
+        if known is not None:
+            message, frame = self.shows.make(), self.driver.settings.global_frame
+            fill_map(message, frame, round(now * SECOND), known.values, known.resolution, known.origin)
+            self.shows.write(message)
+        if (word := self.driver.word(now)) is not None:
+            self.says.write(self.says.make(data=write_word(word)))
+
+
+def make_team(driver, wire: Wire, answer: float, tell: Callable[[str], None], goals: str) -> Ros2Team:
+    """One robot or the whole team on DDS, as the driver is."""
+    kind = Ros2Robot if isinstance(driver, RobotDriver) else Ros2Team
+    return kind(driver, wire, answer, tell, goals)
