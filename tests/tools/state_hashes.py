@@ -28,7 +28,7 @@ from maexp.envs import (
     make_map,
 )
 
-DECISIONS, SEED = 3, 11
+SEED = 11
 DWA, DIRECT = PlannerConfig(name="dwa"), PlannerConfig(name="direct")
 OFFICE = "indoor_small"
 KNOWN = ObservationConfig("known")
@@ -36,11 +36,14 @@ BLIND, SHOWN = ObservationConfig(pictures=False), ObservationConfig(pictures=Fal
 RADIO = ObservationConfig(pictures=False, targets=24, radio=True)
 
 
-def radio(strategy: str, **more) -> CommConfig:
-    return CommConfig(range=8.0, base_station=strategy != "rendezvous", strategy=strategy, **more)
+def radio(strategy: str, **more) -> dict:
+    """Settings of an episode that is long enough for robots to come back and tell."""
+    comm = CommConfig(range=8.0, base_station=strategy != "rendezvous", strategy=strategy, **more)
+    return {"comm": comm, "decisions": 8, "macro_steps": 9, "observation": BLIND}
 
 
-# Name: (who acts, settings of the env and "scenario"). "regions" and "controls" are drawn, others are policies.
+# Name: (who acts, settings of the env, "scenario" and "decisions"). Regions, controls and targets are drawn, others are
+# policies.
 SETUPS = {
     "regions": ("regions", {}),
     "regions of plain DWA, what is known drawn": ("regions", {"planner": DWA, "observation": KNOWN}),
@@ -64,9 +67,10 @@ SETUPS = {
     "voronoi, radios": ("voronoi", {"comm": CommConfig(range=8.0, line_of_sight=True), "observation": BLIND}),
     "potential_field, signals": ("potential_field", {"comm": CommConfig(signal=True, noise=2.0), "observation": BLIND}),
     "cost_utility, messages": ("cost_utility", {"comm": CommConfig(range=8.0, bandwidth=2000.0, delay=0.5)}),
-    "cost_utility reports": ("cost_utility", {"comm": radio("return_to_base"), "observation": BLIND}),
-    "cost_utility meets": ("cost_utility", {"comm": radio("rendezvous", period=2), "observation": BLIND}),
-    "cost_utility relays": ("cost_utility", {"comm": radio("relay"), "observation": BLIND}),
+    "cost_utility reports": ("cost_utility", radio("return_to_base")),
+    "cost_utility meets": ("cost_utility", radio("rendezvous", period=2)),
+    "cost_utility relays": ("cost_utility", radio("relay")),
+    "cost_utility pursues": ("cost_utility", radio("pursuit")),
     "cost_utility, faults": (
         "cost_utility", {"faults": FaultsConfig(at=((1, 1.0),), probability=0.3, duration=2.0), "observation": BLIND},
     ),
@@ -77,7 +81,7 @@ SETUPS = {
     ),
     "targets by number": ("targets", {"observation": SHOWN}),
     "universal": ("universal", {"observation": SHOWN}),
-    "targets by number, radios": ("targets", {"comm": radio("opportunistic"), "observation": RADIO}),
+    "targets by number, radios": ("targets", radio("opportunistic") | {"observation": RADIO}),
     "lookahead": (
         "lookahead", {"lookahead": LookaheadConfig(candidates=3, horizon=2, local_steps=10), "observation": BLIND},
     ),
@@ -111,12 +115,13 @@ def actor(word: str, env: ExplorationEnv):
 def digest(name: str) -> str:
     """SHA-256 of all that a set-up has come to."""
     word, settings = SETUPS[name]
-    settings = {"num_robots": 3} | settings
-    maps = [make_map(settings.pop("scenario", "maze_small"), index) for index in (0, 1)]
+    settings = {"num_robots": 3, "scenario": "maze_small", "decisions": 3} | settings
+    scenario, decisions = settings.pop("scenario"), settings.pop("decisions")
+    maps = [make_map(scenario, index) for index in (0, 1)]
     env = ExplorationEnv(maps, 2, seed=SEED, num_threads=1, **settings)
     torch.manual_seed(SEED)
     policy, state = actor(word, env), env.reset()
-    for _ in range(DECISIONS):
+    for _ in range(decisions):
         state = env.step(policy(state))["next"]
     found = dict(state.flatten_keys(".").items()) | env.state_dict()
     total = hashlib.sha256()
