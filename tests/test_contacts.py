@@ -204,7 +204,7 @@ def test_weights_are_taken_by_a_policy_that_is_told():
     env = make(3, 4, PLACE, comm=CommConfig(range=6.0))  # no base station: nobody may
     td = play(env, env.rand_action, 2)[-1]
     universal = make_policy("universal", env)
-    size = ModelConfig(action="targets", starts_from="cost_utility")
+    size = ModelConfig(action="targets")
     policy = make_policy(env, size)
     policy.load_state_dict(widened(universal.state_dict(), policy.state_dict()))
     assert chooser_of(policy).radio and not chooser_of(universal).radio

@@ -47,7 +47,7 @@ def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
     )
 
 
-def build(env: ExplorationEnv, starts_from: str = "multi_criteria", **settings):
+def build(env: ExplorationEnv, starts_from: str = "cost_utility", **settings):
     model = replace(model_config("small"), action="targets", starts_from=starts_from)
     settings = ROW.configure(candidates=3, branch_horizon=1, **settings)
     policy, critic = make_policy(env, model), ROW.make_critic(env, model, settings)
@@ -103,7 +103,7 @@ def test_memory_and_headroom():
 def test_untrained_it_acts_as_the_planner_and_tries_without_touching_the_episode():
     """The same episodes with and without branches, and those of the planner that it starts from."""
     env = make_env()
-    policy, _, settings = build(env, "cost_utility")
+    policy, _, settings = build(env)
     actor = BranchingActor(policy, env, replace(settings, branch_share=1.0))
     with torch.no_grad():
         env.set_seed(3)

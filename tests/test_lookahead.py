@@ -9,12 +9,10 @@ from worlds import room
 
 from maexp.agents.cli import main
 from maexp.agents.evaluation.evaluate import evaluate
-from maexp.agents.networks.actor import TARGETS
 from maexp.agents.policies import POLICIES
 from maexp.agents.policies.load import load_policy_folder
 from maexp.agents.policies.lookahead import LookaheadPlanner, list_candidates
 from maexp.agents.policies.rollouts import pick_tried
-from maexp.agents.training.branching import BranchPlayer
 from maexp.envs import (
     CommConfig,
     ExplorationEnv,
@@ -27,7 +25,6 @@ from maexp.envs import (
     TargetsConfig,
     make_map,
 )
-from maexp.envs.features import FEATURES
 from maexp.envs.nav_grid import bank_block_sides
 
 
@@ -263,37 +260,3 @@ def test_imagined_worlds_hold_the_blocks_of_a_radar_that_reaches_beyond_the_map(
     sizes, blocks = branches.sizes, branches.tracker.nav.blocks
     assert sizes.block.tolist() == bank_block_sides(env.bank, 40.0).tolist()
     assert blocks.num_blocks >= (-(-sizes.width // sizes.block) * -(-sizes.height // sizes.block)).max()
-
-
-def test_a_policy_may_be_taught_in_the_world_of_the_search():
-    """Labels of two maps that differ where nobody has looked are the same, where branches play in what is known; the
-    prior counts as in the search."""
-    world = make_map("maze_small", 3)
-    starts = torch.tensor([[4.0, 4.0, 0.3], [4.0, 8.0, 0.0]])
-    starts[:, :2] += torch.tensor(world.extent[0])
-    found = {}
-    for number, one in enumerate((world, changed(world, (20.0, 6.0), 5.0))):
-        for kind, prior in (("true", 0.0), ("known", 0.0), ("known", 0.5)):
-            env = ExplorationEnv(
-                one,
-                num_envs=1,
-                num_robots=2,
-                seed=0,
-                observation=ObservationConfig(pictures=False, targets=8),
-                lookahead=LookaheadConfig(prior=prior),
-            )
-            free = torch.from_numpy(one.free[:, :2])
-            place = [free[(free - at[:2]).norm(dim=1).argmin()] for at in starts]
-            env.set_starts(torch.cat([torch.stack(place), starts[:, 2:]], 1))
-            features = env.reset()[TARGETS]
-            player = BranchPlayer(env, candidates=4, horizon=1, seed=1, world=kind)
-            score = features[..., FEATURES.index("score")]
-            index, advantage = player.try_candidates(features, score)
-            found[number, kind, prior] = index, advantage, score.gather(2, index.clamp_min(0))
-    assert (found[0, "known", 0.0][0][..., 1:] >= 0).any()
-    for prior in (0.0, 0.5):
-        first, second = found[0, "known", prior], found[1, "known", prior]
-        assert all(torch.equal(a, b) for a, b in zip(first[:2], second[:2], strict=True))
-    assert not torch.equal(found[0, "true", 0.0][1], found[1, "true", 0.0][1])
-    (_, plain, score), (_, with_prior, _) = found[0, "known", 0.0], found[0, "known", 0.5]
-    torch.testing.assert_close(with_prior - plain, 0.5 * (score - score[..., :1]) + 0.0 * plain, equal_nan=True)

@@ -94,8 +94,8 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
         ("policy.onnx", lambda data: data[:100], "is not the file that its contract names"),
         (
             "contract.json",
-            lambda data: data.replace(b"maexp-policy-3", b"maexp-policy-9"),
-            "of the kind maexp-policy-3",
+            lambda data: data.replace(b"maexp-policy-2", b"maexp-policy-9"),
+            "of the kind maexp-policy-2",
         ),
     ],
 )

@@ -22,7 +22,7 @@ from .features import Candidates, Motion, list_candidates
 from .scene import ArrayScene
 from .shipped import CONTRACT
 
-FORMAT = "maexp-policy-3"
+FORMAT = "maexp-policy-2"
 NETWORK, WEIGHTS, CARD = "policy.onnx", "weights.safetensors", "card.md"
 AGAIN = "export the policy again"
 INPUTS = ("features", "mask", "comm")

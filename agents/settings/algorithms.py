@@ -118,9 +118,6 @@ class ExpertSettings(AlgorithmSettings):
     branch_horizon: int = setting(
         4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
     )
-    branch_world: Literal["true", "known"] = setting(
-        "true", "in which branches are played: the true one, or that in which `lookahead` plays"
-    )
     branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
     learn_from: Literal["union", "base", "everyone"] = setting(
         "union",

@@ -20,7 +20,7 @@ class ModelConfig:
     target_width: int = setting(48, "features per target", low=1, high=4096)
     target_heads: int = setting(2, "of the attention over targets; divide target_width", low=1, high=64)
     starts_from: Literal["cost_utility", "multi_criteria"] = setting(
-        "multi_criteria", "planner whose choices an untrained policy makes"
+        "cost_utility", "planner whose choices an untrained policy makes"
     )
     score_weight: float = setting(50.0, "of the classical value of a target in its logit", low=0)
     stem: Literal["pool", "conv"] = setting(

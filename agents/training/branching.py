@@ -72,26 +72,19 @@ class BranchPlayer:
         env: of the teams; shows targets.
         candidates, horizon: as in `BranchingConfig`.
         seed: of what is tried; None: torch's own generator draws.
-        learn_from, world: as in `ExpertSettings`.
+        learn_from: as in `ExpertSettings`.
     """
 
     def __init__(
-        self,
-        env: ExplorationEnv,
-        candidates: int,
-        horizon: int,
-        seed: int | None = None,
-        learn_from: str = "union",
-        world: str = "true",
+        self, env: ExplorationEnv, candidates: int, horizon: int, seed: int | None = None, learn_from: str = "union"
     ):
         self.env, self.view = env, env.target_view
         config = replace(env.lookahead_config, candidates=candidates, horizon=horizon)
-        branches = branches_of(env, config, self.view.tracker, true_world=world == "true")
+        branches = branches_of(env, config, self.view.tracker, true_world=True)
         if learn_from == "union":
             self.rollouts = Rollouts(branches, config, self.view.tracker)
         else:
             self.rollouts = ToldRollouts(env, branches, config, self.view.tracker, learn_from)
-        self.prior = 0.0 if world == "true" else config.prior  # a world of what is known promises too much
         self.draw = None if seed is None else torch.Generator().manual_seed(seed)
 
     def try_candidates(
@@ -130,7 +123,6 @@ class BranchPlayer:
         teams = active.nonzero().squeeze(-1)
         for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
             worth[some] = self._weigh(some, {name: one[some] for name, one in (mine | {"wanted": there}).items()})
-        worth = worth + self.prior * features[..., SCORE].gather(2, index.clamp_min(0))
         return torch.where(there, index, -1), worth - worth[..., :1]
 
     def _offer(self, index: torch.Tensor, waits: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -184,8 +176,8 @@ class BranchingActor(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase, env: ExplorationEnv, settings: ExpertSettings):
         super().__init__()
         self.policy, self.share = policy, settings.branch_share
-        more = {"learn_from": settings.learn_from, "world": settings.branch_world}
-        self.player = BranchPlayer(env, settings.candidates, settings.branch_horizon, **more)
+        horizon, learn_from = settings.branch_horizon, settings.learn_from
+        self.player = BranchPlayer(env, settings.candidates, horizon, learn_from=learn_from)
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]
 
     @torch.no_grad()

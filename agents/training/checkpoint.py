@@ -26,7 +26,7 @@ NAME = re.compile(r"iteration_(\d+)\.pt")
 BEST = "best.pt"
 START = "iteration_000000.pt"
 """What the training started from; it stays."""
-FORMAT = "maexp-checkpoint-2"
+FORMAT = "maexp-checkpoint-1"
 KINDS = {"overrides": list, "settings": dict, "followers": list, "maps": dict, "iteration": int, "policy": dict}
 """What every reader of a checkpoint relies on."""
 
