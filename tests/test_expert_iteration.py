@@ -183,6 +183,12 @@ def test_begins_from_another_run(somewhere, capsys):
     assert all(torch.equal(mine[n]["features"], theirs[n]["features"]) for n in theirs)
     assert find_checkpoint(whole)[1]["updater"]["memory"]["2"]["mask"].shape[0] > len(theirs["2"]["mask"])
     assert_same_runs(whole, resume(run("parts", 1, *words), 2))
+    other_start = run("criteria", 1, *WORDS, "model.starts_from=multi_criteria")
+    begun = run("begun", 1, *WORDS, f"algorithm.begin_from={other_start}")
+    assert "starts_from: multi_criteria" in (begun / "config.yaml").read_text()
+    wrong = [f"algorithm.begin_from={other_start}", "model.starts_from=cost_utility", "hydra.run.dir=bad"]
+    assert main(["train", *TINY, *WORDS, *wrong]) == 2
+    assert "starts from multi_criteria, and model.starts_from=cost_utility" in capsys.readouterr().err
     other = run("other", 1, "action=targets", "algorithm=mappo")
     for place, sentence in (("nowhere", "nowhere does not exist"), (other, "was not trained by expert iteration")):
         capsys.readouterr()

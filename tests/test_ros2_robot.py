@@ -1,11 +1,13 @@
 """A ROS 2 team without a central planner: each robot drives itself, by what it has heard over DDS of the others."""
 
 import json
+import math
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,6 +88,31 @@ def test_what_was_told_before_an_episode_does_not_count():
     driver.hear(replace(WORD, time=20.0))  # it has begun the next one before this robot has
     driver.begin(episode, 20.0)
     assert driver.planner.heard["a"].time == 0.0 and driver.has_heard("a", 20.0)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"resolution": 0.0}, {"resolution": math.nan}, {"resolution": 1e-9}, {"x": math.inf}, {"x": 1e12}]
+)
+def test_a_map_that_is_none_is_refused(changes):
+    driver = RobotDriver(DriverSettings(**SETTINGS, only="b"))
+    with pytest.raises(ValueError, match="is none"):
+        driver.take_known("a", grid_message(**changes))
+    assert not driver.told
+
+
+def test_a_map_that_lies_too_far_away_is_left_out():
+    driver, notes = RobotDriver(DriverSettings(**SETTINGS, only="b")), []
+    driver.take_known("a", grid_message(x=1e6))
+    driver.take_map("/b/map", grid_message())
+    assert driver.known(notes).values.shape == (4, 5)
+    assert notes == ["the map of a is left out: it lies too far away, or has too small cells"]
+
+
+def grid_message(resolution: float = 0.1, x: float = 0.0):
+    place = SimpleNamespace(position=SimpleNamespace(x=x, y=0.0), orientation=SimpleNamespace(x=0, y=0, z=0.0, w=1.0))
+    info = SimpleNamespace(resolution=resolution, width=5, height=4, origin=place)
+    header = SimpleNamespace(frame_id="map", stamp=SimpleNamespace(sec=1, nanosec=0))
+    return SimpleNamespace(header=header, info=info, data=[0] * 20)
 
 
 class Places:

@@ -289,7 +289,7 @@ def test_when_nothing_is_left_to_be_seen_what_is_known_is_told(folder):
 def test_robots_take_over_what_a_mate_tells_of_itself(folder):
     """Who hears that a mate is on its way to tell leaves it to that, and does not count its target."""
     world = World()
-    one, two = (RobotPlanner(name, folder, mates="ab", **SETTINGS | RADIO) for name in "ab")
+    one, two = (RobotPlanner(name, folder, mates=("a", "b"), **SETTINGS | RADIO) for name in "ab")
     for planner in (one, two):
         like(planner.team, 5.0)
     plan = two.plan(world.grid(), CELL, (0.0, 0.0), (3.0, 3.0), now=0.0)
@@ -334,6 +334,55 @@ def test_blocked_cells_along_a_line():
             blocked += not inside or grid.known[y, x] != FREE
         assert found == blocked
     assert count_blocked(grid, start, start[None]).tolist() == [int(grid.known[8, 5] != FREE)]
+
+
+@pytest.mark.parametrize("start", [(-30.0, 4.0), (55.0, 55.0), (-7.0, -3.0), (3.0, 80.0)])
+def test_blocked_cells_from_beyond_the_grid(start):
+    """What lies before the grid counts, however far; only what lies on it is looked at."""
+    rng = np.random.default_rng(1)
+    grid = KnownGrid(rng.integers(0, 3, (30, 40)).astype(np.uint8), 0.25, (0.0, 0.0))
+    points = rng.uniform((0.0, 0.0), (10.0, 7.5), (20, 2))
+    around = KnownGrid(np.pad(grid.known, 400), 0.25, (0.0, 0.0))  # unknown cells
+    found = count_blocked(grid, np.array(start), points)
+    assert found.tolist() == count_blocked(around, np.array(start) + 100.0, points + 100.0).tolist()
+    assert (count_blocked(grid, np.array([5e6, 0.0]), points) > 1.9e7).all()
+
+
+def test_a_base_station_beyond_the_grid_is_not_at_its_edge(folder, monkeypatch):
+    team, seen = alone(folder, comm={"range": 3.0, "base_station": (90.0, 3.0)}), []
+    add = team.book.add_to
+
+    def note(moment, **more):
+        seen.append(add(moment, **more))
+        return seen[-1]
+
+    monkeypatch.setattr(team.book, "add_to", note)
+    team.plan(World().grid(), CELL, (0.0, 0.0), {"a": (3.0, 3.0)}, now=0.0)
+    assert seen[0].travel[0, -1] == pytest.approx(1.5 * 87.0 / team.radar_range)
+
+
+@pytest.mark.parametrize(
+    "connected, told",
+    [
+        ("b", "connected='b': give"),
+        (3, "connected=3: give"),
+        ({"a": "base_station"}, r"connected\['a'\]='base_station': give a list"),
+        ({"z": ["a"]}, "connected names 'z', and the robots are a, b"),
+    ],
+)
+def test_odd_contacts_are_named(folder, connected, told):
+    team = TeamPlanner(folder, **SETTINGS, **RADIO)
+    with pytest.raises(ValueError, match=told):
+        team.plan(World().grid(), CELL, (0.0, 0.0), {"a": (3.0, 3.0), "b": (4.0, 3.0)}, now=0.0, connected=connected)
+
+
+def test_odd_names_are_named(folder):
+    with pytest.raises(ValueError, match="mates='b': give a list of names"):
+        RobotPlanner("a", mates="b")
+    with pytest.raises(ValueError, match="connected=True: give a list of names"):
+        RobotPlanner("a").plan(World().grid(), CELL, (0.0, 0.0), (3.0, 3.0), now=0.0, connected=True)
+    with pytest.raises(ValueError, match="'base_station' names the base station"):
+        TeamPlanner(folder, **SETTINGS, **RADIO).plan(World().grid(), CELL, (0.0, 0.0), {STATION: (3.0, 3.0)}, now=0.0)
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,14 @@ def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
     assert not planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=0.0, share=True).done
 
 
+def test_a_word_from_the_future_does_not_stay():
+    world, planner = World(), RobotPlanner("a", memory=5.0, **SETTINGS)
+    planner.hear(word("b", (9.0, 9.0), 1e9))
+    planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=1.0)
+    planner.hear(word("b", world.at[1], 2.0))
+    assert planner.heard["b"].time == 2.0
+
+
 def test_a_robot_without_a_pose_says_nothing_and_stays():
     planner = RobotPlanner("a", **SETTINGS)
     plan = planner.plan(World().grid(), CELL, (0.0, 0.0), None, now=0.0)

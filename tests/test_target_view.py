@@ -16,7 +16,7 @@ from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.choices import BETA, rank_by_criteria
-from maexp.envs.features import FEATURES
+from maexp.envs.features import FEATURES, feature_names
 
 MAPS = [make_map("maze_small", k) for k in (0, 3)]
 COUNT = 40  # no team knows more targets
@@ -267,6 +267,10 @@ def test_beside_others_a_policy_starts_from_what_they_leave_and_keeps_apart():
         features[0, FEATURES.index(name)] = value
     expected = 0.8 * 0.75 - 0.2 * math.log(3.0) + 0.3 * 0.5 + 0.06 * 2.0
     assert score_by_criteria(features).tolist() == pytest.approx([expected, 0.0], abs=1e-6)
+    told = torch.zeros(2, len(feature_names(radio=True)))
+    told[:, FEATURES.index("plan_gap")] = 4.0
+    told[1, feature_names(radio=True).index("tells")] = 1.0  # who goes to tell keeps away from nobody
+    assert score_by_criteria(told).tolist() == pytest.approx([0.24, 0.0], abs=1e-6)
 
 
 def test_choices_are_drawn_in_a_collector_and_the_likeliest_elsewhere():

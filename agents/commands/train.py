@@ -40,10 +40,11 @@ NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
 
 def prepare(overrides: list[str]) -> Recipe:
-    """For resume=RUN: that run's settings, then the new ones; for warm_start=POLICY: what that one starts from."""
+    """For resume=RUN: that run's settings, then the new ones; for policies to begin with: what they start from."""
     place = find_override(overrides, "resume")
     if place is None:
-        return Recipe(overrides, starts_as(find_override(overrides, "warm_start")))
+        begins = [find_override(overrides, name) for name in ("warm_start", "algorithm.begin_from")]
+        return Recipe(overrides, [word for one in begins for word in starts_as(one)])
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
     return continue_run(*_resumable(place), overrides, "train")

@@ -19,6 +19,7 @@ from maexp.envs.target_view import first_if_none
 
 SCORE = FEATURES.index("score")
 GAIN, CLAIMED, TRAVEL = (FEATURES.index(name) for name in ("gain", "claimed", "travel"))
+TELLS = feature_names(radio=True).index("tells")
 UNKNOWN_FAR, PLAN_GAP = (FEATURES.index(name) for name in ("unknown_far", "plan_gap"))
 NEARNESS = FEATURES.index("nearness")  # above 0 for every target
 OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
@@ -34,9 +35,10 @@ def score_by_utility(features: Tensor) -> Tensor:
 
 def score_by_criteria(features: Tensor) -> Tensor:
     """What `multi_criteria` would think of them, were the others to choose as `cost_utility` does."""
-    gain = features[..., GAIN] * (1.0 - features[..., CLAIMED])
-    beyond, apart = BEYOND * features[..., UNKNOWN_FAR], APART * features[..., PLAN_GAP]
-    return gain - WAY * features[..., TRAVEL] + beyond + apart
+    gain, apart = features[..., GAIN] * (1.0 - features[..., CLAIMED]), features[..., PLAN_GAP]
+    if features.shape[-1] > TELLS:  # nobody keeps away from who goes to tell the base station
+        apart = apart * (1.0 - features[..., TELLS])
+    return gain - WAY * features[..., TRAVEL] + BEYOND * features[..., UNKNOWN_FAR] + APART * apart
 
 
 STARTS = {"cost_utility": score_by_utility, "multi_criteria": score_by_criteria}

@@ -115,6 +115,8 @@ class ContactBook:
             links: robots that are not named keep the memory that they have.
             now: time [s].
         """
+        if BASE in team.names:
+            raise ValueError(f"{BASE!r} names the base station: give the robot another name")
         known = float(np.count_nonzero(grid.known == FREE)) * grid.cell**2
         self.crew |= set(team.names)
         self.used, self.now, self.seen, notes = used, now, set(links), []
@@ -220,7 +222,7 @@ class ContactBook:
         x, y = np.clip(np.floor(base / grid.cell).astype(np.int64), 0, (grid.width - 1, grid.height - 1)).T
         cell = (y * grid.width + x)[:, None]
         steps = np.take_along_axis(scene.distance.reshape(len(cell), -1), cell, 1)
-        reached = steps < UNREACHED
+        reached = (steps < UNREACHED) & (grid.cells(base)[:, None] >= 0)
         way = np.where(reached, steps * (grid.cell / STRAIGHT), DETOUR * np.linalg.norm(to, axis=-1))
         return way, np.where(reached[..., None], scene.ways_to(cell, WAY_AHEAD), to)
 
@@ -288,10 +290,29 @@ class ContactBook:
         return predict_margin(np, comm, cell, gap, blocked, grid.cell)
 
 
+def read_names(setting: str, names: Any) -> tuple[Hashable, ...]:
+    """Names of robots.
+
+    Raises:
+        ValueError: they are none; a single name is not several.
+    """
+    if isinstance(names, str | bytes | Mapping) or not isinstance(names, Collection):
+        raise ValueError(f"{setting}={names!r}: give a list of names")
+    return tuple(names)
+
+
 def read_links(connected: bool | Links, team: Team) -> Links:
-    """Who is connected with whom, as `ContactBook.look` takes it."""
+    """Who is connected with whom, as `ContactBook.look` takes it.
+
+    Raises:
+        ValueError: it is neither yes, no nor a mapping of the team's names to names.
+    """
     if isinstance(connected, Mapping):
-        return connected
+        if wrong := [name for name in connected if name not in team.names]:
+            raise ValueError(f"connected names {wrong[0]!r}, and the robots are {', '.join(map(str, team.names))}")
+        return {name: read_names(f"connected[{name!r}]", names) for name, names in connected.items()}
+    if not isinstance(connected, bool | np.bool_):
+        raise ValueError(f"connected={connected!r}: give True, False or {{name: [names]}}")
     there = [name for name, at in zip(team.names, team.at, strict=True) if np.isfinite(at).all()]
     base = [BASE] if connected else []
     return {name: [*base, *(mate for mate in there if mate != name)] for name in there}
@@ -299,15 +320,18 @@ def read_links(connected: bool | Links, team: Team) -> Links:
 
 def count_blocked(grid: KnownGrid, start: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Cells along the lines from `start`, [2], to points, [P, 2], on the grid [m] that are not known to be free ground,
-    int64 [P]: `maexp.kernels.radio.count_blocked`."""
-    along = (points - start) / grid.cell
-    pieces = np.maximum(np.ceil(np.abs(along).max(-1)), 1.0)
-    part = np.arange(int(pieces.max(initial=1.0)))
+    int64 [P]: `maexp.kernels.radio.count_blocked`. The points lie on the grid; what lies before it is blocked."""
+    line, size = points - start, np.array([grid.width, grid.height]) * grid.cell
+    pieces = np.maximum(np.ceil(np.abs(line / grid.cell).max(-1)), 1.0)
+    edge = np.where(line > 0.0, -start, size - start) / np.where(line == 0.0, np.inf, line)
+    enter = np.clip(edge.max(-1), 0.0, 1.0)  # share of the line before it comes upon the grid
+    first = np.maximum(np.floor(enter * pieces) - 1.0, 0.0)
+    part = first[:, None] + np.arange(int((pieces - first).max(initial=1.0)))
     there = part < pieces[:, None]
     share = np.where(there, (part + 0.5) / pieces[:, None], 0.0)
-    cells = grid.cells(start + (points - start)[:, None] * share[..., None])
+    cells = grid.cells(start + line[:, None] * share[..., None])
     free = (cells >= 0) & (grid.known.flat[np.maximum(cells, 0)] == FREE)
-    return (there & ~free).sum(-1)
+    return first.astype(np.int64) + (there & ~free).sum(-1)
 
 
 def open_book(

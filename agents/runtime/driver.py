@@ -186,7 +186,7 @@ class TeamDriver:
         Raises:
             ValueError: several maps claim one frame and their offsets are not known, or a map is none.
         """
-        self.begun = now if self.begun is None else self.begun
+        self.begun = now if self.begun is None else min(self.begun, now)
         notes: list[str] = []
         grid = self._merge(notes)
         if grid is None:

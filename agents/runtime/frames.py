@@ -143,10 +143,7 @@ def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
     alike = (first.resolution, first.origin, first.values.shape)
     if all((grid.resolution, grid.origin, grid.values.shape) == alike for grid in grids):
         return OccupancyGrid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
-    cell = min(grid.resolution for grid in grids)
-    corners = np.concatenate([_corners(grid) for grid in grids])
-    low = np.floor(corners.min(axis=0) / cell + 1e-6) * cell
-    columns, rows = np.ceil((corners.max(axis=0) - low) / cell - 1e-6).astype(int)
+    cell, low, (columns, rows) = span(grids)
     x, y = np.meshgrid(low[0] + (np.arange(columns) + 0.5) * cell, low[1] + (np.arange(rows) + 0.5) * cell)
     merged = np.full((rows, columns), -1, dtype=np.int8)
     for grid in grids:
@@ -158,6 +155,14 @@ def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         merged[inside] = np.maximum(merged[inside], grid.values[row[inside], column[inside]])
     return OccupancyGrid(merged, cell, (float(low[0]), float(low[1]), 0.0))
+
+
+def span(grids: list[OccupancyGrid]) -> tuple[float, np.ndarray, np.ndarray]:
+    """What a grid of them all takes: edge of its cells [m], its lower corner [2] [m], columns and rows, int64 [2]."""
+    cell = min(grid.resolution for grid in grids)
+    corners = np.concatenate([_corners(grid) for grid in grids])
+    low = np.floor(corners.min(axis=0) / cell + 1e-6) * cell
+    return cell, low, np.ceil((corners.max(axis=0) - low) / cell - 1e-6).astype(int)
 
 
 def _corners(grid: OccupancyGrid) -> np.ndarray:

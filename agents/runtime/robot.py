@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .contacts import BASE, Memory
+from .contacts import BASE, Memory, read_names
 from .frames import OccupancyGrid, merge_grids
 from .planner import Plan, TeamPlanner
 
@@ -59,6 +59,7 @@ class RobotPlanner:
     ):
         if not memory > 0.0:
             raise ValueError(f"memory={memory!r} must be a number of seconds above 0")
+        mates = read_names("mates", mates)
         if BASE in (name, *mates):
             raise ValueError(f"{BASE!r} names the base station: give the robot another name")
         self.name, self.memory, self.mates = name, memory, mates
@@ -128,11 +129,12 @@ class RobotPlanner:
             own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             own = merge_grids([own, *self.grids.values()])
             grid, resolution, origin = own.values, own.resolution, own.origin
+        self.heard = {name: one for name, one in self.heard.items() if one.time - now <= self.memory}  # none from later
         words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
-        links = {self.name: set(self._lately if connected is None else connected)}
+        links = {self.name: set(self._lately if connected is None else read_names("connected", connected))}
         self._lately.clear()
         self._take_memories()
         plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, connected=links, **more)

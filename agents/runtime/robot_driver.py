@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
 from .driver import DriverSettings, TeamDriver
-from .frames import OccupancyGrid, Pose, merge_grids, read_map, read_time
+from .frames import OccupancyGrid, Pose, merge_grids, read_map, read_time, span
+from .grid import MAX_CELLS
 from .planner import Plan
 from .robot import RobotPlanner, Word
-from .words import read_word
+from .words import FURTHEST, read_word
+
+FINEST = 1e-3  # edge of a cell of a map that is read [m]
 
 
 class RobotDriver(TeamDriver):
@@ -70,12 +74,20 @@ class RobotDriver(TeamDriver):
         """What came on a mate's /NAME/maexp/map, a nav_msgs/OccupancyGrid in the team's frame.
 
         Raises:
-            ValueError: it is in another frame, or none.
+            ValueError: it is in another frame, none, or larger than is planned on.
         """
         frame = message.header.frame_id.lstrip("/")
         if frame != self._root:
             raise ValueError(f"a map in the frame {frame} is not known")
-        self.told[name] = read_time(message.header.stamp), read_map(message)
+        grid = read_map(message)
+        numbers = (grid.resolution, *grid.origin)
+        if not all(map(math.isfinite, numbers)) or grid.resolution < FINEST or max(map(abs, numbers)) > FURTHEST:
+            raise ValueError(f"a map with cells of {grid.resolution:g} m at {grid.origin} is none")
+        if grid.values.size == 0 or grid.values.size > MAX_CELLS:
+            raise ValueError(
+                f"a map of {grid.values.size:,} cells: more than none, and at most {MAX_CELLS:,}, are read"
+            )
+        self.told[name] = read_time(message.header.stamp), grid
 
     def has_heard(self, name: str, now: float) -> bool:
         """Whether a mate has spoken at `now` [s] or since."""
@@ -100,8 +112,17 @@ class RobotDriver(TeamDriver):
             ValueError: where its map lies in the team's frame is not known.
         """
         own = super()._merge(notes)
-        told = [grid for time, grid in self.told.values() if self._counts(time)]
-        return None if own is None else merge_grids([own, *told])
+        if own is None:
+            return None
+        grids = [own]
+        for name, (time, grid) in self.told.items():
+            if not self._counts(time):
+                continue
+            if span([*grids, grid])[2].astype(float).prod() > MAX_CELLS:
+                notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
+                continue
+            grids.append(grid)
+        return merge_grids(grids)
 
     _merge = known
 

@@ -34,6 +34,7 @@ from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.env import find_followers
+from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.overrides import without
 from maexp.agents.settings.resolved import algorithm_settings, model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
@@ -224,6 +225,11 @@ class TrainingRun:
         if "memory" not in saved["updater"]:
             raise UserError(f"algorithm.begin_from={place} was not trained by expert iteration: it holds no branches.")
         check_action(saved, self.cfg)
+        theirs = saved["settings"]["model"].get("starts_from", ModelConfig().starts_from)
+        if theirs != (ours := model_settings(self.cfg).starts_from):
+            raise UserError(
+                f"algorithm.begin_from={place} starts from {theirs}, and model.starts_from={ours}: leave that out."
+            )
         load_matching(self.learner.policy, saved["policy"])
         self.learner.updater.load_memory(saved["updater"]["memory"])
         self.experience.update_policy_weights_()
