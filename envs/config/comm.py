@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from maexp.envs.fields import setting, words_of
+from maexp.kernels.constants import LOSS
 
 from .group import Group
 
 CELL_BYTES = 4  # of a message that tell of a cell: its number and what it is
 STEP = 0.1  # of the simulation [s]
 LONGEST_DELAY = 25.0  # of a message [s]
-SIGNAL_LOSS = 31.0  # of the nearest radio's signal [dB] (`maexp.kernels.radio`)
 CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
 
@@ -88,10 +88,10 @@ class CommConfig(Group):
     def checked(self) -> "CommConfig":
         """A signal must be able to arrive; a place becomes a tuple."""
         super().checked()
-        if self.signal and self.threshold >= self.power - SIGNAL_LOSS:
+        if self.signal and self.threshold >= self.power - LOSS:
             raise ValueError(
                 f"comm.threshold={self.threshold:g} dBm is out of reach: of comm.power={self.power:g} dBm "
-                f"{self.power - SIGNAL_LOSS:g} arrive at best, and nobody would ever hear anybody; lower the "
+                f"{self.power - LOSS:g} arrive at best, and nobody would ever hear anybody; lower the "
                 "threshold, or use comm.range=0 if that is meant"
             )
         return replace(self, base_station=_check_base(self.base_station))
