@@ -16,7 +16,6 @@ from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.runtime import RobotPlanner, TeamPlanner, Word
 from maexp.agents.runtime.contacts import BASE as STATION
 from maexp.agents.runtime.contacts import Memory, count_blocked, read_comm
-from maexp.agents.runtime.features import list_candidates
 from maexp.agents.runtime.frames import OccupancyGrid
 from maexp.agents.runtime.grid import KnownGrid
 from maexp.envs import CommConfig, ExplorationEnv
@@ -93,9 +92,9 @@ class Robots:
     def _spy(self, robot: int, learned) -> None:
         rank = learned.rank
 
-        def note(scene, *more):
-            self.seen[robot] = scene, list_candidates(scene, COUNT, *more)
-            return rank(scene, *more)
+        def note(scene, candidates):
+            self.seen[robot] = scene, candidates
+            return rank(scene, candidates)
 
         learned.rank = note
 

@@ -129,12 +129,11 @@ def _run_job(cfg: TrainSettings) -> None:
         print(f"{title} (done before)")
         return
     print(title)
-    if not list_checkpoints(where / "checkpoints"):
-        if (recipe := train.prepare(overrides)).defaults:
-            cfg = without_hydra(compose_recipe("train", recipe))
-    else:
+    if list_checkpoints(where / "checkpoints"):
         recipe = train.prepare([f"resume={quote(str(where))}"])
         cfg, overrides = without_hydra(compose_recipe("train", recipe)), without(recipe.words, "hydra", "resume")
+    elif (recipe := train.prepare(overrides)).defaults:
+        cfg = without_hydra(compose_recipe("train", recipe))
     check_ranges(cfg, "train")  # Hydra made these settings, so that the command has not checked them
     train.check(cfg)
     if train.run(cfg, where, overrides):

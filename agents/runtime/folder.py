@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from maexp.envs.choices import rank
-from maexp.envs.features import FEATURES, Moment, feature_names
+from maexp.envs.features import FEATURES, feature_names
 
-from .features import Candidates, Motion, list_candidates
+from .features import Candidates, Motion
 from .scene import ArrayScene
 from .shipped import CONTRACT
 
@@ -94,29 +93,19 @@ class LearnedChoice:
         }
         return self.session.run(["logits"], inputs)[0][0]
 
-    def rank(
-        self,
-        scene: ArrayScene,
-        heading,
-        speed,
-        last,
-        time_left: float,
-        motion: Motion,
-        telling: Callable[[Moment], Moment] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What every robot thinks of every target, float [n, K], and of going to tell the base station, float [n], -inf
-        where that is no choice; the arguments of `list_candidates`.
+    def rank(self, scene: ArrayScene, candidates: Candidates) -> tuple[np.ndarray, np.ndarray]:
+        """What every robot of a scene thinks of every target, float [n, K], and of going to tell the base station,
+        float [n], -inf where that is no choice, by the candidates that it is shown.
 
         Targets that the policy was not shown come behind the others.
         """
-        candidates = list_candidates(scene, self.contract.candidates, heading, speed, last, time_left, motion, telling)
         logits, shown = np.zeros(scene.travel.shape), np.zeros(scene.travel.shape, bool)
         count, found = candidates.target.shape[1], self.logits(candidates)
         robot, place = np.nonzero(candidates.mask[:, :count])
         target = candidates.target[robot, place]
         logits[robot, target], shown[robot, target] = found[robot, place], True
         tell = np.full(len(found), -np.inf)
-        if telling is not None:
+        if candidates.mask.shape[1] > count:
             tell = np.where(candidates.mask[:, count], found[:, count], -np.inf)
         return rank(scene, logits, shown), tell
 

@@ -19,7 +19,7 @@ from maexp.kernels.constants import FREE, UNREACHED
 from .choices import CHOICES
 from .coarse import coarsen
 from .contacts import Links, open_book, read_links
-from .features import Motion
+from .features import Motion, list_candidates
 from .folder import Contract, LearnedChoice
 from .grid import MAX_CELLS, KnownGrid, read_grid
 from .imagine import LOOKAHEAD, load_foresight, read_lookahead
@@ -290,8 +290,8 @@ class TeamPlanner:
             telling = None
             if self.book is not None:
                 telling = partial(self.book.add_to, scene=scene, names=[team.names[k] for k in robots], can=can)
-            now = heading[robots], team.speed[robots], before, time_left, self.motion
-            preference, tell = self.learned.rank(scene, *now, telling)
+            count, now = self.learned.contract.candidates, (heading[robots], team.speed[robots], before, time_left)
+            preference, tell = self.learned.rank(scene, list_candidates(scene, count, *now, self.motion, telling))
         if self.foresight is not None:
             preference = self.foresight.improve(scene, preference, team, self.motion, self.learned is not None, notes)
         return preference, tell
