@@ -15,7 +15,7 @@ import warp as wp
 
 from maexp.envs.choices import WAY_AHEAD
 from maexp.envs.features import DETOUR, Contacts, Moment, add_telling, predict_margin
-from maexp.envs.navigation import Navigation, to_action
+from maexp.envs.navigation import Navigation
 from maexp.envs.simulation import radio_struct
 from maexp.kernels.constants import FREE, STRAIGHT, UNREACHED
 from maexp.kernels.launches import launch_named, view
@@ -50,10 +50,10 @@ class ContactView:
         moment = add_telling(moment, can, way, begin, to)
         return replace(moment, radio=self._contacts(moment, nav))
 
-    def goals(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The action that leads robots to the base station: region int64 [E, N] and offset float32 [E, N, 2]."""
+    def goals(self) -> torch.Tensor:
+        """Where robots go that tell the base station, float32 [E, N, 2] [m]."""
         base = self.env.simulation.tensors["base"][:, None, :2]
-        return to_action(self.env, base.expand(-1, self.env.num_robots, -1))
+        return base.expand(-1, self.env.num_robots, -1)
 
     def _way_to_base(self, nav: Navigation, base: torch.Tensor, to: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """How far it is to the base station [m], [E, N, 1], and a point near the beginning of the way, from the robot,

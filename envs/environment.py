@@ -17,6 +17,7 @@ from maexp.envs.config import (
 )
 from maexp.envs.copies import describe, rebuild
 from maexp.envs.map import MapError, PointCloudMap
+from maexp.envs.regions import from_regions
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.settings import complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
@@ -189,23 +190,20 @@ class ExplorationEnv(EnvBase):
             state["error"] |= bad.to(torch.int32) * ERROR_ACTION
             state["command"].copy_(torch.nan_to_num(control))
         else:
-            region, offset, tells = self._find_goals(action)
-            if self.strategy is not None:
-                region, offset = self.strategy.direct(region, offset, tells)
-            state["region"].copy_(region)
-            state["offset"].copy_(offset)
+            goals, tells = self._find_goals(action)
+            state["wanted"].copy_(goals if self.strategy is None else self.strategy.direct(goals, tells))
 
-    def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """Region and offset of the action, or of the targets that it names instead, and who is to tell the base
-        station."""
+    def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Goals float32 [E, N, 2] [m] of the action, by targets, in metres, or by regions and offsets as in the paper;
+        and who is to tell the base station."""
         if "target" not in action.keys():
             if self.target_view is not None:
                 self.target_view.forget()
-            return action["region"], action["offset"], None
+            given = action.get("goal", None)
+            return from_regions(self, action["region"], action["offset"]) if given is None else given, None
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
-        goals = self.target_view.take(action["target"], action.get("preference", None))
-        return *goals, self.target_view.tells
+        return self.target_view.take(action["target"], action.get("preference", None)), self.target_view.tells
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors

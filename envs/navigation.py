@@ -418,10 +418,6 @@ class Navigation:
         launch_named(self.launch, goals._aim, tuple(chosen.shape), values)
         return target
 
-    def to_action(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """`to_action` of this env's goals [m], float [E, N, 2]."""
-        return _to_action(points, self.arrays, self.launch)
-
 
 def known_grids(env: ExplorationEnv) -> KnownGrids:
     """Grids of what the teams of an env know, a row for each env, or for each robot where communication is limited.
@@ -434,19 +430,3 @@ def known_grids(env: ExplorationEnv) -> KnownGrids:
     map_id, *flags = (wp.from_torch(state[name]) for name in ("map_id", f"{prefix}_free", f"{prefix}_boundary"))
     false = wp.from_torch(state["false_walls"]) if sim.settings.false_alarms else None
     return KnownGrids(sim.maps, grids, map_id, *flags, env.num_robots if limited else 1, cells, false)
-
-
-def to_action(env: ExplorationEnv, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Region int64 [E, N] and offset float32 [E, N, 2] of goals [m], shape [E, N, 2]; the nearest if outside."""
-    arrays = {"map_id": view(env.simulation.tensors["map_id"])}
-    arrays |= {name: view(env.simulation.map_tensors[name], wp.vec2) for name in ("lower", "upper")}
-    return _to_action(points, arrays, launch_on(env.device))
-
-
-def _to_action(points: torch.Tensor, arrays: dict, launch: Launch) -> tuple[torch.Tensor, torch.Tensor]:
-    points = points.float().contiguous()
-    region = torch.empty(points.shape[:2], dtype=torch.int64, device=points.device)
-    offset = torch.empty_like(points)
-    values = arrays | {"point": view(points, wp.vec2), "region": view(region), "offset": view(offset, wp.vec2)}
-    launch_named(launch, goals._to_action, tuple(region.shape), values)
-    return region, offset

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import torch
 
 from maexp.envs.features import DETOUR, PACE
-from maexp.envs.navigation import to_action
 from maexp.kernels import unpack_flags
 from maexp.kernels.types import DT
 
@@ -75,19 +74,15 @@ class Strategy:
         }
 
     @torch.no_grad()
-    def direct(
-        self, region: torch.Tensor, offset: torch.Tensor, tells: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region [E, N] and offset [E, N, 2] of where robots go, given where their policy sends them; `tells`, bool
-        [E, N]: whom it sends to tell the base station, until they have told it."""
+    def direct(self, goal: torch.Tensor, tells: torch.Tensor | None = None) -> torch.Tensor:
+        """Where robots go, given where their policy sends them, float32 [E, N, 2] [m]; `tells`, bool [E, N]: whom it
+        sends to tell the base station, until they have told it."""
         self.look()
         if tells is not None:
             self.state["duty"] |= tells & self.can_tell()
-        duty, goal = getattr(self, f"_{self.name}")()
+        duty, own = getattr(self, f"_{self.name}")()
         self.state["duty"] = duty & (self.sim["collided"] == 0)
-        own_region, own_offset = to_action(self.env, goal)
-        duty = self.state["duty"]
-        return torch.where(duty, own_region, region), torch.where(duty.unsqueeze(-1), own_offset, offset)
+        return torch.where(self.state["duty"].unsqueeze(-1), own, goal)
 
     def can_tell(self) -> torch.Tensor:
         """Robots that may choose to go and tell the base station something that it does not know, bool [E, N]."""

@@ -161,8 +161,8 @@ class TargetView:
         [m]."""
         self.state["has_last"], self.state["last"] = chosen >= 0, where
 
-    def take(self, index: torch.Tensor, preference: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Send every robot to a candidate, int64 [E, N]; region int64 [E, N] and offset float32 [E, N, 2] of the goals.
+    def take(self, index: torch.Tensor, preference: torch.Tensor | None = None) -> torch.Tensor:
+        """Send every robot to a candidate, int64 [E, N]; the goals, float32 [E, N, 2] [m].
 
         With `targets.distinct` a robot gets another one where the one that is named is taken.
 

@@ -216,7 +216,7 @@ class TargetTracker:
 
     def take(
         self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> torch.Tensor:
         """Remember a choice and turn it into goals.
 
         Args:
@@ -226,21 +226,21 @@ class TargetTracker:
             waits: bool [E, N], robots that do not drive anywhere, but as `targets.spare` says; None: none does.
 
         Returns:
-            region int64 [E, N] and offset float32 [E, N, 2].
+            float32 [E, N, 2] [m].
         """
         self.state["chosen"] = chosen.long().unsqueeze(-1).clone()
         return self.goals(chosen, cell, toward, waits)
 
     def goals(
         self, chosen: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> torch.Tensor:
         """What `take` returns, without remembering the choice."""
         chosen, cell, toward = chosen.long().contiguous(), cell.long().clone(), toward.float().clone()
         target = self.nav.aim(chosen, cell, toward)
         goal = self._approach(cell, target, toward)
         if waits is not None and self.env.targets_config.distinct:
             goal = torch.where(waits.unsqueeze(-1), self._rest(), goal)
-        return self.nav.to_action(goal)
+        return goal
 
     def _rest(self) -> torch.Tensor:
         """Where robots wait for which no target is left [m], float32 [E, N, 2].

@@ -1,4 +1,4 @@
-"""Goals of robots: where each goes that has chosen a target or none, and the region and offset of a point.
+"""Goals of robots: where each goes that has chosen a target or none, and goals as the paper's regions and offsets.
 
 Numbers at random come from (seed, env, episode, macro step) alone: no generator's state, and the same for env i in any
 batch.
@@ -80,6 +80,38 @@ def _aim(
 
 
 @wp.func
+def region_point(lower: wp.vec2, upper: wp.vec2, region: int, offset: wp.vec2) -> wp.vec2:
+    """A place in a region (ix * REGIONS + iy): its centre + offset * half a region [m]."""
+    half = (upper - lower) / (2.0 * float(REGIONS))
+    x = lower[0] + half[0] * (float(2 * (region / REGIONS) + 1) + wp.clamp(offset[0], -1.0, 1.0))
+    y = lower[1] + half[1] * (float(2 * (region % REGIONS) + 1) + wp.clamp(offset[1], -1.0, 1.0))
+    return wp.vec2(x, y)
+
+
+@wp.kernel
+def _from_regions(
+    # Map:
+    map_id: wp.array(dtype=wp.int32),  # [env]
+    lower: wp.array(dtype=wp.vec2),  # [map]
+    upper: wp.array(dtype=wp.vec2),  # [map]
+    # In:
+    region: wp.array2d(dtype=wp.int64),  # [env, robot]
+    offset: wp.array2d(dtype=wp.vec2),  # [env, robot], from -1 to 1
+    # Out:
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot] [m]
+):
+    """Goals of the paper's action; NaN where an offset is not finite."""
+    e, i = wp.tid()
+    m = map_id[e]
+    o = offset[e, i]
+    if wp.isfinite(o[0]) and wp.isfinite(o[1]):
+        r = int(wp.clamp(region[e, i], wp.int64(0), wp.int64(REGIONS * REGIONS - 1)))
+        goal[e, i] = region_point(lower[m], upper[m], r, o)
+    else:
+        goal[e, i] = wp.vec2(wp.nan, wp.nan)
+
+
+@wp.func
 def split(at: float, lower: float, side: float):
     """Number of the interval that a coordinate lies in, of `REGIONS`, and where in it, from -1 to 1."""
     share = (at - lower) / wp.max(side, 1.0e-9) * float(REGIONS)
@@ -88,21 +120,22 @@ def split(at: float, lower: float, side: float):
 
 
 @wp.kernel
-def _to_action(
+def _to_regions(
     # Map:
     map_id: wp.array(dtype=wp.int32),  # [env]
     lower: wp.array(dtype=wp.vec2),  # [map]
     upper: wp.array(dtype=wp.vec2),  # [map]
     # In:
-    point: wp.array2d(dtype=wp.vec2),  # [env, robot] [m]
+    goal: wp.array2d(dtype=wp.vec2),  # [env, robot] [m]
     # Out:
     region: wp.array2d(dtype=wp.int64),  # [env, robot]
     offset: wp.array2d(dtype=wp.vec2),  # [env, robot], from -1 to 1
 ):
+    """The paper's action that leads nearest to goals."""
     e, i = wp.tid()
     low = lower[map_id[e]]
     side = upper[map_id[e]] - low
-    x, right = split(point[e, i][0], low[0], side[0])
-    y, up = split(point[e, i][1], low[1], side[1])
+    x, right = split(goal[e, i][0], low[0], side[0])
+    y, up = split(goal[e, i][1], low[1], side[1])
     region[e, i] = wp.int64(x * REGIONS + y)
     offset[e, i] = wp.vec2(right, up)

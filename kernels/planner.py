@@ -1,4 +1,4 @@
-"""Local planners: goals from actions, direct controls from the policy, and which planner drives."""
+"""Local planners: goals of the policy, direct controls from the policy, and which planner drives."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.stopping import hold_turns
-from maexp.kernels.types import ERROR_ACTION, REGIONS, Maps
+from maexp.kernels.types import ERROR_ACTION, Maps
 
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -43,33 +43,31 @@ def _set_goal(
     # State in:
     active: wp.array(dtype=wp.int32),  # [env]
     # Scratch in:
-    region: wp.array2d(dtype=wp.int64),  # [env, robot]
-    offset: wp.array2d(dtype=wp.vec2),  # [env, robot]
+    wanted: wp.array2d(dtype=wp.vec2),  # [env, robot]
     # State in and out:
     error: wp.array(dtype=wp.int32),  # [env]
     # State out:
     goal: wp.array2d(dtype=wp.vec2),  # [env, robot]
     waypoint: wp.array2d(dtype=wp.vec2),  # [env, robot]
 ):
-    """Goal = region centre + offset * half a region (region = ix * REGIONS + iy); out of bounds is clamped."""
+    """Take the goals that the policy wants, those beyond the map to its edge."""
     e, i = wp.tid()
     if active[e] == 0:
         return
-    m = map_id[e]
-    o = offset[e, i]
-    if not (wp.isfinite(o[0]) and wp.isfinite(o[1])):
+    at = wanted[e, i]
+    if not (wp.isfinite(at[0]) and wp.isfinite(at[1])):
         wp.atomic_or(error, e, ERROR_ACTION)
         return
-    r = int(wp.clamp(region[e, i], wp.int64(0), wp.int64(REGIONS * REGIONS - 1)))
-    half = (maps.upper[m] - maps.lower[m]) / (2.0 * float(REGIONS))
-    x = maps.lower[m][0] + half[0] * (float(2 * (r / REGIONS) + 1) + wp.clamp(o[0], -1.0, 1.0))
-    y = maps.lower[m][1] + half[1] * (float(2 * (r % REGIONS) + 1) + wp.clamp(o[1], -1.0, 1.0))
+    low = maps.lower[map_id[e]]
+    high = low + (maps.upper[map_id[e]] - low)  # where the last region ends: it may be an ulp beyond `upper`
+    x = wp.clamp(at[0], low[0], high[0])
+    y = wp.clamp(at[1], low[1], high[1])
     goal[e, i] = wp.vec2(x, y)
     waypoint[e, i] = wp.vec2(x, y)
 
 
 def set_goals(launch: Launch, shard: Shard) -> None:
-    """Turn the policy's regions and offsets into goals."""
+    """Take the goals that the policy wants."""
     if shard.settings.planner != "direct":
         shard.call(launch, _set_goal)
 

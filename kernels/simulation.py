@@ -142,7 +142,7 @@ class Simulation:
         self.threads.each(self.shards, lambda shard: shard.replay(step.reset))
 
     def set_goals(self) -> None:
-        """Take ``region`` and ``offset`` (or ``command``), and start the macro step's reward at zero."""
+        """Take ``wanted`` (or ``command``), and start the macro step's reward at zero."""
         self.tensors["terms"].zero_()
         self.threads.each(self.shards, lambda shard: shard.replay(set_goals))
 

@@ -129,9 +129,8 @@ STATE = {
 SCRATCH = {
     # What the host asks for.
     "mask": Field(wp.int32, "E", "", "1 for the envs that a reset starts anew, or whose pictures are drawn"),
-    "region": Field(wp.int64, "E N", "", "the policy's region, ix * 8 + iy"),
-    "offset": Field(wp.vec2, "E N", "", "its offset in that region, in [-1, 1] half regions"),
-    "command": Field(wp.vec2, "E N", "", "its controls, if it drives itself, shares of the limits in [-1, 1]"),
+    "wanted": Field(wp.vec2, "E N", "m", "where the policy sends the robot next"),
+    "command": Field(wp.vec2, "E N", "", "the policy's controls, if it drives itself, shares of the limits in [-1, 1]"),
 
     # Who is near whom in this local step.
     "facing": Field(wp.vec2, "E N", "", "unit vector ahead of the robot"),

@@ -51,6 +51,39 @@ def oracle_dir() -> Path:
     return folder
 
 
+@pytest.fixture
+def own_domain(monkeypatch) -> None:
+    """This process, and those that it starts, in a DDS domain of their own on this machine."""
+    from loopback import surroundings
+
+    for name, value in surroundings().items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.fixture(scope="session")
+def small_suite(tmp_path_factory) -> Path:
+    """The file of a frozen suite of two parts, four short episodes each: not to be changed."""
+    from small_suite import make_small_suite
+
+    return make_small_suite(tmp_path_factory.mktemp("suite") / "small.yaml")
+
+
+@pytest.fixture(scope="session")
+def suite_run(small_suite, tmp_path_factory) -> Path:
+    """The folder of a run of it: not to be changed."""
+    from maexp.agents.cli import main
+
+    where, words = tmp_path_factory.mktemp("runs") / "run", ["policy=nearest_frontier", "num_envs=3"]
+    assert main(["suite", "run", str(small_suite), *words, f"hydra.run.dir={where}"]) == 0
+    return where
+
+
+@pytest.fixture
+def copied_run(suite_run, tmp_path) -> Path:
+    """A copy of it that a test may change."""
+    return Path(shutil.copytree(suite_run, tmp_path / "copy"))
+
+
 @pytest.fixture(scope="session")
 def whole_run(tmp_path_factory) -> Path:
     """Folder of a tiny benchmark that ran in one go: not to be changed."""

@@ -3,6 +3,9 @@
 import os
 import random
 
+QUICK = {"stands": 0.2, "limit": 0.5, "answer": 20.0}
+"""Of `Serving`: nobody waits for long [s]."""
+
 LOOPBACK = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='true'/></Interfaces></General>"
     "</Domain></CycloneDDS>"

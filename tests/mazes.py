@@ -4,6 +4,7 @@ from maexp.envs import ExplorationEnv, PlannerConfig, make_map
 
 MAPS = [make_map("maze_small", k) for k in (0, 3)]
 REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
+GOAL = ("agents", "action", "goal")
 
 
 def make_env(num_envs=4, planner="wavefront", clearance=None, **settings) -> ExplorationEnv:

@@ -11,6 +11,7 @@ from maexp.envs import CommConfig, ExplorationEnv
 from maexp.envs.belief import Beliefs
 from maexp.envs.branches import Branches
 from maexp.envs.navigation import Navigation
+from maexp.envs.regions import from_regions
 from maexp.kernels.state import STATE
 
 pytestmark = pytest.mark.kernels
@@ -105,8 +106,8 @@ def test_a_branch_of_the_same_choice_goes_as_the_original():
     branches.look(torch.arange(3))
     branches.branch(0, torch.ones(3, 2, dtype=torch.bool))
     ours, names = branches.env.simulation.tensors, ("pose", "covered", "covered_sum", "seen_free", "viewers_boundary")
-    for name in ("region", "offset"):
-        ours[name].copy_(td["agents", "action", name].repeat_interleave(2, 0))
+    action = td["agents", "action"]
+    ours["wanted"].copy_(from_regions(env, action["region"], action["offset"]).repeat_interleave(2, 0))
     branches.env.simulation.set_goals()
     branches.env.simulation.step(0, env.local_steps)
     assert all(torch.equal(env.simulation.tensors[name], one) for name, one in before.items())

@@ -54,13 +54,13 @@ def test_it_chooses_as_the_simulators_search(scenario, index):
         where = (seen["grid"][0], seen["resolution"], seen["origin"], seen["poses"][0])
         more = {"velocities": seen["velocities"][0], "time_left": seen["time_left"], "now": seen["time"]}
         goals, plain = (team.plan(*where, **more).goals for team in teams)
-        region, offset = search(None)
+        sent = search.goals()
         nav, chosen = search.tracker.nav, search.tracker.state["chosen"][0, :, 0]
         place = [int((nav.block[0, 0] == one).nonzero()[0]) for one in chosen]
         points = np.array([nav.point[0, robot, k].numpy() for robot, k in enumerate(place)])
         same += (np.linalg.norm(points - goals, axis=-1) < 1e-3).tolist()
         departs += (np.linalg.norm(plain - goals, axis=-1) > 1e-3).tolist()
-        td["agents", "action", "region"], td["agents", "action", "offset"] = region, offset
+        td["agents", "action", "goal"] = sent
         td = env.step(td)["next"].exclude("agents", "reward")
     assert np.mean(same) >= 0.75
     assert np.any(np.array(departs) & same)

@@ -29,7 +29,8 @@ from maexp.agents.runtime import TeamPlanner
 from maexp.agents.runtime.agent import TeamAgent
 from maexp.agents.suites.players import Player
 from maexp.envs import ObservationConfig, make_map
-from maexp.envs.navigation import Navigation
+from maexp.envs.regions import from_regions
+from maexp.envs.targets import TargetTracker
 
 pytestmark = pytest.mark.slow  # processes
 
@@ -175,13 +176,13 @@ def test_an_echo_is_no_policy():
 
 def note_goals(monkeypatch) -> list[torch.Tensor]:
     """Where planners inside send robots from now on, float32 [E, N, 2] [m] each time."""
-    points, to_action = [], Navigation.to_action
+    points, goals = [], TargetTracker.goals
 
-    def note(nav, goals):
-        points.append(goals.clone())
-        return to_action(nav, goals)
+    def note(*arguments):
+        points.append(goals(*arguments))
+        return points[-1]
 
-    monkeypatch.setattr(Navigation, "to_action", note)
+    monkeypatch.setattr(TargetTracker, "goals", note)
     return points
 
 
@@ -205,8 +206,9 @@ def test_a_process_chooses_as_its_class_does_inside(monkeypatch):
 
 
 @pytest.mark.parametrize("policy", ["cost_utility", "hungarian", "small_mazes"])
-def test_goals_in_metres_are_the_bits_of_the_planners(policy, monkeypatch):
-    """Where a planner inside sends its robots, as float64 metres over the wire, becomes the same region and offset."""
+def test_goals_over_the_wire_are_those_of_planners_inside(policy, monkeypatch):
+    """As float64 metres: to the bit where a planner names regions and offsets, to their rounding where it names
+    targets."""
     points = note_goals(monkeypatch)
     shown = ObservationConfig(pictures=False, targets=24 if policy == "small_mazes" else 0)
     env = make_env(3, observation=shown)
@@ -216,10 +218,10 @@ def test_goals_in_metres_are_the_bits_of_the_planners(policy, monkeypatch):
         sight.look()
         before = env.simulation.tensors["center"].clone()
         acted = env.step(play_inside(state))
-        sent = [env.simulation.tensors[name].clone() for name in ("region", "offset")]
+        sent = env.simulation.tensors["wanted"].clone()
         wired = wire.unpack(wire.pack({"type": "goals", "goals": points[-1].numpy().astype(np.float64)})[4:])["goals"]
-        region, offset = sight.to_action(wired)
-        assert torch.equal(region, sent[0].long()) and torch.equal(offset, sent[1])
+        goals = from_regions(env, *sight.to_action(wired))
+        assert torch.equal(goals, sent) or (policy == "small_mazes" and torch.allclose(goals, sent, rtol=0, atol=1e-5))
         state = acted["next"]
     assert not torch.equal(before, env.simulation.tensors["center"])
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import find_browser, open_tab
-from small_suite import make_small_suite
 
 from maexp.agents.cli import main
 from maexp.agents.suites import rows, site
@@ -24,25 +23,19 @@ PLAYED = ("nearest_frontier", "random")
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Path:
-    """The file of a frozen suite of two parts, four short episodes each."""
-    return make_small_suite(tmp_path_factory.mktemp("suite") / "small.yaml")
-
-
-@pytest.fixture(scope="module")
-def runs(small, tmp_path_factory) -> list[Path]:
+def runs(small_suite, tmp_path_factory) -> list[Path]:
     """The folders of two runs of it: not to be changed."""
     where = tmp_path_factory.mktemp("runs")
     for name in PLAYED:
-        assert main(["suite", "run", str(small), f"policy={name}", f"hydra.run.dir={where / name}"]) == 0
+        assert main(["suite", "run", str(small_suite), f"policy={name}", f"hydra.run.dir={where / name}"]) == 0
     return [where / name for name in PLAYED]
 
 
 @pytest.fixture(scope="module")
-def board(small, runs, tmp_path_factory) -> Path:
+def board(small_suite, runs, tmp_path_factory) -> Path:
     """A leaderboard of them: not to be changed."""
     out = tmp_path_factory.mktemp("board") / "site"
-    assert main(["leaderboard", *map(str, runs), f"out={out}", f"suite={small}"]) == 0
+    assert main(["leaderboard", *map(str, runs), f"out={out}", f"suite={small_suite}"]) == 0
     return out
 
 
@@ -128,9 +121,9 @@ def test_who_is_replaced_is_told_and_another_policy_is_not(board, tmp_path, caps
     assert "a b would replace a/b" in told.err and len(read_all(out)) == 3
 
 
-def test_rows_stay_and_join(small, runs, board, tmp_path, capsys):
+def test_rows_stay_and_join(small_suite, runs, board, tmp_path, capsys):
     out = tmp_path / "site"
-    assert main(["leaderboard", str(runs[1]), f"out={out}", f"suite={small}", "verify=false"]) == 0
+    assert main(["leaderboard", str(runs[1]), f"out={out}", f"suite={small_suite}", "verify=false"]) == 0
     assert [one["verified"] for one in read_all(out)] == [False]
     assert main(["leaderboard", str(board / "small" / "nearest_frontier.json"), f"out={out}"]) == 0
     assert [one["policy"] for one in read_all(out)] == list(PLAYED)
@@ -169,9 +162,9 @@ def edit_maps(run: Path) -> None:
         (edit_maps, ["verify=false"], "was played on other maps or starts (seed=0)"),
     ],
 )
-def test_a_run_that_is_not_what_it_says_is_no_row(edit, words, told, small, runs, tmp_path, capsys):
+def test_a_run_that_is_not_what_it_says_is_no_row(edit, words, told, small_suite, runs, tmp_path, capsys):
     edit(Path(shutil.copytree(runs[1], tmp_path / "run")))
-    assert main(["leaderboard", str(tmp_path / "run"), f"out={tmp_path / 'site'}", f"suite={small}", *words]) == 2
+    assert main(["leaderboard", str(tmp_path / "run"), f"out={tmp_path / 'site'}", f"suite={small_suite}", *words]) == 2
     assert told in capsys.readouterr().err
     assert not (tmp_path / "site").exists()
 

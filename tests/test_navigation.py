@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from mazes import OFFSET, REGION, make_env
+from mazes import GOAL, OFFSET, REGION, make_env
 from oracle.grid import frontier_cells, geodesic_distance
 from oracle.pace import look_around
 from worlds import room, ways_to_blocks
 
 from maexp.envs import RadarConfig, RobotConfig, make_map
 from maexp.envs.navigation import Navigation
+from maexp.envs.regions import to_regions
 from maexp.envs.targets import keyed_uniform
 from maexp.kernels.block_size import block_sides
 from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN, UNREACHED
@@ -77,14 +78,16 @@ def test_travel_and_points_of_targets():
 def test_actions_mean_the_points_they_came_from():
     env = make_env(3)
     env.reset()
-    nav = Navigation(env)
     points = keyed_uniform(env, 2) * 36.0
-    region, offset = nav.to_action(points)
+    region, offset = to_regions(env, points)
     td = env.reset()
     td[REGION], td[OFFSET] = region, offset
     env.step(td)
     torch.testing.assert_close(env.simulation.tensors["goal"], points, atol=1e-4, rtol=0)
-    region, offset = nav.to_action(points + 1000.0)
+    td[GOAL], td[REGION] = points, 63 - region
+    env.step(td)
+    assert torch.equal(env.simulation.tensors["goal"], points), "goals in metres count before regions, to the bit"
+    region, offset = to_regions(env, points + 1000.0)
     assert (region == 63).all() and (offset == 1.0).all()
 
 

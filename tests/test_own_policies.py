@@ -77,6 +77,8 @@ def odd(what):
 number = odd(lambda action: 3)
 no_action = odd(lambda action: action.clear())
 no_offset = odd(lambda action: action.__delitem__("offset"))
+flat = odd(lambda action: action.update(goal=action["offset"][..., 0]))
+endless = odd(lambda action: action.update(goal=action["offset"] / 0))
 wide = odd(lambda action: action.update(offset=action["offset"][..., :1]))
 floats = odd(lambda action: action.update(region=action["region"].float()))
 beyond = odd(lambda action: action.update(region=action["region"] + 64))
@@ -150,7 +152,9 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
         ("my_robots:raises", r"calling it with the env raised RuntimeError in my_robots.py, line \d+: no weights"),
         ("my_robots:looks", r"raised KeyError.* The env shows no targets: add observation.targets=24\."),
         ("my_robots:number", "policy my_robots.number returned a int: return the tensordict"),
-        ("my_robots:no_action", "policy my_robots.no_action wrote no action: .* must hold region, int"),
+        ("my_robots:flat", r"policy my_robots.flat wrote a goal of shape \[\d+, 3\]: "),
+        ("my_robots:endless", "policy my_robots.endless wrote a goal that is NaN or infinite: "),
+        ("my_robots:no_action", "policy my_robots.no_action wrote no action: .* must hold goal, float"),
         ("my_robots:no_offset", "policy my_robots.no_offset wrote no offset"),
         ("my_robots:wide", r"wrote a offset of shape \[1, 3, 1\]"),
         ("my_robots:floats", "wrote a region of float32"),

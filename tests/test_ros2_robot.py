@@ -289,6 +289,6 @@ def test_robots_that_drive_themselves_play_a_suite(tmp_path):
     for name in files:
         with np.load(over / "actions" / name) as one, np.load(inside / "actions" / name) as other:
             assert not any(one["reasons"])
-            alike = one["region"].shape == other["region"].shape and np.array_equal(one["region"], other["region"])
-            same.append(alike and bool(np.abs(one["offset"] - other["offset"]).max() < 1e-5))
+            alike = one["goal"].shape == other["goal"].shape
+            same.append(alike and bool(np.abs(one["goal"] - other["goal"]).max() < 1e-4))
     assert sum(same) >= 5 and not all(same), same

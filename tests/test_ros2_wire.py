@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from loopback import surroundings
 
 pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED: DDS is not tested")
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
@@ -170,12 +169,6 @@ def test_hashes_of_definitions(name):
     assert f"typehash=RIHS01_{kind.hash};".encode() in str(quality(kind, reads=False)).encode()
 
 
-@pytest.fixture
-def alone(monkeypatch):
-    for name, value in surroundings().items():
-        monkeypatch.setenv(name, value)
-
-
 def wait_for(wire, reader, seconds=10.0):
     """The first messages that come."""
     for _ in range(int(10 * seconds)):
@@ -185,7 +178,7 @@ def wait_for(wire, reader, seconds=10.0):
     raise AssertionError("nothing came")
 
 
-def test_a_map_reaches_who_comes_later(alone):
+def test_a_map_reaches_who_comes_later(own_domain):
     here, there = Wire(), Wire()
     writer = here.writer("/a/map")
     for number in (7, 8):
@@ -199,7 +192,7 @@ def test_a_map_reaches_who_comes_later(alone):
     assert not there.reader("/b/map").matched
 
 
-def test_a_goal_is_delivered_once(alone):
+def test_a_goal_is_delivered_once(own_domain):
     here, there = Wire(), Wire()
     writer, reader = here.writer("/a/goal_pose"), there.reader("/a/goal_pose")
     while not (writer.matched and reader.matched):
@@ -214,7 +207,7 @@ def test_a_goal_is_delivered_once(alone):
 SEND = "/a/navigate_to_pose/_action/send_goal"
 
 
-def test_a_service_answers_who_asks(alone):
+def test_a_service_answers_who_asks(own_domain):
     here, one, other = Wire(), Wire(), Wire()
     server, clients = here.server(SEND), [one.client(SEND), other.client(SEND)]
     assert here.server(SEND) is server, "two would both answer"
@@ -236,7 +229,7 @@ def test_a_service_answers_who_asks(alone):
         assert [answer.seq for answer in got] == [1, 2][:count] and all(answer.accepted == accepted for answer in got)
 
 
-def test_names_of_services_on_the_wire(alone):
+def test_names_of_services_on_the_wire(own_domain):
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 
     wire = Wire()

@@ -12,7 +12,9 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.suites import rows, site
 from maexp.agents.suites.frozen import freeze, read_frozen
+from maexp.agents.suites.play import build_env, build_maps, build_replay
 from maexp.agents.suites.suite import FOLDER, load_suite
+from maexp.envs import ObservationConfig
 
 pytestmark = pytest.mark.slow  # whole runs of suites
 
@@ -47,6 +49,16 @@ def played(small, tmp_path_factory) -> Path:
     where = tmp_path_factory.mktemp("runs") / "run"
     assert main(["suite", "run", str(small), "policy=nearest_frontier", f"hydra.run.dir={where}"]) == 0
     return where
+
+
+def test_what_was_sent_is_not_directed_again(small):
+    """Goals are noted as the strategy of the radios left them."""
+    suite = load_suite(str(small))
+    part, maps = suite.parts["maze_small"], build_maps(suite.parts["maze_small"])
+    played = build_env(part, maps, 2, suite.seed, ObservationConfig(pictures=False))
+    env = build_replay(part, maps, 2, suite.seed)
+    assert played.strategy is not None and env.strategy is None and env.comm_config.has_base
+    assert env.settings.limited and env.settings.done == "base"
 
 
 def test_each_part_has_its_own_score(small, played, capsys):

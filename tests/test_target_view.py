@@ -11,7 +11,7 @@ from worlds import ways_to_blocks
 from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.networks.actor import make_policy
 from maexp.agents.networks.target_chooser import score_by_criteria
-from maexp.agents.policies import POLICIES
+from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
@@ -62,10 +62,11 @@ def test_the_highest_score_is_what_cost_utility_takes(planner):
     """On the same episodes, to the bit: what a learned policy starts from is the classical planner."""
     env = make_env(planner=PlannerConfig(name=planner), targets=256)
     other = ExplorationEnv(MAPS, num_envs=4, seed=5, planner=PlannerConfig(name=planner), num_threads=1)
-    policy, td = POLICIES["cost_utility"](other), other.reset()
+    planner, td = FrontierPlanner(other, CLASSICAL["cost_utility"]), other.reset()
     mine = env.reset()
     for _ in range(5):
-        mine, td = play(env, 1, mine)[0], step_mdp(other.step(policy(td)))
+        td["agents", "action", "goal"] = planner.goals()
+        mine, td = play(env, 1, mine)[0], step_mdp(other.step(td))
         assert torch.equal(env.simulation.tensors["goal"], other.simulation.tensors["goal"])
         assert torch.equal(mine["agents", "observation", "pose"], td["agents", "observation", "pose"])
 

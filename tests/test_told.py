@@ -58,7 +58,7 @@ def play_branch(env: ExplorationEnv, strategy: str, td, likes: torch.Tensor, nam
     for _ in range(HORIZON - 1):
         step = env.rand_action(td.clone())
         del step[(*ACTION, "target")]
-        step[(*ACTION, "region")], step[(*ACTION, "offset")] = follower(None)
+        step[(*ACTION, "goal")] = follower.goals()
         env.step(step)
     env.strategy.name = strategy
 

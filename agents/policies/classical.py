@@ -20,6 +20,7 @@ from tensordict.nn import TensorDictModule
 from maexp.envs import ExplorationEnv
 from maexp.envs.choices import CLASSICAL, rank_by_utility
 from maexp.envs.nav_grid import build_nav_grid, open_cells
+from maexp.envs.regions import to_regions
 from maexp.envs.targets import TargetTracker, TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.types import REGIONS
@@ -43,7 +44,12 @@ class FrontierPlanner:
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region [E, N] and offset [E, N, 2]; the argument only ties the policy to an observation."""
+        """Region [E, N] and offset [E, N, 2] of `goals`; the argument only ties the policy to an observation."""
+        return to_regions(self.tracker.env, self.goals())
+
+    @torch.no_grad()
+    def goals(self) -> torch.Tensor:
+        """Where each robot goes, float32 [E, N, 2] [m]."""
         scene = self.look()
         chosen, waits = self.choose(scene)
         index = chosen.clamp_min(0).unsqueeze(-1)

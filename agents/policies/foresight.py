@@ -21,7 +21,6 @@ from maexp.agents.runtime.team import Team
 from maexp.envs.config import LookaheadConfig, RobotConfig
 from maexp.envs.features import drive_until_next
 from maexp.envs.grid_team import GridTeam, room_for
-from maexp.envs.navigation import to_action
 from maexp.kernels.constants import OBSTACLE, UNKNOWN
 from maexp.kernels.types import DT
 
@@ -171,13 +170,10 @@ class Foresight:
 
         still = np.nan_to_num(world.from_map(team.at))[:, None]
         goals = spread(go_beyond(point, middle, at[:, None], drive[:, None]), still, torch.float64)[0].numpy()
-        actions = [to_action(self.team.env, self.team.centers(goals[None, :, k])) for k in range(count)]
-        region, offset = (torch.stack(one, 2) for one in zip(*actions, strict=True))
         return {
             "index": spread(place, 0, torch.int64),
             "block": spread(np.where(there, self.team.blocks(point), -1), -1, torch.int64),
-            "region": region,
-            "offset": offset,
+            "goal": self.team.centers(goals[None]),
             "point": spread(point, still, torch.float32),
             "value": spread(value, 0.0, torch.float32),
             "wanted": spread(wanted, False, torch.bool),

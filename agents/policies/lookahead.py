@@ -77,9 +77,9 @@ class LookaheadPlanner(FrontierPlanner):
         """What each robot may try, the choice of the rollout policy first.
 
         Returns:
-            "index", "block", "region": int64 [E, N, K], "offset", "point": float32 [E, N, K, 2], "value": float32
-            [E, N, K], more than the own choice [radar discs], "wanted": bool [E, N, K], "body": float32 [E, N] [m],
-            "hears": bool [E, N, N].
+            "index", "block": int64 [E, N, K], "goal", "point": float32 [E, N, K, 2] [m], "value": float32 [E, N, K],
+            more than the own choice [radar discs], "wanted": bool [E, N, K], "body": float32 [E, N] [m], "hears": bool
+            [E, N, N].
         """
         index = list_candidates(preference, own, self.config.candidates)
         there = (index >= 0) & scene.alive.unsqueeze(-1)
@@ -87,15 +87,13 @@ class LookaheadPlanner(FrontierPlanner):
         cell, block = scene.cells().gather(2, place), scene.block.gather(2, place)
         toward, point = (pick_places(one, place) for one in (scene.middle, scene.points))
         block = torch.where(index >= 0, block, -1)
-        region, offset = self.rollouts.goals(block, cell, toward, waits)
         value = (preference if self.trained else value_in_turn(scene)).gather(2, place)
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & (own >= 0).unsqueeze(-1)
         return {
             "index": place,
             "block": block,
-            "region": region,
-            "offset": offset,
+            "goal": self.rollouts.goals(block, cell, toward, waits),
             "point": point,
             "value": value,
             "wanted": there,

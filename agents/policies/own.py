@@ -163,13 +163,15 @@ class OwnPolicy:
         lead = f"[{self.shape[0]}, {self.shape[1]}"
         if self.direct:
             return f"control, float {lead}, 2]"
-        regions = f"region, int {lead}] from 0 to {REGIONS**2 - 1}, and offset, float {lead}, 2]"
-        return f"target, int {lead}] from 0 to {self.targets - 1}, or {regions}" if self.targets else regions
+        goals = f"goal, float {lead}, 2] in metres, or region, int {lead}] from 0 to {REGIONS**2 - 1}, and offset, "
+        goals += f"float {lead}, 2]"
+        return f"target, int {lead}] from 0 to {self.targets - 1}, or {goals}" if self.targets else goals
 
     def _find_wrong(self, action: dict[str, torch.Tensor]) -> str:
         """What is wrong with an action, to complete "policy NAME ..."; "" for nothing."""
         whole = {"region": REGIONS**2, "target": self.targets}
-        heads = ("control",) if self.direct else ("target",) if "target" in action else ("region", "offset")
+        alone = "control" if self.direct else next((one for one in ("target", "goal") if one in action), None)
+        heads = (alone,) if alone else ("region", "offset")
         for head in heads:
             value = action.get(head)
             if value is None:

@@ -55,22 +55,19 @@ class Rollouts:
             self.follower = FrontierPlanner(branches.env, CLASSICAL.get(config.rollout_policy, rank_by_utility))
             branches.attach(self.follower.tracker)
 
-    def goals(
-        self, block: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The actions that lead to candidates: region int64 [E, N, K] and offset float32 [E, N, K, 2].
+    def goals(self, block: torch.Tensor, cell: torch.Tensor, toward: torch.Tensor, waits: torch.Tensor) -> torch.Tensor:
+        """The goals that lead to candidates, float32 [E, N, K, 2] [m].
 
         Args:
             block, cell: int64 [E, N, K], as for `TargetTracker.take`.
             toward: float32 [E, N, K, 2] [m].
             waits: bool [E, N], robots whose first candidate is to wait.
         """
-        actions = [
+        goals = [
             self.tracker.goals(block[..., k], cell[..., k], toward[..., k, :], waits if k == 0 else None)
             for k in range(block.shape[-1])
         ]
-        region, offset = (torch.stack(one, 2) for one in zip(*actions, strict=True))
-        return region, offset
+        return torch.stack(goals, 2)
 
     def look(self, teams: torch.Tensor) -> torch.Tensor:
         """Take up what some teams know now, and that no choice of theirs has been played: float32 [T], NaN.
@@ -88,8 +85,8 @@ class Rollouts:
 
         Args:
             robot: its number.
-            mine: what robots are offered: "region" int64 [T, N, K], "offset" float32 [T, N, K, 2] and "block" int64
-                [T, N, K], as of `LookaheadPlanner`.
+            mine: what robots are offered: "goal" float32 [T, N, K, 2] [m] and "block" int64 [T, N, K], as of
+                `LookaheadPlanner`.
             chosen: int64 [T, N], the candidates of all robots; the robot's own one is the first.
             wanted: bool [T, K], candidates that are tried; what is returned for the others means nothing.
             kept: float32 [T], what the first is worth as far as that is known, else NaN (`keep`).
@@ -128,15 +125,12 @@ class Rollouts:
         self.branches.branch(robot, wanted)
         names = ("covered", "covered_sum", "local_step", "collided")
         before = {name: state[name].clone() for name in names}
-        state["region"][:count] = pick_tried(mine["region"], tried)
-        state["offset"][:count] = pick_tried(mine["offset"], tried)
+        state["wanted"][:count] = pick_tried(mine["goal"], tried)
         if self.follower is not None:
             self._brief(pick_tried(mine["block"], tried))
         self._step()
         for _ in range(1, self.config.horizon):
-            region, offset = self.follower(None)
-            state["region"].copy_(region)
-            state["offset"].copy_(offset)
+            state["wanted"].copy_(self.follower.goals())
             self._step()
         return self._score(before)[:count].view(wanted.shape)
 

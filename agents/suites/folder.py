@@ -18,9 +18,11 @@ from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.map import MapError, read_npz
 
 RUN, RESULTS, ACTIONS = "run.json", "results.json", "actions"
-FORMAT = "maexp-suite-result-1"
-ARRAYS = {"decisions": "i", "region": "u", "offset": "f", "seconds": "f", "maps": "U", "reasons": "U"}
-"""Of a file of actions, with the kinds of their numbers."""
+FORMAT = "maexp-suite-result-2"
+READ = (FORMAT, "maexp-suite-result-1")  # the first had regions and offsets: results that are published stay valid
+ARRAYS = {"decisions": "i", "seconds": "f", "maps": "U", "reasons": "U"}
+SENT = ({"goal": "f"}, {"region": "u", "offset": "f"})
+"""Of a file of actions, with the kinds of their numbers: these, and one of those."""
 
 
 def batch_file(where: Path, part: str, first: int) -> Path:
@@ -30,7 +32,7 @@ def batch_file(where: Path, part: str, first: int) -> Path:
 
 def write_batch(where: Path, suite: Suite, part: str, batch: Batch) -> None:
     """The actions of a batch, and the metrics that came of them."""
-    arrays = {name: getattr(batch, name) for name in ARRAYS}
+    arrays = {name: getattr(batch, name) for name in ARRAYS} | batch.sent
     arrays["metrics"] = np.stack([batch.metrics[name] for name in suite.metrics], 1)
     write_file(batch_file(where, part, batch.first), lambda file: np.savez_compressed(file, **arrays))
 
@@ -45,33 +47,35 @@ def read_batch(where: Path, suite: Suite, part: str, first: int) -> Batch:
     try:
         arrays = read_npz(path)
         metrics = arrays.pop("metrics")
-        for name, kind in ARRAYS.items():
+        names = SENT["region" in arrays]
+        for name, kind in (ARRAYS | names).items():
             if arrays[name].dtype.kind != kind:
                 raise ValueError(f"{name} is {arrays[name].dtype}")
-        _check_shapes(arrays, suite.parts[part].num_robots, metrics, len(suite.metrics))
+        sent = {name: arrays.pop(name) for name in names}
+        _check_shapes(arrays, sent, suite.parts[part].num_robots, metrics, len(suite.metrics))
     except (MapError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{short(path)} is damaged or holds something else ({error}).") from error
-    return Batch(first, metrics=dict(zip(suite.metrics, metrics.T, strict=True)), **arrays)
+    return Batch(first, sent=sent, metrics=dict(zip(suite.metrics, metrics.T, strict=True)), **arrays)
 
 
-def _check_shapes(arrays: dict[str, np.ndarray], robots: int, metrics: np.ndarray, count: int) -> None:
-    episodes, most = arrays["region"].shape[:2]
+def _check_shapes(
+    arrays: dict[str, np.ndarray], sent: dict[str, np.ndarray], robots: int, metrics: np.ndarray, count: int
+) -> None:
+    episodes, most = arrays["seconds"].shape
     wanted = {
         "decisions": (episodes,),
-        "region": (episodes, most, robots),
-        "offset": (episodes, most, robots, 2),
         "seconds": (episodes, most),
         "maps": (episodes,),
         "reasons": (episodes,),
-    }
-    for name, shape in wanted.items():
-        if arrays[name].shape != shape or not episodes or not most:
-            raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
+    } | {name: (episodes, most, robots, 2)[: 3 if name == "region" else 4] for name in sent}
+    for name, one in (arrays | sent).items():
+        if one.shape != wanted[name] or not episodes or not most:
+            raise ValueError(f"{name} has shape {one.shape}, not {wanted[name]}")
     if metrics.shape != (episodes, count) or metrics.dtype != np.float64:
         raise ValueError(f"metrics has shape {metrics.shape}")
     if not ((0 <= arrays["decisions"]) & (arrays["decisions"] <= most)).all():
         raise ValueError("decisions are out of range")
-    if arrays["region"].max() >= 64 or not np.isfinite(arrays["offset"]).all():
+    if not all(np.isfinite(one).all() for one in sent.values()) or sent.get("region", np.zeros(1)).max() >= 64:
         raise ValueError("an action is out of range")
 
 
@@ -151,7 +155,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text())
-        if content["format"] != FORMAT:
+        if content["format"] not in READ:
             raise ValueError(f"format {content['format']}")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         told = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

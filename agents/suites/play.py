@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,8 +24,6 @@ from maexp.envs import (
 )
 from maexp.envs.metrics import RADIO, episode_metrics
 
-REGION, OFFSET = ("agents", "action", "region"), ("agents", "action", "offset")
-
 
 @dataclass
 class Batch:
@@ -34,7 +32,8 @@ class Batch:
     Attributes:
         first: number of the first
         decisions: int32 [K], made in each
-        region, offset: uint8 [K, T, N] and float32 [K, T, N, 2], where the robots were sent; 0 after the last decision
+        sent: where the robots were sent, 0 after the last decision: "goal" float32 [K, T, N, 2] [m]; or, of a run from
+            before that was noted, "region" uint8 [K, T, N] and "offset" float32 [K, T, N, 2]
         seconds: float32 [K, T], processor time of the policy [s]
         maps: of each episode, names [K]
         metrics: each metric's value in each episode, float64 [K]
@@ -43,8 +42,7 @@ class Batch:
 
     first: int
     decisions: np.ndarray
-    region: np.ndarray
-    offset: np.ndarray
+    sent: dict[str, np.ndarray]
     seconds: np.ndarray
     maps: np.ndarray
     metrics: dict[str, np.ndarray]
@@ -101,12 +99,18 @@ def build_env(
     )
 
 
+def build_replay(part: Part, maps: list[PointCloudMap], num_envs: int, seed: int) -> ExplorationEnv:
+    """The env of a part for actions that were noted: the strategy of its radios has had its say in them."""
+    undirected = replace(part, comm=part.comm | {"strategy": "opportunistic"})
+    return build_env(undirected, maps, num_envs, seed, ObservationConfig(pictures=False), device="cpu")
+
+
 class Recorder:
     """A policy that notes where the robots were sent and what each decision took."""
 
     def __init__(self, policy: Callable, env: ExplorationEnv):
         self.policy, self.env = policy, env
-        self.sent: list[tuple[np.ndarray, np.ndarray]] = []
+        self.goals: list[np.ndarray] = []
         self.seconds: list[np.ndarray] = []
         self.reasons = np.full(env.num_envs, "", dtype=object)
 
@@ -121,24 +125,22 @@ class Recorder:
         return acted
 
     def _note(self) -> None:
-        """What the env made of the last decision: targets, too, have become regions and offsets there."""
-        if len(self.sent) < len(self.seconds):
-            tensors = self.env.simulation.tensors
-            self.sent.append(tuple(tensors[name].cpu().numpy().copy() for name in ("region", "offset")))
+        """What the env made of the last decision: all that policies may name has become goals there."""
+        if len(self.goals) < len(self.seconds):
+            self.goals.append(self.env.simulation.tensors["wanted"].cpu().numpy().copy())
 
     def batch(self, first: int, count: int, decisions: np.ndarray, metrics: dict, maps: np.ndarray) -> Batch:
         """What was noted of the first `count` envs."""
         self._note()
         decisions, most = decisions[:count].astype(np.int32), max(int(decisions[:count].max()), 1)
-        region, offset = (np.stack([one[k] for one in self.sent[:most]], 1)[:count] for k in (0, 1))
+        goal = np.stack(self.goals[:most], 1)[:count]
         seconds = np.stack(self.seconds[:most], 1)[:count]
         made = np.arange(most) < decisions[:, None]
         reasons = getattr(self.policy, "reasons", [""] * self.env.num_envs)
         return Batch(
             first,
             decisions,
-            np.where(made[..., None], region, 0).astype(np.uint8),
-            np.where(made[..., None, None], offset, 0.0).astype(np.float32),
+            {"goal": np.where(made[..., None, None], goal, 0.0).astype(np.float32)},
             np.where(made, seconds, 0.0).astype(np.float32),
             maps,
             metrics,
@@ -151,14 +153,13 @@ class Replay:
 
     def __init__(self, batch: Batch, num_envs: int, device: torch.device):
         rows = np.minimum(np.arange(num_envs), len(batch.decisions) - 1)
-        self.region = torch.from_numpy(batch.region[rows].astype(np.int64)).to(device)
-        self.offset = torch.from_numpy(batch.offset[rows]).to(device)
+        self.sent = {name: torch.from_numpy(one[rows]).to(device) for name, one in batch.sent.items()}
         self.decisions = torch.from_numpy(batch.decisions[rows].astype(np.int64)).to(device)
         self.step = 0
 
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
-        at = min(self.step, self.region.shape[1] - 1)
-        state[REGION], state[OFFSET] = self.region[:, at], self.offset[:, at]
+        for name, one in self.sent.items():
+            state["agents", "action", name] = one[:, min(self.step, one.shape[1] - 1)]
         state["lost"] = (self.step >= self.decisions).unsqueeze(-1)
         self.step += 1
         return state
@@ -182,5 +183,5 @@ def play_batch(suite: Suite, env: ExplorationEnv, policy: Callable, first: int) 
 
 
 def replay_batch(suite: Suite, env: ExplorationEnv, noted: Batch) -> Batch:
-    """The same episodes from their actions."""
+    """The same episodes from their actions, in the env of `build_replay`."""
     return play_batch(suite, env, Replay(noted, env.num_envs, env.device), noted.first)

@@ -14,10 +14,9 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.films import play_teams
 from maexp.agents.files import short, write_text
 from maexp.agents.suites import folder
-from maexp.agents.suites.play import Replay, build_env, build_maps
+from maexp.agents.suites.play import Replay, build_maps, build_replay
 from maexp.agents.suites.suite import Suite, load_suite
 from maexp.agents.suites.verify import verify
-from maexp.envs import ObservationConfig
 from maexp.envs.metrics import label_copies
 from maexp.envs.viewing.episode import Episode
 
@@ -106,7 +105,7 @@ def make_film(suite: Suite, part: str, where: Path) -> dict[str, Any]:
     """The first episode of a part as a page can show it."""
     noted = folder.read_batch(where, suite, part, 0)
     known = suite.parts[part]
-    env = build_env(known, build_maps(known), 1, suite.seed, ObservationConfig(pictures=False), device="cpu")
+    env = build_replay(known, build_maps(known), 1, suite.seed)
     every = max(1, known.limit // FRAMES)
     return describe_film(play_teams(env, Replay(noted, 1, env.device), "", first=0, every=every)[0])
 

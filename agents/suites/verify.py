@@ -11,10 +11,9 @@ from maexp.agents.errors import UserError
 from maexp.agents.map_sets import MapsError
 from maexp.agents.suites import folder
 from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
-from maexp.agents.suites.play import Batch, build_env, build_maps, replay_batch
+from maexp.agents.suites.play import Batch, build_maps, build_replay, replay_batch
 from maexp.agents.suites.score import summarise_suite
 from maexp.agents.suites.suite import Suite, load_suite
-from maexp.envs import ObservationConfig
 
 CLOSE = 1e-9  # numbers computed from metrics may differ by so much where libraries add up in another order
 FEW = 20  # differences that are listed
@@ -123,7 +122,7 @@ def _replay_part(
             found.add(_name_of(where, name, noted), f"it holds episodes after the last, {suite.episodes - 1}")
             return played
         if env is None or env.num_envs < count:
-            env = build_env(part, maps, count, suite.key(seed), ObservationConfig(pictures=False), device="cpu")
+            env = build_replay(part, maps, count, suite.key(seed))
         again = replay_batch(suite, env, noted)
         again.reasons, again.seconds = noted.reasons, noted.seconds
         _compare_batches(where, noted, again, name, found)

@@ -132,13 +132,11 @@ class BranchPlayer:
         place, frontier = index.clamp(0, count - 1), (index >= 0) & (index < count)
         block = torch.where(frontier, s["block"].gather(2, place), -1)
         toward = pick_places(s["toward"], place)
-        region, offset = self.rollouts.goals(block, s["cell"].gather(2, place), toward, waits)
+        goal = self.rollouts.goals(block, s["cell"].gather(2, place), toward, waits)
         tells = index == count
         if self.view.contacts is not None:
-            where = self.view.contacts.goals()
-            region = torch.where(tells, where[0].unsqueeze(-1), region)
-            offset = torch.where(tells.unsqueeze(-1), where[1].unsqueeze(2), offset)
-        return {"region": region, "offset": offset, "block": block, "tells": tells}
+            goal = torch.where(tells.unsqueeze(-1), self.view.contacts.goals().unsqueeze(2), goal)
+        return {"goal": goal, "block": block, "tells": tells}
 
     def rank_for_trial(self, features: torch.Tensor) -> torch.Tensor:
         """What each robot tries first, float32 [E, N, M]: the best of a classical score whose weight of the way is

@@ -32,7 +32,7 @@ from maexp.agents.training.train import TrainingRun
 LEARNING_RATE = 2e-3
 PASSES = 4  # over each batch
 LOG = "warm_start.csv"
-HEADS = ("region", "offset", "target", "control")
+HEADS = ("region", "offset", "target", "goal", "control")
 
 
 def check_warm_start(cfg: TrainSettings) -> None:

@@ -68,9 +68,7 @@ class ToldRollouts(Rollouts):
         if self.strategy is not None:
             self.strategy.name = self.begins_as if self.begins else self.goes_on_as
             tells = self.tells if self.begins else None
-            region, offset = self.strategy.direct(state["region"], state["offset"], tells)
-            state["region"].copy_(region)
-            state["offset"].copy_(offset)
+            state["wanted"].copy_(self.strategy.direct(state["wanted"], tells))
         self.begins = False
         state["active"] *= (state["macro_step"] < env.macro_steps).int()
         super()._step()

@@ -102,8 +102,7 @@ class TeamVectorEnv(VectorEnv):
             raise RuntimeError(
                 f"teams {np.flatnonzero(before).tolist()} are done: call reset(options={{'reset_mask': ...}})"
             )
-        team = (self.num_envs, self.env.num_robots)
-        action = to_action(actions, self._kind, self._targets, team, self.env.device)
+        action = to_action(actions, self._kind, self._targets, self.env)
         now = self._seen = self.env.step(action)["next"]
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any():
             now = self._start_anew(now, before)

@@ -150,7 +150,7 @@ class TeamParallelEnv(ParallelEnv):
             together: Any = {key: _stacked(key, [one[key] for one in given.values()]) for key in space}
         else:
             together = _stacked("action", list(given.values()))
-        return to_action(together, self._kind, self._targets, (1, len(given)), self.env.device)
+        return to_action(together, self._kind, self._targets, self.env)
 
     def _tell(self) -> tuple[dict[str, dict], dict[str, dict]]:
         """What every agent that is left observes, and what its ``info`` holds of the team and of it, as numbers."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -25,6 +25,9 @@ from torchrl.data import Composite, TensorSpec
 
 from maexp.envs.config import ObservationConfig, PlannerConfig
 from maexp.kernels.types import REGIONS
+
+if TYPE_CHECKING:
+    from maexp.envs.environment import ExplorationEnv
 
 ACTIONS = ("targets", "region_offset", "region", "goal")
 SHOWN = 24  # targets that ``action="targets"`` shows unless ``observation`` says how many
@@ -97,14 +100,15 @@ def action_space(kind: str, targets: int, robots: tuple[int, ...] = ()) -> space
     return spaces.Dict(region=choice, offset=box) if kind == "region_offset" else choice
 
 
-def to_action(actions, kind: str, targets: int, shape: tuple[int, int], device) -> TensorDict:
-    """The env's action, batch [E], from arrays of ``shape`` = (E, N), in the form that `action_space` describes."""
+def to_action(actions, kind: str, targets: int, env: ExplorationEnv) -> TensorDict:
+    """The env's action, batch [E], from arrays of shape [E, N], in the form that `action_space` describes."""
+    shape = (env.num_envs, env.num_robots)
     if kind == "control":
         parts = {"control": _box("control", actions, (*shape, 2))}
     elif kind == "targets":
         parts = {"target": _choice("target", actions, shape, targets)}
     elif kind == "goal":
-        parts = _region_of(_box("goal", actions, (*shape, 2)))
+        parts = {"goal": _in_metres(env, _box("goal", actions, (*shape, 2)))}
     elif kind == "region":
         parts = {"region": _choice("region", actions, shape), "offset": np.zeros((*shape, 2), np.float32)}
     else:
@@ -112,19 +116,16 @@ def to_action(actions, kind: str, targets: int, shape: tuple[int, int], device) 
             raise ValueError(f"the action is {type(actions).__name__}: give a dict of region and offset")
         region, offset = _choice("region", actions["region"], shape), actions["offset"]
         parts = {"region": region, "offset": _box("offset", offset, (*shape, 2))}
-    tensors = {name: torch.as_tensor(one, device=device) for name, one in parts.items()}
-    inner = TensorDict(tensors, batch_size=shape, device=device)
-    return TensorDict({"agents": {"action": inner}}, batch_size=shape[:1], device=device)
+    tensors = {name: torch.as_tensor(one, device=env.device) for name, one in parts.items()}
+    inner = TensorDict(tensors, batch_size=shape, device=env.device)
+    return TensorDict({"agents": {"action": inner}}, batch_size=shape[:1], device=env.device)
 
 
-def _region_of(goal: np.ndarray) -> dict[str, np.ndarray]:
-    """Region and offset of a goal in shares of half the extent; a goal outside counts as its border."""
-    side = REGIONS
-    cell = (np.nan_to_num(goal).clip(-1, 1) + 1) / 2 * side  # NaN is refused by the env, by the offset
-    index = np.floor(cell).clip(0, side - 1)
-    offset = np.where(np.isnan(goal), goal, 2 * (cell - index) - 1).astype(np.float32)
-    index = index.astype(np.int64)
-    return {"region": index[..., 0] * side + index[..., 1], "offset": offset}
+def _in_metres(env: ExplorationEnv, goal: np.ndarray) -> torch.Tensor:
+    """Goals [m] in shares of half the extent, from its middle; one outside counts as its border, NaN stays."""
+    number = env.simulation.tensors["map_id"].long()
+    low, high = (env.simulation.map_tensors[name][number].unsqueeze(1) for name in ("lower", "upper"))
+    return low + (torch.from_numpy(goal).to(env.device).clamp(-1.0, 1.0) + 1.0) / 2.0 * (high - low)
 
 
 def _choice(name: str, values, shape, count: int = REGIONS**2) -> np.ndarray:
