@@ -28,7 +28,7 @@ from maexp.envs.fields import check_settings, setting
 from maexp.envs.scenarios import SCENARIOS
 
 IR2 = ("comm=ir2",)
-BASE = (*IR2, "comm.base_station=true")
+BASE = (*IR2, "comm.base_station=true", "scenario.done=base")  # else the last reports would be cut off
 ODOMETRY = ("odometry.drift=0.02", "odometry.turn=0.005")
 RADAR = ("radar.missed=0.5", "radar.evidence=3")
 CONDITIONS = {
@@ -49,7 +49,7 @@ CONDITIONS = {
     "base_pursuit": (*BASE, "comm.strategy=pursuit"),
     "all": (*BASE, "comm.noise=13", "comm.strategy=return_to_base", "faults.probability=0.5", *RADAR, *ODOMETRY),
 }
-"""Name -> words of `maexp evaluate`; the others are compared with the first."""
+"""Name -> words of `maexp evaluate`; the others are compared with the first (`COMPARED`)."""
 METRICS = (
     "coverage_auc",
     "base_coverage_auc",
@@ -133,7 +133,7 @@ def place(config: ConditionsConfig, scenario: str, team: int, condition: str, po
 
 
 def write_table(config: ConditionsConfig) -> None:
-    """`TABLE`: means of every condition and policy, and how far coverage over time is from that of the first."""
+    """`TABLE`: means of every condition and policy, and paired differences between conditions and policies."""
     parts = []
     for scenario in config.places:
         for team in config.teams:
@@ -151,19 +151,57 @@ def read(config: ConditionsConfig, scenario: str, team: int, condition: str) -> 
 
 def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
     """Markdown; `found`: condition -> policy -> its episodes, the first condition first."""
-    played = {name for row in found.values() for one in row.values() for name in one.episodes}
+    played = {name for row in found.values() for result in row.values() for name in result.episodes}
     shown = [MEASURES[name] for name in METRICS if name in played]
-    heads = ["condition", "policy", "to the first [points]", *(f"{one.column} [{one.unit}]" for one in shown)]
+    policies = list(dict.fromkeys(policy for row in found.values() for policy in row))
+    columns = [column for column in COMPARED if column.makes_sense(found, policies)]
+    heads = ["condition", "policy", *(column.head(policies) for column in columns)]
+    heads += [f"{measure.column} [{measure.unit}]" for measure in shown]
     rows = []
-    first = next(iter(found.values()), {})
     for condition, row in found.items():
-        for policy, one in row.items():
-            apart = ""
-            if row is not first and policy in first:
-                apart = MEASURES["coverage_auc"].difference(one.minus(first[policy])["coverage_auc"])
-            summary = one.summary()
-            rows.append([condition, f"`{policy}`", apart, *(_mean(measure, summary) for measure in shown)])
+        for policy, result in row.items():
+            apart = [column.write(found, policies, condition, policy) for column in columns]
+            summary = result.summary()
+            rows.append([condition, f"`{policy}`", *apart, *(_mean(measure, summary) for measure in shown)])
     return "\n".join([f"**{title}**", "", *markdown_table(heads, rows)])
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A column of paired differences in a metric: to another condition with the same policy, or to the first policy
+    under the same condition."""
+
+    metric: str
+    to: str = ""  # name of the condition; "": to the first policy
+
+    def head(self, policies: list[str]) -> str:
+        return f"{MEASURES[self.metric].column}, minus {self.to or f'`{policies[0]}`'} [points]"
+
+    def makes_sense(self, found: dict[str, dict[str, EvaluationResult]], policies: list[str]) -> bool:
+        """Whether there is anything to write."""
+        return any(self.write(found, policies, condition, policy) for condition in found for policy in policies)
+
+    def write(
+        self, found: dict[str, dict[str, EvaluationResult]], policies: list[str], condition: str, policy: str
+    ) -> str:
+        """Mean and interval; "" where there is nothing to compare with."""
+        mine = found[condition].get(policy)
+        beside = (self.to, policy) if self.to else (condition, policies[0])
+        other = found.get(beside[0], {}).get(beside[1])
+        if mine is None or other is None or mine is other:
+            return ""
+        if self.metric not in mine.episodes or self.metric not in other.episodes:
+            return ""
+        return MEASURES[self.metric].difference(mine.minus(other)[self.metric])
+
+
+COMPARED = (
+    Compared("coverage_auc", "perfect"),
+    Compared("base_coverage_auc", "base"),
+    Compared("coverage_auc"),
+    Compared("base_coverage_auc"),
+)
+"""Columns of differences, where there is something to compare."""
 
 
 def _mean(measure: Measure, summary: dict[str, dict]) -> str:

@@ -2,10 +2,12 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 from maexp.agents import cli, conditions
 from maexp.agents.evaluation.baseline import load_baseline
+from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.resolved import resolve
 from maexp.envs import make_map
@@ -34,6 +36,7 @@ def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):
     heads = next(line for line in text.splitlines() if line.startswith("| condition")).split(" | ")
     base = heads.index("base over time [%]")
     assert rows[0][base] == "" and 5.0 < float(rows[1][base]) < float(rows[1][heads.index("over time [%]")])
+    assert heads[2] == "over time, minus perfect [points]" and "minus" not in heads[3], "one policy, no `base`"
     assert rows[0][2] == "" and rows[1][2].startswith(("+", "-"))
     played = []
     monkeypatch.setattr(cli, "main", lambda argv: played.append(argv) or 0)
@@ -45,6 +48,40 @@ def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):
     assert "stopped at base_return, cost_utility. The same command goes on there" in capsys.readouterr().err
     assert conditions.main([*words, "episodes=4"]) == 2
     assert "was played with episodes=2, not 4: take another folder" in capsys.readouterr().err
+
+
+def test_differences_are_paired_and_to_what_the_head_says():
+    """Against what NumPy makes of the same episodes."""
+    rng = np.random.default_rng(0)
+    maps = np.repeat(["a", "b", "c", "d", "e", "f"], 2)
+
+    def episodes(base: bool) -> EvaluationResult:
+        names = ("coverage_auc", "base_coverage_auc") if base else ("coverage_auc",)
+        return EvaluationResult("", 3, {name: rng.random(12) for name in names}, 1.0, maps)
+
+    found = {
+        condition: {policy: episodes(condition != "perfect") for policy in ("x", "y")}
+        for condition in ("perfect", "base", "base_return")
+    }
+    lines = conditions.table("here", found).splitlines()
+    heads = lines[2].strip("| ").split(" | ")
+    assert heads[2:6] == [
+        "over time, minus perfect [points]",
+        "base over time, minus base [points]",
+        "over time, minus `x` [points]",
+        "base over time, minus `x` [points]",
+    ]
+    cells = {tuple(row[:2]): row[2:6] for row in (line[2:-2].split(" | ") for line in lines[4:])}
+
+    def apart(metric, condition, policy):
+        mine, other = found["base_return"]["y"], found[condition][policy]
+        return f"{100 * (mine.episodes[metric] - other.episodes[metric]).mean():+.1f}"
+
+    mine = cells["base_return", "`y`"]
+    others = (("perfect", "y"), ("base", "y"), ("base_return", "x"), ("base_return", "x"))
+    for cell, metric, other in zip(mine, ("coverage_auc", "base_coverage_auc") * 2, others, strict=True):
+        assert cell.split(" ")[0] == apart(metric, *other)
+    assert cells["perfect", "`x`"] == [""] * 4 and cells["base", "`x`"][1:] == [""] * 3
 
 
 @pytest.mark.parametrize(
