@@ -199,7 +199,7 @@ class Beliefs(Branches):
             nothing is known.
     """
 
-    _own = (*OF_POINTS, "hears", "comm", "known_weight")
+    _own = (*OF_POINTS, "hears", "contacts", "comm", "known_weight")
 
     def __init__(
         self,

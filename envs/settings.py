@@ -21,6 +21,7 @@ from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
 from maexp.envs.scenarios import find_scenario
 from maexp.kernels.sensing import return_chance
+from maexp.kernels.types import DT
 
 LEAST_RETURNS = 0.01  # share of the returns in view that has to count
 
@@ -54,7 +55,7 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
     check_base(maps, comm)
     check_noise(maps, settings.radar)
     check_done(settings.done, comm)
-    check_failing(faults, num_robots)
+    check_failing(faults, num_robots, settings.macro_steps * settings.local_steps * DT)
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
     return replace(
         settings,
@@ -150,9 +151,11 @@ def check_done(done: str, comm: CommConfig) -> None:
         raise ValueError("done='base' needs a base station: add comm.base_station=true")
 
 
-def check_failing(config: FaultsConfig, num_robots: int) -> None:
-    """Raise ValueError if a robot fails that is not there."""
-    for robot, _ in config.at:
+def check_failing(config: FaultsConfig, num_robots: int, seconds: float) -> None:
+    """Raise ValueError if a robot fails that is not there, or after the episode's `seconds`."""
+    for robot, moment in config.at:
+        if moment >= seconds:
+            raise ValueError(f"faults.at: robot {robot} fails after {moment:g} s, and an episode ends at {seconds:g} s")
         if robot >= num_robots:
             last = num_robots - 1
             raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")

@@ -27,6 +27,7 @@ PATIENCE = 3  # decisions that robots wait for others after the time agreed on
 WORTH = 1.0  # a pursuit pays where the other misses so many radar discs, and
 WAY_COST = 0.3  # as many more for every radar range of way there
 NEAR = 0.5  # a robot this near to a place is there [radar ranges]
+TEAMS = 64  # whose points are compared at once
 TELLING = ("opportunistic", "return_to_base")  # strategies that leave it to the policy to tell the base station sooner
 
 
@@ -38,15 +39,16 @@ class Strategy:
         name: of the strategy; None: `comm.strategy`.
 
     Attributes:
-        known: int32 [E, N], what robots know; ``linked`` bool [E, N, U], with whom they are connected; ``way``
+        known: int32 [E, N], what robots know; ``linked`` bool [E, N, U], with whom they are connected, where links
+            fade since the decision before; ``done`` bool [E, N, U], who of those knows all that they know; ``way``
             [E, N, U], how far it is back into contact [m]; ``left`` [E, N], how far they still get in the episode [m]:
             of the last `look`.
         state: tensors that later decisions depend on; U radios, the base station's last. ``met`` int32 [E, N, U], the
             macro step in which a robot was last connected with a radio, -1: never; ``place`` [E, N, U, 2], where that
-            was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what it knew
-            then; ``knew`` and ``grew`` int32 [E, N], what it knew last and when that last became more; ``duty`` bool
-            [E, N], who is on its way to tell; ``due`` int32 [E, N], ``spot`` [E, N, 2] and ``party`` bool [E, N, U]:
-            when, where and with whom it has an appointment.
+            was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what of its
+            knowledge that radio had then; ``knew`` and ``grew`` int32 [E, N], what it knew last and when that last
+            became more; ``duty`` bool [E, N], who is on its way to tell; ``due`` int32 [E, N], ``spot`` [E, N, 2] and
+            ``party`` bool [E, N, U]: when, where and with whom it has an appointment.
     """
 
     def __init__(self, env: ExplorationEnv, name: str | None = None):
@@ -54,6 +56,9 @@ class Strategy:
         s, device = env.simulation.tensors, env.device
         e, n, u = *s["center"].shape[:2], s["known_weight"].shape[1]
         self.has_base, self.robots = env.comm_config.has_base, n
+        comm = env.comm_config
+        self.fades = comm.noise > 0.0 or comm.loss > 0.0  # links come and go: one moment says little
+        self.asks = self.fades or comm.messages  # who is connected may not know all
         self.reach = max(one.range for one in env.radar_configs)
         self.drive = env.simulation.robot_tensors["max_speed"] * (PACE * DT * env.local_steps)  # of a decision [m]
 
@@ -88,7 +93,7 @@ class Strategy:
         """Robots that may choose to go and tell the base station something that it does not know, bool [E, N]."""
         if not self.has_base or self.name not in TELLING:
             return torch.zeros_like(self.state["duty"])
-        return self._has_news(self.robots) & ~self.linked[..., self.robots] & (self.sim["collided"] == 0)
+        return self._has_news(self.robots) & (self.sim["collided"] == 0)
 
     def busy(self) -> torch.Tensor:
         """Robots that are on their way to tell, whatever they choose now, bool [E, N]."""
@@ -115,7 +120,8 @@ class Strategy:
         s["place"] = torch.where(links.unsqueeze(-1), radios.unsqueeze(1), s["place"])
         s["met"] = torch.where(links, self.step.unsqueeze(-1).to(torch.int32), s["met"])
         s["driven"] = torch.where(links, odometer.unsqueeze(-1), s["driven"])
-        s["told"] = torch.where(links, self.known.unsqueeze(-1), s["told"])
+        s["told"] = torch.where(links, self._shared() if self.asks else self.known.unsqueeze(-1), s["told"])
+        self.done = links & (s["told"] >= self.known.unsqueeze(-1))
         s["grew"] = torch.where(self.known > s["knew"], self.step.to(torch.int32), s["grew"])
         s["knew"] = self.known.clone()
         if self.has_base:  # every robot knows where that is
@@ -129,12 +135,27 @@ class Strategy:
 
     def _links(self) -> torch.Tensor:
         """Radios that each robot is connected with over any number of others, bool [E, N, U]."""
-        words = self.sim["hears"]
+        words = self.sim["hears"] | self.sim["contacts"] if self.fades else self.sim["hears"]
         radios = words.shape[1]
         links = unpack_flags(words.transpose(1, 2).contiguous(), radios).transpose(1, 2).float()
         for _ in range(max(radios - 1, 1).bit_length()):
             links = ((links @ links) > 0).float()
         return links[:, : self.robots] > 0
+
+    def _shared(self) -> torch.Tensor:
+        """How much of what each robot knows each radio knows, too, int32 [E, N, U]: connected radios tell each other
+        which points they know, free and at once (`maexp.kernels.messages`)."""
+        maps, sim = self.env.simulation.map_tensors, self.sim
+        radios, points = self.state["told"].shape[-1], sim["known_free"].shape[-1]
+        parts = []
+        for teams in torch.arange(len(sim["map_id"]), device=self.env.device).split(TEAMS):
+            number = sim["map_id"][teams].long()
+            index = maps["free_begin"][number].long().unsqueeze(-1) + torch.arange(points, device=teams.device)
+            there = index < maps["free_begin"][number + 1].long().unsqueeze(-1)
+            weight = torch.where(there, maps["free_weight"][index.clamp_max(len(maps["free_weight"]) - 1)], 0).double()
+            known = unpack_flags(sim["known_free"][teams], radios).double()
+            parts.append((known[:, : self.robots] * weight.unsqueeze(1)) @ known.transpose(1, 2))
+        return torch.cat(parts).round().to(torch.int32)
 
     def _period(self, cost: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
         """Decisions from one report to the next, where each takes `cost` of them and so many are left.
@@ -164,10 +185,10 @@ class Strategy:
         since, way = self.step - s["met"][..., n].clamp_min(0), self.way[..., n] / self.drive
         away = since + (way if self.given_period == "auto" else 0.0)
         go = s["duty"] | (away >= self._period(2.0 * way, self.rest + since)) | self.idle | self._is_late()
-        return go & self._has_news(n) & ~self.linked[..., n], s["place"][:, :, n]
+        return go & self._has_news(n), s["place"][:, :, n]
 
     def _has_news(self, radio: int) -> torch.Tensor:
-        """Robots that have learned something since they were last connected with a radio."""
+        """Robots that know what a radio did not know when they were last connected, or does not yet."""
         return self.known > self.state["told"][..., radio]
 
     def _is_late(self) -> torch.Tensor:
@@ -180,7 +201,7 @@ class Strategy:
         they take from how wide the ground is that they know."""
         s, n = self.state, self.robots
         mates = self.linked[..., :n]
-        missing = (s["party"] & ~self.linked).any(-1) & (self.step <= s["due"] + PATIENCE)
+        missing = (s["party"] & ~self.done).any(-1) & (self.step <= s["due"] + PATIENCE)
         bound = mates & missing.unsqueeze(1)  # [i, j]: i is with j, who has promised to meet somebody else
         due = torch.where(bound, s["due"].unsqueeze(1), torch.iinfo(torch.int32).max)
         first = due.argmin(-1)  # the earliest promise counts for all who are together
@@ -197,13 +218,13 @@ class Strategy:
         s["spot"] = torch.where(keeps.unsqueeze(-1), self._pick(s["spot"], first), spot)
         promised = s["party"].gather(1, first.unsqueeze(-1).expand_as(s["party"])) | self.linked
         s["party"] = torch.where(keeps.unsqueeze(-1), promised, party)
-        absent = s["party"] & ~self.linked
+        absent = s["party"] & ~self.done
         time = (s["due"] - self.step) * self.drive
         back = (DETOUR * (s["spot"] - self.at).norm(dim=-1)).minimum(self._driven(absent)) + self.drive
         news = (absent & (self.known.unsqueeze(-1) > s["told"])).any(-1)
         go = absent.any(-1) & ((time <= back) | (self.idle & news) | (s["duty"] & keeps))
         if self.has_base:
-            go = go | (self._is_late() & self._has_news(n) & ~self.linked[..., n])
+            go = go | (self._is_late() & self._has_news(n))
         return go, s["spot"]
 
     def _driven(self, absent: torch.Tensor) -> torch.Tensor:
@@ -225,7 +246,7 @@ class Strategy:
         """The last robot goes to and fro between the base station and whom it has not met for longest; the others come
         home when they find nothing new, and in time before the end."""
         s, n = self.state, self.robots
-        home, goal = self._has_news(n) & ~self.linked[..., n], s["place"][:, :, n].clone()
+        home, goal = self._has_news(n), s["place"][:, :, n].clone()
         go = home & (s["duty"] | self.idle | self._is_late())
         last = n - 1
         met = s["met"][:, last, :last]
@@ -249,12 +270,12 @@ class Strategy:
         known = s["met"] >= 0
         if self.has_base:
             known[..., self.robots] = True
-        pays = torch.where(known & ~self.linked, misses - WORTH - WAY_COST * gap, -torch.inf)
+        pays = torch.where(known, misses - WORTH - WAY_COST * gap, -torch.inf)
         best, whom = pays.max(-1)
         goal = s["place"].gather(2, whom.view(*whom.shape, 1, 1).expand(-1, -1, 1, 2)).squeeze(2)
         go = best > 0.0
         if self.has_base:
-            home = self._has_news(self.robots) & ~self.linked[..., self.robots] & (self._is_late() | self.idle)
+            home = self._has_news(self.robots) & (self._is_late() | self.idle)
             goal = torch.where(home.unsqueeze(-1), s["place"][:, :, self.robots], goal)
             go = go | home
         return go, goal

@@ -208,13 +208,15 @@ def received_power(
         float32 [K] on the device of ``free`` [dBm].
 
     Raises:
-        ValueError: a shape does not fit, or a length is not positive.
+        ValueError: a shape does not fit, a place is not finite, or a length is not positive.
     """
     if free.dim() != 2 or not free.numel():
         raise ValueError(f"free has shape {tuple(free.shape)}: give a grid [H, W] with cells")
     ends = [torch.as_tensor(one, dtype=torch.float32, device=free.device).contiguous() for one in (senders, receivers)]
     if any(one.dim() != 2 or one.shape[1] != 2 for one in ends) or len(ends[0]) != len(ends[1]):
         raise ValueError(f"senders {tuple(ends[0].shape)} and receivers {tuple(ends[1].shape)} must both be [K, 2]")
+    if not all(bool(end.isfinite().all()) for end in ends):
+        raise ValueError("senders and receivers must be finite numbers of metres")
     for name, value in (("edge", edge), ("cell", cell)):
         if not 0.0 < value < math.inf:
             raise ValueError(f"{name}={value} must be a positive number of metres")

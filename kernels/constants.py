@@ -21,6 +21,7 @@ LOSS = 31.0  # along the first cells [dB]
 BLOCKED_LOSS = 40.0  # of ten times as many blocked cells [dB]
 CLEAR_LOSS = 20.0  # of ten times as many clear cells [dB]
 CLEAR_CELLS = 35.0  # up to so many cost nothing more
+NUDGE = 1e-4  # added to places on a line, in cells: rounding must not decide on which side of an edge they lie
 
 # Targets.
 RAYS = 48  # rays that look around from a target

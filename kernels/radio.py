@@ -11,7 +11,7 @@ logarithm is absent where nothing blocks, the second where no more than 35 cells
 
 import warp as wp
 
-from maexp.kernels.constants import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS
+from maexp.kernels.constants import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS, NUDGE
 from maexp.kernels.goals import keyed_uniform
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch
@@ -43,16 +43,17 @@ def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin
     """Cells of the map's grid along a line that are no free ground; those of the grid start at `begin`.
 
     The line is cut in as many equal pieces as it crosses columns of cells, or rows if those are more; the middle of
-    each stands for a cell. So the line there and the line back count the same.
+    each stands for a cell; one on an edge, as of lines between middles of cells, counts with the greater cell. So the
+    line there and the line back count the same.
     """
     along = (b - a) / grids.cell[m]
-    pieces = wp.max(int(wp.ceil(wp.max(wp.abs(along[0]), wp.abs(along[1])))), 1)
+    pieces = wp.max(int(wp.ceil(wp.max(wp.abs(along[0]), wp.abs(along[1])) - NUDGE)), 1)
     start = (a - grids.origin[m]) / grids.cell[m]
     blocked = int(0)
     for k in range(pieces):
         at = start + along * ((float(k) + 0.5) / float(pieces))
-        x = int(wp.floor(at[0]))
-        y = int(wp.floor(at[1]))
+        x = int(wp.floor(at[0] + NUDGE))
+        y = int(wp.floor(at[1] + NUDGE))
         inside = x >= 0 and y >= 0 and x < grids.width[m] and y < grids.height[m]
         if not inside:
             blocked += 1
@@ -188,6 +189,7 @@ def _place_base(
     worst_sum: wp.array(dtype=wp.int64),  # [env]
     told_step: wp.array(dtype=wp.int32),  # [env]
     connected: wp.array2d(dtype=wp.int32),  # [env, robot]
+    contacts: wp.array3d(dtype=wp.int32),  # [env, radio, word]
 ):
     """Put the base station where it is asked for, or where robot 0 starts (inf); nobody knows anything yet."""
     e = wp.tid()
@@ -198,6 +200,8 @@ def _place_base(
         base[e] = wp.vec3(base_x, base_y, 0.0)
     for k in range(known_weight.shape[1]):
         known_weight[e, k] = 0
+        for w in range(contacts.shape[2]):
+            contacts[e, k, w] = 0
     for i in range(connected.shape[1]):
         connected[e, i] = 0
     cells_sent[e] = wp.int64(0)
@@ -225,6 +229,7 @@ def _note_links(
     worst_sum: wp.array(dtype=wp.int64),  # [env]
     told_step: wp.array(dtype=wp.int32),  # [env]
     connected: wp.array2d(dtype=wp.int32),  # [env, robot]
+    contacts: wp.array3d(dtype=wp.int32),  # [env, radio, word]
     # Scratch out:
     counted: wp.array(dtype=wp.int32),  # [env]
     reached: wp.array2d(dtype=wp.int32),  # [env, word]
@@ -240,6 +245,9 @@ def _note_links(
         return
     robots = connected.shape[1]
     radios = known_weight.shape[1]
+    for k in range(radios):
+        for w in range(contacts.shape[2]):
+            contacts[e, k, w] = contacts[e, k, w] | hears[e, k, w]
     least = known_weight[e, 0]
     count = maps.total_weight[map_id[e]]
     standing = int(0)

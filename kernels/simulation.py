@@ -142,8 +142,9 @@ class Simulation:
         self.threads.each(self.shards, lambda shard: shard.replay(step.reset))
 
     def set_goals(self) -> None:
-        """Take ``wanted`` (or ``command``), and start the macro step's reward at zero."""
+        """Take ``wanted`` (or ``command``), and start the macro step's reward and contacts at zero."""
         self.tensors["terms"].zero_()
+        self.tensors["contacts"].zero_()
         self.threads.each(self.shards, lambda shard: shard.replay(set_goals))
 
     def step(self, start: int, count: int) -> None:

@@ -102,6 +102,7 @@ STATE = {
     "cells_sent": Field(wp.int64, "E", "", "points that radios have told others of, where communication is limited"),
     "comm": Field(wp.bool, "E N N", "", "[i, j]: robot i hears robot j; all true unless communication is limited"),
     "hears": Field(wp.int32, "E U W", "", "the same in bits, of all radios that radio i hears"),
+    "contacts": Field(wp.int32, "E U W", "", "all that radio i has heard since the decision before, in bits"),
     "base": Field(wp.vec3, "E", "m", "where the base station is, or would be, z = 0"),
 
     # How much that is. Weights: `Maps.free_weight`, 1 a point on maps of even density.

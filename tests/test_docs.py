@@ -37,7 +37,7 @@ SHIPPED = {
     "planners": (len(PLANNERS), 3),
     "features": (len(FEATURES), 32),
     "channels": (PICTURE_CHANNELS, 4),
-    "arrays of the state": (len(STATE), 49),
+    "arrays of the state": (len(STATE), 56),
 }
 """What the patches add to: how many there are, and how many they are written for."""
 

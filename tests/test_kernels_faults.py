@@ -111,7 +111,7 @@ def test_nobody_foresees_a_failure(name):
 def test_a_mate_out_of_reach_may_have_failed(name):
     """Who does not hear a robot goes where it would go if that had not failed."""
     found = []
-    for at in ([(1, 0.0)], [(1, 50.0)]):
+    for at in ([(1, 0.0)], [(1, 5.0)]):
         env = make(FaultsConfig(at=at), robots=2, envs=1, comm=CommConfig(range=5.0))
         env.set_starts([[6.0, 10.0, 0.0], [34.0, 10.0, 0.0]])
         td = POLICIES[name](env)(env.reset())

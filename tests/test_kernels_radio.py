@@ -34,6 +34,22 @@ def test_received_power_agrees_with_the_oracle(edge, cell):
     np.testing.assert_allclose(back.numpy()[sure], values[sure], atol=2e-3)
 
 
+@pytest.mark.parametrize("edge", [1.0, 0.25, 0.1])
+def test_lines_between_middles_of_cells_count_the_same_both_ways(edge):
+    """Along them points lie on edges of cells."""
+    rng = np.random.default_rng(5)
+    free = rng.random((40, 60)) < 0.9
+    a, b = ((rng.integers(0, (60, 40), (2, 600, 2)) + 0.5) * edge).astype(np.float32)
+    b[:200, 1], b[200:400, 0] = a[:200, 1], a[200:400, 0]  # along rows and columns, too
+    ground, there, back = torch.from_numpy(free), torch.from_numpy(a), torch.from_numpy(b)
+    got = mk.received_power(ground, there, back, edge, edge)
+    assert torch.equal(got, mk.received_power(ground, back, there, edge, edge))
+    wanted = [radio.power(free, edge, p, q, edge) for p, q in zip(a, b, strict=True)]
+    sure = np.array([certain for _, certain in wanted])
+    assert sure.mean() > 0.95
+    np.testing.assert_allclose(got.numpy()[sure], np.array([value for value, _ in wanted])[sure], atol=2e-3)
+
+
 def test_numbers_of_ir2():
     """One blocked cell costs nothing, two 12 dB and three the link; in the open it ends after 312 cells."""
     free = torch.ones(3, 400, dtype=torch.bool)
@@ -50,7 +66,15 @@ def test_numbers_of_ir2():
     assert float(mk.received_power(free, here, far)) == pytest.approx(-51.0 - 20.0 * np.log10(399.0 / 35.0), abs=1e-3)
 
 
-@pytest.mark.parametrize("bad", [dict(free=torch.ones(4)), dict(senders=torch.zeros(2, 3)), dict(cell=0.0)])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        dict(free=torch.ones(4)),
+        dict(senders=torch.zeros(2, 3)),
+        dict(senders=torch.full((2, 2), torch.nan)),
+        dict(cell=0.0),
+    ],
+)
 def test_misfits_are_refused(bad):
     given = dict(free=torch.ones(4, 4, dtype=torch.bool), senders=torch.zeros(2, 2), receivers=torch.zeros(2, 2))
     with pytest.raises(ValueError, match=next(iter(bad))):

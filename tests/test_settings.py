@@ -305,3 +305,22 @@ def test_maps_that_changed_are_named():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_changed_maps(saved, maps[:1])
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("comm.cell=1", ""),
+        ("radar.obstacle_radius=1", ""),
+        ("comm.cell=0", "comm.cell=0 must be auto or a finite number above 0"),
+        ("comm.period=2.5", "comm.period=2.5 must be auto or a whole number"),
+        ("comm.delay=0.04", "comm.delay=0.04 is less than half a step of 0.1 s: use 0 or 0.1"),
+    ],
+)
+def test_whole_numbers_stand_for_numbers_beside_words(word, told):
+    words = ["policy=random", "comm=ir2", word]
+    if told:
+        with pytest.raises(ValueError, match=told):
+            resolve(compose_config("evaluate", words))
+    else:
+        resolve(compose_config("evaluate", words))

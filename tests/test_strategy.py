@@ -1,5 +1,6 @@
 """What robots do about radios that do not reach: who goes to tell, where to, and that it repeats."""
 
+import math
 import pickle
 
 import pytest
@@ -20,7 +21,11 @@ BASE = (2.0, 10.0)
 
 def make(strategy: str = "return_to_base", robots: int = 2, envs: int = 1, base=BASE, **settings) -> ExplorationEnv:
     comm = CommConfig(
-        range=settings.pop("range", 6.0), base_station=base, strategy=strategy, period=settings.pop("period", 3)
+        range=settings.pop("range", 6.0),
+        base_station=base,
+        strategy=strategy,
+        period=settings.pop("period", 3),
+        bandwidth=settings.pop("bandwidth", math.inf),
     )
     settings = {"local_steps": 10, "macro_steps": 40, "num_threads": 1, "seed": 2, "success_coverage": 1.0} | settings
     return ExplorationEnv(WORLD, envs, robots, comm=comm, **settings)
@@ -64,6 +69,55 @@ def goal_of(env: ExplorationEnv, robot: int) -> list[float]:
 def start(env: ExplorationEnv, *poses) -> None:
     env.set_starts([[*one, 0.0] for one in poses])
     env.reset()
+
+
+def shared_with_base(env: ExplorationEnv, robot: int) -> int:
+    """Weight of the free points that a robot and the base station know, point by point."""
+    words = env.simulation.tensors["known_free"][0, 0].tolist()
+    maps, base = env.simulation.map_tensors, env.num_robots
+    weights = maps["free_weight"].tolist()
+    return sum(w for word, w in zip(words, weights, strict=True) if word >> robot & 1 and word >> base & 1)
+
+
+LIMITS = {"bandwidth": {"bandwidth": 80.0}, "delay": {"delay": 5.0}, "loss": {"loss": 0.9}, "noise": {"noise": 40.0}}
+
+
+@pytest.mark.parametrize("limit", LIMITS)
+def test_robots_take_for_told_what_the_base_station_has(limit):
+    """Not what they have begun to send; where links come and go, contacts between two decisions count."""
+    signal = {"signal": True, "power": -5.0} if limit == "noise" else {"range": 6.0}
+    comm = CommConfig(**signal, base_station=BASE, strategy="return_to_base", period=3, **LIMITS[limit])
+    env = ExplorationEnv(WORLD, 1, 2, comm=comm, local_steps=10, macro_steps=40, num_threads=1, seed=2)
+    policy, td, believed, right = POLICIES["nearest_frontier"](env), env.reset(), 0, 0
+    for _ in range(25):
+        env.strategy.look()
+        has = env.simulation.tensors["known_weight"][0].tolist()
+        for robot in range(2):
+            there = shared_with_base(env, robot)
+            told = int(env.strategy.state["told"][0, robot, 2])
+            assert told <= there, "never more than it has"
+            believed += told < has[robot]
+            right += there < has[robot]
+            if told < there:
+                assert not env.strategy.linked[0, robot, 2], "only what came there over others"
+        td = step_mdp(env.step(policy(td)))
+    assert right > 5 and believed >= right
+
+
+def test_a_robot_stays_until_all_is_told():
+    """With 80 B/s, 2 points in a local step."""
+    env = make(bandwidth=80.0, period=1)
+    start(env, (4.0, 10.0), (17.0, 10.0))
+    assert wait(env, 2)[1]
+    put(env, {1: (6.0, 12.0)})
+    for _ in range(30):
+        before = shared_with_base(env, 1)
+        duty = wait(env)[1]
+        if not duty:
+            break
+        assert shared_with_base(env, 1) > before, "while it stands there it tells"
+    knows = int(env.simulation.tensors["known_weight"][0, 1])
+    assert not duty and shared_with_base(env, 1) == knows
 
 
 def test_a_robot_reports_and_is_released():

@@ -14,7 +14,7 @@ from maexp.envs.choices import WAY_AHEAD
 from maexp.envs.config.comm import CELLS_OF_RADAR, CommConfig
 from maexp.envs.features import DETOUR, PACE, Contacts, Moment, add_telling, predict_margin
 from maexp.envs.fields import check_settings
-from maexp.kernels.constants import FREE, STRAIGHT, UNREACHED
+from maexp.kernels.constants import FREE, NUDGE, STRAIGHT, UNREACHED
 
 from .features import Motion
 from .grid import KnownGrid
@@ -322,14 +322,14 @@ def count_blocked(grid: KnownGrid, start: np.ndarray, points: np.ndarray) -> np.
     """Cells along the lines from `start`, [2], to points, [P, 2], on the grid [m] that are not known to be free ground,
     int64 [P]: `maexp.kernels.radio.count_blocked`. The points lie on the grid; what lies before it is blocked."""
     line, size = points - start, np.array([grid.width, grid.height]) * grid.cell
-    pieces = np.maximum(np.ceil(np.abs(line / grid.cell).max(-1)), 1.0)
+    pieces = np.maximum(np.ceil(np.abs(line / grid.cell).max(-1) - NUDGE), 1.0)
     edge = np.where(line > 0.0, -start, size - start) / np.where(line == 0.0, np.inf, line)
     enter = np.clip(edge.max(-1), 0.0, 1.0)  # share of the line before it comes upon the grid
     first = np.maximum(np.floor(enter * pieces) - 1.0, 0.0)
     part = first[:, None] + np.arange(int((pieces - first).max(initial=1.0)))
     there = part < pieces[:, None]
     share = np.where(there, (part + 0.5) / pieces[:, None], 0.0)
-    cells = grid.cells(start + line[:, None] * share[..., None])
+    cells = grid.cells(start + line[:, None] * share[..., None] + NUDGE * grid.cell)
     free = (cells >= 0) & (grid.known.flat[np.maximum(cells, 0)] == FREE)
     return first.astype(np.int64) + (there & ~free).sum(-1)
 

@@ -38,11 +38,12 @@ def _supplied(one: Field) -> Any:
 
 
 def _storable(members: tuple, optional: bool = False) -> Any:
-    """The nearest type that OmegaConf can check: Literal becomes str, a mixture with tuples Any."""
+    """The nearest type that OmegaConf can check: Literal becomes str, a mixture with tuples, or of numbers and words,
+    Any."""
     if get_origin(members[0]) is list:
         return members[0]
     plain = {str if get_origin(one) is Literal else one for one in members if one is not NoneType}
-    if not plain.issubset(PRIMITIVES):
+    if not plain.issubset(PRIMITIVES) or (str in plain and len(plain) > 1):  # it would take no 1 for a float
         return Any
     union = None
     for one in sorted(plain, key=PRIMITIVES.index):

@@ -86,8 +86,10 @@ class CommConfig(Group):
         return self.base_station is not False
 
     def checked(self) -> "CommConfig":
-        """A signal must be able to arrive; a place becomes a tuple."""
+        """A signal must be able to arrive, and a delay be one; a place becomes a tuple."""
         super().checked()
+        if 0.0 < self.delay and not self.message_steps:
+            raise ValueError(f"comm.delay={self.delay:g} is less than half a step of {STEP:g} s: use 0 or {STEP:g}")
         if self.signal and self.threshold >= self.power - LOSS:
             raise ValueError(
                 f"comm.threshold={self.threshold:g} dBm is out of reach: of comm.power={self.power:g} dBm "

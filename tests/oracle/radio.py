@@ -2,19 +2,22 @@
 
 import math
 
+NUDGE, LEAST = 1e-4, 5e-5  # cells
+
 
 def cells_on_line(free, edge: float, a, b) -> tuple[int, bool]:
     """Blocked cells on the line from a to b [m] over a grid `free[y][x]` with its lower corner at (0, 0), and whether
-    that is certain: no point that decides lies within a thousandth of a cell of an edge."""
+    that is certain: no point that decides lies about where float32 may round it to another cell. A point on an edge
+    counts with the greater cell."""
     ax, ay, bx, by = (float(x) / edge for x in (*a, *b))
     across = max(abs(bx - ax), abs(by - ay))
-    pieces = max(math.ceil(across), 1)
-    sure = across < 1.0 or abs(across - round(across)) > 1e-3
+    pieces = max(math.ceil(across - NUDGE), 1)
+    sure = across < 1.0 or abs(across - NUDGE - round(across - NUDGE)) > LEAST
     blocked = 0
     for k in range(pieces):
         share = (k + 0.5) / pieces
-        x, y = ax + (bx - ax) * share, ay + (by - ay) * share
-        sure = sure and min(abs(v - round(v)) for v in (x, y)) > 1e-3
+        x, y = ax + (bx - ax) * share + NUDGE, ay + (by - ay) * share + NUDGE
+        sure = sure and min(abs(v - round(v)) for v in (x, y)) > LEAST
         column, row = math.floor(x), math.floor(y)
         inside = 0 <= row < len(free) and 0 <= column < len(free[0])
         blocked += not (inside and free[row][column])
