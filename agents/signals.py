@@ -4,6 +4,9 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+STOPPED = 130
+"""Exit status of a command that was interrupted."""
+
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:

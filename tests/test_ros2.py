@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from maexp.agents.runtime import TeamPlanner, frames
+from maexp.envs.quaternions import read_yaw
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
 from bag_writer import GRID, STORE, TF, grid, transforms
@@ -140,7 +141,7 @@ def test_goals_and_markers_are_real_messages(conversion):
     frames.fill_pose(pose.pose, *way[-1], frames.heading_of(way))
     got = passed_on(pose).pose
     assert (got.position.x, got.position.y) == (2.0, 3.0)
-    assert frames.read_yaw(got.orientation) == pytest.approx(np.pi / 2)
+    assert read_yaw(got.orientation) == pytest.approx(np.pi / 2)
     point, array = made("geometry_msgs/msg/Point"), blank("visualization_msgs/msg/MarkerArray")
     array.markers = [blank("visualization_msgs/msg/Marker") for _ in range(3)]
     conversion.fill_way(array.markers[0], point, 1, way)

@@ -20,8 +20,7 @@ from maexp.agents.runtime.frames import OccupancyGrid
 from maexp.agents.runtime.grid import KnownGrid
 from maexp.envs import CommConfig, ExplorationEnv
 from maexp.envs.features import FEATURES, RADIO_TABLE, feature_names
-from maexp.kernels.constants import FREE
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT, FREE
 
 RADIOS = {
     "range": HERE,

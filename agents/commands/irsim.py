@@ -75,7 +75,8 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
 
 def make_config(cfg: IrsimSettings, world: PointCloudMap):
     """The trial of these settings; what is not given is that of the floor's scenario."""
-    from maexp.agents.irsim.config import DT, TOLERANCE, TrialConfig
+    from maexp.agents.irsim.config import TOLERANCE, TrialConfig
+    from maexp.kernels.constants import DT
 
     scenario = find_scenario(world.scenario)
     team = [(scenario.max_speed, cfg.radar_range or scenario.radar_range)] * cfg.num_robots
@@ -102,7 +103,7 @@ def make_config(cfg: IrsimSettings, world: PointCloudMap):
 
 def measure(curve: list[float], seconds: float) -> dict[str, float | None]:
     """Coverage at the end and on average over the time, and when 85 and 95 % were seen [s]; None: never."""
-    from maexp.agents.irsim.config import DT
+    from maexp.kernels.constants import DT
 
     values = np.array(curve)
     whole = np.concatenate([values, np.full(max(round(seconds / DT) + 1 - len(values), 0), values[-1])])

@@ -8,10 +8,9 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import LeaderboardSettings
+from maexp.agents.suites.suite import RESULTS
 
 # What needs torch is imported where it is used.
-
-RESULTS = "results.json"
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> None:

@@ -14,14 +14,14 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import SuiteSettings
-from maexp.agents.signals import ended_by_signals
+from maexp.agents.signals import STOPPED, ended_by_signals
 from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.
 
 KEPT = ("place", "policy", "name", "seed", "num_envs", "decision_limit")
 """Settings of a run that `resume` keeps."""
-DIFFERENT, STOPPED = 1, 130
+DIFFERENT = 1
 
 
 def prepare(overrides: list[str]) -> Recipe:

@@ -10,8 +10,8 @@ from PIL import Image, ImageDraw
 
 from maexp.envs.files import whole_file
 from maexp.envs.render import ROBOT_COLOURS
+from maexp.kernels.constants import DT
 
-from .config import DT
 from .people import PERSON_RADIUS
 from .trial import FilmFrame
 

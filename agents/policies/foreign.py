@@ -40,8 +40,8 @@ from maexp.agents.policies.classical import as_module
 from maexp.envs import ExplorationEnv
 from maexp.envs.navigation import known_grids
 from maexp.envs.regions import to_regions
+from maexp.kernels.constants import DT
 from maexp.kernels.launches import finish_filling, launch_on
-from maexp.kernels.types import DT
 
 LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib"))
 VALUES = np.array([-1, 0, 100], np.int8)

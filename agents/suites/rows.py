@@ -19,6 +19,7 @@ from maexp.agents.suites.suite import Suite, load_suite
 from maexp.agents.suites.verify import verify
 from maexp.envs.metrics import label_copies
 from maexp.envs.viewing.episode import Episode
+from maexp.kernels.constants import DT
 
 FORMAT = "maexp-leaderboard-row-1"
 KEPT = ("suite", "policy", "score", "random", "reference", "decisions", "run")
@@ -97,7 +98,7 @@ def _describe_part(suite: Suite, part: str, summary: dict, results: dict) -> dic
         "episodes": episodes[score],
         "copies": label_copies(np.array(episodes["map"]), values).tolist(),
         "lost": len(episodes["lost"]),
-        "seconds": 0.1 * suite.parts[part].limit,
+        "seconds": DT * suite.parts[part].limit,
     }
 
 

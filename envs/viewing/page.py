@@ -14,7 +14,7 @@ from maexp.envs.render import EXPLORED, OVERLAP, UNEXPLORED, WALL_SEEN, WALL_UNS
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at
 from maexp.envs.viewing.scene import DrawnScene, Stage
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 HOST = "127.0.0.1"  # this machine only: the page has no password
 RATE = 20.0  # pictures per second, at most
