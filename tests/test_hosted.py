@@ -220,7 +220,7 @@ def test_goals_over_the_wire_are_those_of_planners_inside(policy, monkeypatch):
         acted = env.step(play_inside(state))
         sent = env.simulation.tensors["wanted"].clone()
         wired = wire.unpack(wire.pack({"type": "goals", "goals": points[-1].numpy().astype(np.float64)})[4:])["goals"]
-        goals = from_regions(env, *sight.to_action(wired))
+        goals = from_regions(env.simulation, *sight.to_action(wired))
         assert torch.equal(goals, sent) or (policy == "small_mazes" and torch.allclose(goals, sent, rtol=0, atol=1e-5))
         state = acted["next"]
     assert not torch.equal(before, env.simulation.tensors["center"])

@@ -4,12 +4,12 @@ import ast
 import importlib
 import sys
 import xml.etree.ElementTree as xml
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from paths import ROOT
 
 from maexp.agents.runtime import TeamPlanner, frames
 from maexp.envs.quaternions import read_yaw
@@ -18,7 +18,7 @@ pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED:
 from bag_writer import GRID, STORE, TF, grid, transforms
 from rosbags.interfaces import Nodetype
 
-PACKAGE = Path(__file__).resolve().parents[1] / "docs" / "ros2" / "maexp_ros"
+PACKAGE = ROOT / "docs" / "ros2" / "maexp_ros"
 ZERO = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 

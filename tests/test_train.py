@@ -25,7 +25,8 @@ from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import make_map
 
-pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands
+# Trainings; a short one is among the README's commands.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("somewhere", "no_pictures")]
 
 TINY = [
     "scenario=maze_small",
@@ -53,18 +54,6 @@ CLOCKS = (
     "time_update",
     "time_validation",
 )
-
-
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(autouse=True)
-def no_film(monkeypatch):
-    """Pictures have tests of their own."""
-    monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", lambda *args: None)
-    monkeypatch.setattr("maexp.agents.commands.train.draw_curves", lambda *args: None)
 
 
 def run(folder: str, iterations: int, *words: str) -> Path:

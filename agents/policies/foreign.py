@@ -143,7 +143,7 @@ class TeamSight:
         """
         points = torch.from_numpy(np.asarray(goals, np.float32)).to(self.env.device)
         own = self.env.simulation.believed["center"][..., :2]
-        return to_regions(self.env, torch.where(points.isnan().any(-1, keepdim=True), own, points))
+        return to_regions(self.env.simulation, torch.where(points.isnan().any(-1, keepdim=True), own, points))
 
 
 def _largest(values: torch.Tensor) -> float:
