@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from test_train import TINY, assert_same_runs, resume, run
+from tiny_training import TINY, assert_same_runs, resume, run
 from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy

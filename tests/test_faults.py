@@ -1,6 +1,7 @@
 """Kills, full disks, damaged and hostile files: what was there before stays whole, and one sentence says what happened.
 
-Checkpoints that are killed while they are written, and Ctrl-C: test_train.py. Damaged maps: test_fuzz_import.py.
+Checkpoints that are killed while they are written, and Ctrl-C: test_train_stopped.py. Damaged maps:
+test_fuzz_import.py.
 """
 
 import itertools

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from metrics_file import read_metrics
-from test_train import TINY, assert_same
+from tiny_training import TINY, assert_same
 from toy_env import OFFSET, SMALL_MODEL, ToyEnv
 
 from maexp.agents import ALGORITHMS, make_policy

@@ -30,8 +30,8 @@ from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import BenchmarkSettings
-from maexp.agents.signals import STOPPED
-from maexp.agents.training.train import stop_on_signals, write_config
+from maexp.agents.signals import STOPPED, stop_on_signals
+from maexp.agents.training.train import write_config
 
 NOTE = "What is absent here each cell has from its scenario and its algorithm: see cells/*/*/*/config.yaml."
 FAILED = 1

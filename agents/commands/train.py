@@ -25,11 +25,9 @@ from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkp
 from maexp.agents.training.imitation import check_warm_start, starts_as, warm_start
 from maexp.agents.training.logs import check_logger, log_results
 from maexp.agents.training.named import NamedPolicy, find_players, suit_observation
+from maexp.agents.training.prepare import check_collector, check_expert, describe_workers
 from maexp.agents.training.train import (
     TrainingRun,
-    check_collector,
-    check_expert,
-    describe_workers,
     train,
     write_config,
 )
