@@ -189,13 +189,13 @@ def overview() -> str:
 
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
+    from maexp.agents.command_words import check_sweep, check_words
     from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
     from maexp.agents.settings.checks import check_ranges
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.settings.resolved import describe_radius, without_hydra
     from maexp.agents.settings.runs import Recipe
-    from maexp.agents.words import check_sweep, check_words
 
     verb = VERBS[name]
     flags, rest = split_flags(words)

@@ -17,8 +17,8 @@ from maexp.agents.irsim.follower import Follower
 from maexp.agents.irsim.mapping import TeamGrid
 from maexp.agents.irsim.odometry import Odometry
 from maexp.agents.irsim.people import Walkers
-from maexp.agents.irsim.players import team_planner
 from maexp.agents.irsim.simulator import Scan
+from maexp.agents.irsim.trial_planners import team_planner
 from maexp.agents.policies import POLICIES
 from maexp.kernels.constants import DT
 

@@ -18,7 +18,7 @@ from maexp.envs.viewing import show
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at, paint
 from maexp.envs.viewing.quads import make_quads
-from maexp.envs.viewing.scene import GROUND, WALL_SHARE, Stage
+from maexp.envs.viewing.stage import GROUND, WALL_SHARE, Stage
 
 pytestmark = pytest.mark.slow  # a browser's page
 

@@ -23,7 +23,7 @@ def check(cfg: IrsimSettings) -> None:
     """Raise UserError for what is missing, before a folder is made."""
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
-    from maexp.agents.irsim.players import check_player
+    from maexp.agents.irsim.trial_planners import check_player
 
     check_player(cfg.policy, find_player(cfg.policy))
     if importlib.util.find_spec("irsim") is None:
@@ -33,9 +33,9 @@ def check(cfg: IrsimSettings) -> None:
 def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
     from maexp.agents.irsim import ours
-    from maexp.agents.irsim.pictures import draw_curves, draw_moment
-    from maexp.agents.irsim.players import make_planner
+    from maexp.agents.irsim.drawing import draw_curves, draw_moment
     from maexp.agents.irsim.trial import run_trial
+    from maexp.agents.irsim.trial_planners import make_planner
 
     with blame_input():
         world = import_map(cfg.floor, read(ImportOptions, cfg.importing))

@@ -17,8 +17,8 @@ from .floor import make_floor
 from .follower import Follower
 from .mapping import TeamGrid
 from .odometry import Odometry
-from .players import ForeignTeam
 from .simulator import Simulator
+from .trial_planners import ForeignTeam
 
 BORDER = 3.0  # [m] of the team's grid around the floor, for beliefs that drift
 
@@ -72,7 +72,7 @@ def run_trial(
 
     Args:
         world: a floor.
-        planner: who plans for the team, `maexp.agents.irsim.players.make_planner`.
+        planner: who plans for the team, `maexp.agents.irsim.trial_planners.make_planner`.
         starts: x, y [m] and heading [rad].
         config: the team and what disturbs it.
         watch: called at every decision.

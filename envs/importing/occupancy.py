@@ -15,8 +15,8 @@ from PIL import Image
 from maexp.envs.map import MapError, check_file
 
 from .grid import FREE, MAX_CELLS, MAX_ORIGIN, OBSTACLE, UNKNOWN, Grid
+from .import_report import ImportReport, ScannedImage
 from .options import ImportOptions
-from .report import ImportReport, ScannedImage
 
 MAX_YAML_BYTES = 64 * 1024
 _BRIEF = Repr()

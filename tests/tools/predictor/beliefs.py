@@ -24,9 +24,9 @@ from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, make_map
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.importing.finish import crop_grid, finish_map
+from maexp.envs.importing.import_report import ImportReport
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.importing.report import ImportReport
 from maexp.envs.importing.sources import GridSource
 from maexp.envs.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import GENERATED, cut_last_fifth, default_macro_steps, find_scenario, split
