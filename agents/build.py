@@ -31,7 +31,7 @@ from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.config import STARTS
-from maexp.envs.scenarios import SCENARIOS, find_scenario
+from maexp.envs.scenarios import GENERATED, SCENARIOS, find_scenario
 from maexp.envs.starts import read_starts
 
 
@@ -187,7 +187,7 @@ def _check_entry(entry: Any) -> None:
         )
     name, path = entry["name"], entry.get("path")
     if name not in SCENARIOS or (SCENARIOS[name].build is None and path is None):
-        known = ", ".join(one for one, row in SCENARIOS.items() if row.build is not None)
+        known = ", ".join(GENERATED)
         raise UserError(
             f"scenario.also={name} is no scenario with maps of its own: choose among {known}, or give "
             "{name: pointcloud, path: FILES}."

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from maexp.agents.errors import UserError, describe_disk_error
 from maexp.agents.memory import keep_freed_memory
+from maexp.agents.signals import STOPPED
 
 if TYPE_CHECKING:  # nobody waits for Hydra to print a line of help
     from omegaconf import DictConfig
 
-BAD_INPUT, INTERRUPTED, PIPE_CLOSED = 2, 130, 141
+BAD_INPUT, PIPE_CLOSED = 2, 141
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def main(argv: list[str] | None = None) -> int:
         return BAD_INPUT
     except KeyboardInterrupt:
         print("maexp: interrupted.", file=sys.stderr)
-        return INTERRUPTED
+        return STOPPED
     except BrokenPipeError:  # `maexp train --help | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PIPE_CLOSED
@@ -188,13 +189,13 @@ def overview() -> str:
 
 def run_verb(name: str, words: list[str]) -> int:
     """Compose the settings of a verb, claim a folder and run it."""
+    from maexp.agents.command_words import check_sweep, check_words
     from maexp.agents.commands.run_folder import claim_folder, remove_if_empty
     from maexp.agents.settings.checks import check_ranges
     from maexp.agents.settings.compose import compose_recipe
     from maexp.agents.settings.overrides import find_override, make_overrides, split_flags, without
     from maexp.agents.settings.resolved import describe_radius, without_hydra
     from maexp.agents.settings.runs import Recipe
-    from maexp.agents.words import check_sweep, check_words
 
     verb = VERBS[name]
     flags, rest = split_flags(words)

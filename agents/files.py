@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from maexp.envs.files import whole_file
+from maexp.envs.whole_file import whole_file
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -8,179 +8,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 from scipy.ndimage import distance_transform_edt
 
-from maexp.envs.bank import CELLS_PER_RANGE, MapBank
 from maexp.envs.branches import OF_POINTS, Branches, branch_env
 from maexp.envs.config import CommConfig
+from maexp.envs.imagined_bank import SCALARS, WorldSizes, imagined_bank
 from maexp.envs.nav_grid import bank_nav_grids
 from maexp.envs.navigation import Navigation
 from maexp.envs.targets import TargetTracker
 from maexp.kernels.belief import NOBODY, recall, write_worlds
-from maexp.kernels.block_size import block_sides
 from maexp.kernels.constants import FREE, MARGIN_CELLS, OBSTACLE, UNKNOWN
-from maexp.kernels.known_grid import NavGrids
-from maexp.kernels.launches import finish_filling, record, replay
+from maexp.kernels.launches import record, replay
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
 
 Guess = Callable[[torch.Tensor], torch.Tensor]
-ENDLESS = 1 << 30  # total weight of an imagined map: nobody knows how much there is to see
 FULL = 100  # weight of a cell that is free for certain
 AWAY = 1.0e6  # where robots are put that a robot does not hear [m]
-
-
-@dataclass(frozen=True)
-class WorldSizes:
-    """Grids of imagined worlds, a row for every true map; lengths in cells, but for `edge` and `origin` [m]."""
-
-    edge: np.ndarray  # float32 [M], of a cell
-    origin: np.ndarray  # float32 [M, 2], lower corner of cell (0, 0)
-    width: np.ndarray  # int32 [M], with the margin
-    height: np.ndarray
-    margin: np.ndarray
-    tile: np.ndarray  # the radar's cells
-    block: np.ndarray  # blocks of frontier cells
-
-    @classmethod
-    def around(cls, grids: NavGrids, most: float, least: float) -> WorldSizes:
-        """Grids around the true ones, for radars that reach `most` and at least `least` metres."""
-        edge, width, height = (getattr(grids, name).numpy() for name in ("cell", "width", "height"))
-        block = block_sides(edge, least, width, height)  # as in the true grids
-        margin = (np.ceil((np.ceil(most / edge) + 1) / block) * block).astype(np.int32)
-        return cls(
-            edge=edge,
-            origin=(grids.origin.numpy() - edge[:, None] * margin[:, None]).astype(np.float32),
-            width=width + 2 * margin,
-            height=height + 2 * margin,
-            margin=margin,
-            tile=np.maximum(1, np.round(most / CELLS_PER_RANGE / edge)).astype(np.int32),
-            block=block,
-        )
-
-    @property
-    def tiles_x(self) -> np.ndarray:
-        """Tiles along x, int32 [M]."""
-        return -(-self.width // self.tile)
-
-    @property
-    def tiles_y(self) -> np.ndarray:
-        """Tiles along y, int32 [M]."""
-        return -(-self.height // self.tile)
-
-
-@dataclass(frozen=True)
-class ImaginedMap:
-    """Stands for a map in the bank of imagined worlds."""
-
-    name: str
-    resolution: float
-    extent: tuple[tuple[float, float], tuple[float, float]]
-
-
-@dataclass
-class ImaginedBank(MapBank):
-    """Room for imagined maps."""
-
-    def tensors(self, device: torch.device) -> dict[str, torch.Tensor]:
-        """The arrays on ``device``; walls are what masks the radar."""
-        tensors = super().tensors(device)
-        return tensors | {
-            name: tensors[name.replace("occluder", "boundary")]
-            for name in ("occluder", "occluder_begin", "occluder_cell")
-        }
-
-
-def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> ImaginedBank:
-    """Room for `worlds` maps as large as the largest."""
-    cells, tiles = int((sizes.width * sizes.height).max()), int((sizes.tiles_x * sizes.tiles_y).max())
-    points, pairs = cells + 1, 4 * cells  # of four pairs of neighbours a cell, no pattern parts more than three
-    begin = np.arange(worlds + 1, dtype=np.int32)
-    scalars = {
-        "total_weight": np.full(worlds, ENDLESS, np.int32),
-        "outline_radius_max": np.repeat(env.bank.arrays["outline_radius_max"].max(), worlds),
-    } | {name: np.repeat(env.bank.arrays[name][:1], worlds, 0) for name in SCALARS}
-    arrays = {
-        "free": np.zeros((worlds * points, 3), np.float32),
-        "free_weight": np.ones(worlds * points, np.int32),
-        "free_clearance": np.zeros(worlds * points, np.float32),
-        "free_begin": begin * points,
-        "free_cell": np.zeros(worlds * (tiles + 1), np.int32),
-        "boundary": np.zeros((worlds * points, 3), np.float32),
-        "boundary_begin": begin * points,
-        "boundary_cell": np.zeros(worlds * (tiles + 1), np.int32),
-        "neighbour_begin": np.zeros(worlds * points + 1, np.int32),
-        "neighbour": np.zeros(worlds * pairs, np.int32),
-        "occluder": np.zeros((0, 3), np.float32),
-        "occluder_begin": begin,
-        "occluder_cell": begin,
-        "occluder_radius": np.zeros(worlds * points, np.float32),
-        "cell_begin": begin[:-1] * (tiles + 1),
-        "shown_begin": begin[:-1] * 0,
-        "point_pixel_begin": np.zeros(1, np.int32),
-        "point_pixel": np.zeros(1, np.int32),
-        "pixel_point_begin": np.zeros(1, np.int32),
-        "pixel_point": np.zeros(1, np.int32),
-    }
-    finest, coarsest = float(sizes.edge.min()), float(sizes.edge.max())
-    width, height = int(sizes.width.max()), int(sizes.height.max())
-    in_range = (2 * math.ceil(max(one.range for one in env.radar_configs) / finest) + 3) ** 2
-    grids = NavGrids()
-    values = {
-        "origin": (np.zeros((worlds, 2), np.float32), wp.vec2),
-        "cell": (np.full(worlds, coarsest, np.float32), wp.float32),
-        "width": (np.full(worlds, width, np.int32), wp.int32),
-        "height": (np.full(worlds, height, np.int32), wp.int32),
-        "free_cell": (np.zeros(worlds * points, np.int32), wp.int32),
-        "boundary_cell": (np.zeros(worlds * points, np.int32), wp.int32),
-        "cell_begin": (np.zeros(worlds + 1, np.int32), wp.int32),
-        "stand_in": (np.arange(width * height, dtype=np.int32), wp.int32),
-        "void_begin": (np.zeros(width * height + 1, np.int32), wp.int32),
-        "voids": (np.zeros(1, np.int32), wp.int32),
-    }
-    for name, (array, kind) in values.items():
-        setattr(grids, name, wp.array(array, dtype=kind, device=str(env.device)))
-    finish_filling(env.device)
-    side = ((0.0, 0.0), (finest * (width - 1), finest * (height - 1)))
-    return ImaginedBank(
-        maps=[ImaginedMap(f"imagined_{k}", finest, side) for k in range(worlds)],
-        arrays=arrays | scalars,
-        order_free=[],
-        order_boundary=[],
-        max_free=points,
-        max_boundary=points,
-        free_in_range=in_range,
-        boundary_in_range=in_range,
-        occluders_in_range=in_range,
-        grids=(grids, width * height),
-        block_sides=np.full(worlds, sizes.block.min()),
-    )
-
-
-SCALARS = (
-    "resolution",
-    "occluder_radius_max",
-    "cell_origin",
-    "cell_size",
-    "cells_x",
-    "cells_y",
-    "lower",
-    "upper",
-    "frame_origin",
-    "pixel_size",
-)
-"""What an imagined map has one of, set anew for every team."""
-
-
 IN_GRIDS = {"origin": "cell_origin", "cell": "resolution"}
-"""What navigation grids call two of these."""
+"""What navigation grids call two of `SCALARS`."""
 
 
 class Beliefs(Branches):
@@ -220,6 +72,7 @@ class Beliefs(Branches):
         self.tracker: TargetTracker | None = None
         self._fill_tables()
         self._allocate()
+        self._record()
         self.env.simulation.tensors["comm"].fill_(True)
         self.env.simulation.tensors["hears"].fill_(-1)
 
@@ -256,36 +109,37 @@ class Beliefs(Branches):
         self.table = {name: torch.from_numpy(np.ascontiguousarray(one)).to(device) for name, one in columns.items()}
 
     def _allocate(self) -> None:
-        env, maps, sizes, device = self.env, self.env.simulation.maps, self.sizes, self.origin.device
-        grids, cells = env.bank.grids
-        self.cells, self.tiles = cells, int((sizes.tiles_x * sizes.tiles_y).max())
+        sizes, device = self.sizes, self.origin.device
+        self.cells, self.tiles = self.env.bank.grids[1], int((sizes.tiles_x * sizes.tiles_y).max())
+        shape = (self.worlds, self.cells)
         self.state, self.certain, self.guess = (
-            torch.full((self.worlds, cells), FREE, dtype=torch.uint8, device=device) for _ in range(3)
+            torch.full(shape, FREE, dtype=torch.uint8, device=device) for _ in range(3)
         )
-        self.worth = torch.full((self.worlds, cells), FULL, dtype=torch.uint8, device=device)
+        self.worth = torch.full(shape, FULL, dtype=torch.uint8, device=device)
         self.wall = torch.full((self.worlds, self.nav.known.shape[-1]), NOBODY, dtype=torch.int32, device=device)
-        index = torch.zeros((self.worlds, cells), dtype=torch.int32, device=device)
-        count = torch.zeros((self.worlds, self.tiles, 3), dtype=torch.int32, device=device)
-        pair_begin = torch.zeros((self.worlds, self.tiles), dtype=torch.int32, device=device)
+        self.index = torch.zeros(shape, dtype=torch.int32, device=device)
+        self.count = torch.zeros((self.worlds, self.tiles, 3), dtype=torch.int32, device=device)
+        self.pair_begin = torch.zeros((self.worlds, self.tiles), dtype=torch.int32, device=device)
         self.total = torch.zeros((self.worlds, 2), dtype=torch.int32, device=device)
         self.place = torch.zeros(self.worlds, dtype=torch.int32, device=device)
         self.own = {name: torch.zeros(self.worlds, dtype=torch.int32, device=device) for name in ("margin", "tile")}
-        own = {name: wp.from_torch(one) for name, one in self.own.items()}
-        self.values = own | {
+        self.known = torch.zeros((self.worlds, self.nav.known.shape[-1]), dtype=torch.uint8, device=device)
+        flags = self.origin.simulation.tensors["viewers_boundary" if self.rows == 1 else "known_boundary"]
+        self.flags = torch.zeros_like(flags[:1]).repeat(self.teams, 1, 1)
+        self.map_id = torch.zeros(self.teams, dtype=torch.int32, device=device)
+
+    def _kernel_values(self) -> dict[str, Any]:
+        """What kernels of worlds take, by their parameters' names."""
+        maps, grids = self.env.simulation.maps, self.env.bank.grids[0]
+        own = ("wall", "guess", "state", "certain", "count", "index", "pair_begin", "total", "worth", "place")
+        values = {name: wp.from_torch(one) for name, one in self.own.items()}
+        values |= {name: wp.from_torch(getattr(self, name)) for name in own}
+        return values | {
             "maps": self.origin.simulation.maps,
             "grids": self.true_grids,
-            "place": wp.from_torch(self.place),
             "rows_per_env": self.rows,
             "lanes": self.nav.known_grids.lanes,
-            "robots": env.num_robots,
-            "wall": wp.from_torch(self.wall),
-            "guess": wp.from_torch(self.guess),
-            "state": wp.from_torch(self.state),
-            "certain": wp.from_torch(self.certain),
-            "count": wp.from_torch(count),
-            "index": wp.from_torch(index),
-            "pair_begin": wp.from_torch(pair_begin),
-            "total": wp.from_torch(self.total),
+            "robots": self.env.num_robots,
             "most_pairs": maps.neighbour.shape[0] // self.worlds,
             "tiles_x": maps.cells_x,
             "origin": grids.origin,
@@ -297,7 +151,6 @@ class Beliefs(Branches):
             "boundary_begin": maps.boundary_begin,
             "free_cell": maps.free_cell,
             "boundary_cell": maps.boundary_cell,
-            "worth": wp.from_torch(self.worth),
             "free_weight": maps.free_weight,
             "free": maps.free,
             "boundary": maps.boundary,
@@ -306,20 +159,18 @@ class Beliefs(Branches):
             "neighbour_begin": maps.neighbour_begin,
             "neighbour": maps.neighbour,
         }
-        state = env.simulation.tensors
+
+    def _record(self) -> None:
+        """The launches that write worlds, and those that let robots recall what they know in them."""
+        env, grids, values = self.env, self.env.bank.grids[0], self._kernel_values()
         names = ("map_id", "seen_free", "viewers_free", "seen_boundary", "viewers_boundary")
-        recalled = {name: wp.from_torch(state[name]) for name in names}
-        origin = self.origin.simulation.tensors
-        self.known = torch.zeros((self.worlds, self.nav.known.shape[-1]), dtype=torch.uint8, device=device)
-        self.flags = torch.zeros_like(origin["viewers_boundary" if self.rows == 1 else "known_boundary"][:1])
-        self.flags = self.flags.repeat(self.teams, 1, 1)
-        self.map_id = torch.zeros(self.teams, dtype=torch.int32, device=device)
+        recalled = {name: wp.from_torch(env.simulation.tensors[name]) for name in names}
         read = {name: wp.from_torch(getattr(self, name)) for name in ("known", "flags", "map_id")}
-        where = wp.device_from_torch(device)
+        where = wp.device_from_torch(self.origin.device)
         self.writing = record(
-            lambda launch: write_worlds(launch, self.worlds, self.cells, self.tiles, self.values | read), where
+            lambda launch: write_worlds(launch, self.worlds, self.cells, self.tiles, values | read), where
         )
-        self.recalling = record(lambda launch: recall(launch, env.num_envs, self.values | recalled), where)
+        self.recalling = record(lambda launch: recall(launch, env.num_envs, values | recalled), where)
         self.grid_views = {name: wp.to_torch(getattr(grids, name)) for name in ("origin", "cell", "width", "height")}
 
     def look(self, teams: torch.Tensor) -> None:

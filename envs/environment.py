@@ -200,7 +200,7 @@ class ExplorationEnv(EnvBase):
             if self.target_view is not None:
                 self.target_view.forget()
             given = action.get("goal", None)
-            return from_regions(self, action["region"], action["offset"]) if given is None else given, None
+            return from_regions(self.simulation, action["region"], action["offset"]) if given is None else given, None
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
         return self.target_view.take(action["target"], action.get("preference", None)), self.target_view.tells

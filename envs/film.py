@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from maexp.envs.files import whole_file
+from maexp.envs.whole_file import whole_file
 
 HOLD = 2.0  # seconds the last picture of a GIF stays before it starts over
 

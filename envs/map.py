@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maexp.envs.files import whole_file
+from maexp.envs.whole_file import whole_file
 
 BOUNDARY_REACH = 1.5  # an obstacle point bounds free space within this many spacings of a free point
 MAX_POINTS = 20_000_000  # of a scan; a file that promises more is refused before anything is allocated

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.envs.files import whole_file
 from maexp.envs.map import PointCloudMap
 from maexp.envs.raster import map_raster
+from maexp.envs.whole_file import whole_file
 
 COLORS = {"outside": (245, 245, 245), "free": (198, 219, 239), "boundary": (8, 48, 107), "obstacle": (140, 140, 150)}
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 
 class CoverageRecorder:

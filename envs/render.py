@@ -18,7 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from maexp.envs.film import write_gif, write_mp4
 from maexp.envs.raster import MapRaster, map_raster
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 __all__ = ["draw_frame", "draw_grid", "draw_teams", "record_episode", "watch_episode", "write_gif", "write_mp4"]
 

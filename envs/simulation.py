@@ -13,6 +13,7 @@ from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotC
 from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
 from maexp.kernels.arrays import count_bytes
 from maexp.kernels.blocks import BLOCKS
+from maexp.kernels.constants import DT
 from maexp.kernels.dynamics import KINDS, Robots
 from maexp.kernels.known_grid import news_capacity
 from maexp.kernels.radio import Radio
@@ -21,7 +22,7 @@ from maexp.kernels.sensing import Sensing, return_chance
 from maexp.kernels.shards import Settings
 from maexp.kernels.simulation import Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
-from maexp.kernels.types import DT, PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
+from maexp.kernels.types import PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
 from maexp.kernels.wavefront import grid_bytes
 from maexp.kernels.ways import PATH_CELLS
 

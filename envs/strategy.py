@@ -17,7 +17,7 @@ import torch
 
 from maexp.envs.features import DETOUR, PACE
 from maexp.kernels import unpack_flags
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv

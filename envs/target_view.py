@@ -89,7 +89,7 @@ class TargetView:
         s["block"], s["mask"] = scene.block.gather(2, best), some
         s["cell"] = scene.cells().gather(2, best)
         s["way"] = torch.where(some, scene.travel.gather(2, best), 0.0)
-        s["point"], s["toward"] = _pick(scene.points, best), _pick(scene.middle, best)
+        s["point"], s["toward"] = pick_places(scene.points, best), pick_places(scene.middle, best)
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
         moment = self._moment(s, scene, best, some, value.gather(2, best))
         if self.contacts is not None:
@@ -116,7 +116,7 @@ class TargetView:
         reach, point, gain, hears = nav.radar_range, state["point"], scene.gain.gather(2, best), nav.state["comm"]
         open_value = torch.where(some, value, -torch.inf)
         score, taken, claimed = plan_in_turn(gain, open_value, point / reach, hears)
-        where = _pick(point, taken.unsqueeze(-1)).squeeze(2)
+        where = pick_places(point, taken.unsqueeze(-1)).squeeze(2)
         ways = torch.where(scene.alive.unsqueeze(-1), nav.way / reach, torch.inf)
         plans, last = (where, some.any(-1)), (state["last"], state["has_last"])
         rival, *gaps = compare_with_others(point, best, ways, hears, plans, last)
@@ -188,10 +188,10 @@ class TargetView:
         chosen, waits = self.tracker.share(preference, s["way"], s["point"])
         self.tells = index == self.count
         index = chosen.clamp_min(0).unsqueeze(-1)
-        self.note(chosen, _pick(s["point"], index).squeeze(2))
+        self.note(chosen, pick_places(s["point"], index).squeeze(2))
         block = torch.where(chosen >= 0, s["block"].gather(2, index).squeeze(-1), -1)
         cell = s["cell"].gather(2, index).squeeze(-1)
-        return self.tracker.take(block, cell, _pick(s["toward"], index).squeeze(2), waits)
+        return self.tracker.take(block, cell, pick_places(s["toward"], index).squeeze(2), waits)
 
     def forget(self) -> None:
         """Another policy acts: nobody knows which targets its robots go to."""
@@ -238,6 +238,6 @@ def _best(value: torch.Tensor, count: int) -> torch.Tensor:
     return torch.nn.functional.pad(place, (0, count - place.shape[-1]))
 
 
-def _pick(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Entries [E, N, M, 2] of [E, N, K, 2]."""
+def pick_places(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    """Entries [E, N, M, 2] of [E, N, K, 2]; ``index`` int64 [E, N, M]."""
     return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))

@@ -14,10 +14,10 @@ from maexp.envs.features import drive_until_next
 from maexp.envs.navigation import Navigation
 from maexp.kernels import goals, targets
 from maexp.kernels.assignment import FORBIDDEN, assign_targets
+from maexp.kernels.constants import DT
 from maexp.kernels.launches import launch_named, launch_on, view
 from maexp.kernels.sharing import share_targets
 from maexp.kernels.teamwork import choose_in_turn
-from maexp.kernels.types import DT
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv

@@ -3,6 +3,8 @@
 Imports nothing: robots' computers have neither Warp nor torch.
 """
 
+DT = 0.1  # length of a local step [s]
+
 # What is known of a cell.
 UNKNOWN, FREE, OBSTACLE = 0, 1, 2
 

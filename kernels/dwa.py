@@ -13,6 +13,7 @@ from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.state import robots_struct
 from maexp.kernels.types import (
     ERROR_CAPACITY,
+    FAR,
     HALF,
     LANES,
     ROBOTS_PER_WORD,
@@ -26,7 +27,6 @@ from maexp.kernels.types import (
 
 wp.set_module_options(MODULE_OPTIONS)
 
-FAR = 1.0e30
 NEAREST = 1.0e-6  # distances below count as this [m], so that the logarithm stays finite
 
 

@@ -2,6 +2,8 @@
 
 A grid cell is `UNKNOWN`, `FREE` or `OBSTACLE`; a frontier cell is a free one that shares an edge with an
 unknown one. What lies outside the grid is not unknown: nothing can ever be seen there.
+
+Every cell is asked by itself, so none is missed and nothing is searched; `geodesic` names the searches.
 """
 
 from collections.abc import Callable

@@ -11,6 +11,11 @@ the key of a cell is its distance plus the least distance that may be left. Keys
 a step, so cells wait in a ring of 64 buckets, one for every key that can occur; those of a bucket are a linked list,
 and a cell whose label drops moves to another. A* goes on until all keys up to the goal's distance are done: then all
 cells of all shortest ways to the goal have their exact distance.
+
+Five files look over the cells of a grid. This one alone measures ways. `wavefront` keeps a way from search to search
+and picks the waypoint that is driven to; `ways` has the short steps around a search, from cell to cell; `frontier`
+needs no search, for a cell's neighbours say whether it is one; `tree` samples as RRT does, to find some frontiers
+without looking at every cell.
 """
 
 from collections.abc import Callable

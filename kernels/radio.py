@@ -24,8 +24,7 @@ wp.set_module_options(MODULE_OPTIONS)
 FADING_KEY = 1 << 24  # apart from the numbers that policies draw
 UNION = 0
 BASE = 1
-EVERYONE = 2
-"""Whose coverage ends an episode."""
+"""Whose coverage ends an episode: places in `maexp.envs.config.DONE`."""
 
 
 @wp.struct

@@ -15,8 +15,8 @@ from typing import Any
 
 import warp as wp
 
+from maexp.kernels.constants import DT
 from maexp.kernels.launches import Launch, RecordedLaunch, lanes_on, launch_named, record, replay
-from maexp.kernels.types import DT
 
 Stage = Callable[[Launch, "Shard"], None]
 """``stage(launch, shard)`` launches kernels over the envs of a shard."""

@@ -10,10 +10,9 @@ import warp as wp
 
 from maexp.kernels.launches import launch_on, view
 from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.types import NOTHING
 
 wp.set_module_options(MODULE_OPTIONS)
-
-NOTHING = -3.0e38  # below every preference
 
 
 @wp.func

@@ -1,6 +1,9 @@
 """Rapidly-exploring random trees that look for frontiers: a branch that leaves what is known has found one.
 
 A tree grows from every robot over its passable cells. Coordinates are in cells of the env's grid.
+
+What `rrt_frontiers` is made of: it measures no ways, and what no sample comes near is not found.
+`frontier` finds all, `geodesic`, which names the other searches, how far they are.
 """
 
 import warp as wp

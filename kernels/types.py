@@ -37,9 +37,6 @@ TEAM_CHANNELS = 3
 """Of the team's picture: the first two of a robot's, and how many robots have explored it."""
 CHANNEL_VIEWERS = 2
 
-DT = 0.1
-"""Length of a local step [s]."""
-
 START_CLEARANCE = 3.0
 """Starts keep this many collision thresholds from the boundary and from other robots."""
 
@@ -47,6 +44,12 @@ BESIDE = 1.5
 """Robots that start together stand at most so many clearances from another one."""
 
 PI = 3.14159265358979
+
+FAR = 1.0e30
+"""Longer than any distance [m]."""
+
+NOTHING = -3.0e38
+"""Below every value and preference."""
 
 LANES = 8
 """Items that a CPU's vector unit takes at once where a kernel says so; on a GPU a thread takes them in turn."""

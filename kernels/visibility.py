@@ -23,6 +23,7 @@ from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (
     ERROR_CAPACITY,
+    FAR,
     HALF,
     ROBOTS_PER_WORD,
     VIEWER_NOW,
@@ -37,7 +38,6 @@ from maexp.kernels.types import (
 
 wp.set_module_options(MODULE_OPTIONS)
 
-FAR = 1.0e30
 CELL_HALF = 0.709  # half the diagonal of a cell in edges, with room for rounding
 WORTH_A_TEST = 6  # free points of a cell from which on it pays to ask first whether it is hidden
 WORTH_AN_OCCLUDER = 2  # occluders from which on it does

@@ -9,6 +9,8 @@ the path that is in the robot's radar range and in sight, drawn nearer where the
 
 A path holds its first `PATH_CELLS` cells only; the search is repeated long before a robot gets there. What is
 held never outlives a macro step: a new goal always searches anew.
+
+The distances are those of `geodesic`, which names the other searches; here is when to search, and what of it is driven.
 """
 
 import numpy as np

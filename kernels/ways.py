@@ -1,4 +1,7 @@
-"""Steps over navigation grids: from where a search starts, what is in sight, and the way back."""
+"""Steps over navigation grids: from where a search starts, what is in sight, and the way back.
+
+Functions that kernels call, with no loop over a whole grid: `geodesic`, which names the other searches, has that.
+"""
 
 import warp as wp
 

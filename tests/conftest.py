@@ -52,6 +52,27 @@ def oracle_dir() -> Path:
 
 
 @pytest.fixture
+def somewhere(tmp_path, monkeypatch) -> None:
+    """A working folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch) -> None:
+    """Trainings draw nothing: pictures have tests of their own."""
+    for name in ("draw_rollout", "draw_curves"):
+        monkeypatch.setattr(f"maexp.agents.commands.train.{name}", lambda *args: None)
+
+
+@pytest.fixture(scope="module")
+def maps() -> list:
+    """Two small mazes and a map of random obstacles."""
+    from maexp.envs import make_map
+
+    return [make_map("maze_small", 0), make_map("maze_small", 1), make_map("random_obstacles", 0)]
+
+
+@pytest.fixture
 def own_domain(monkeypatch) -> None:
     """This process, and those that it starts, in a DDS domain of their own on this machine."""
     from loopback import surroundings

@@ -3,6 +3,9 @@
 import torch
 from torchrl.envs.utils import step_mdp
 
+SHORT = {"local_steps": 3, "macro_steps": 4, "num_threads": 1}
+"""Settings of an env whose episodes are short."""
+
 
 def actions(envs: int, robots: int, steps: int, seed: int = 1) -> list[dict]:
     """Actions of env e that do not depend on how many envs there are."""

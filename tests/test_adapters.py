@@ -6,20 +6,21 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from episodes import SHORT
 from torchrl.envs import ActionMask, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import MaskedCategorical
 from worlds import room
 
 from maexp.agents import ModelConfig
+from maexp.agents.networks.actor import TARGETS_MASK
 from maexp.agents.networks.target_chooser import TargetChooser, TargetReader
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig, parallel_env, team_env, vector_env
 from maexp.envs.target_view import first_if_none
 
-SMALL = {"local_steps": 3, "macro_steps": 4, "num_threads": 1}
 SHOWN = ObservationConfig(targets=8, pictures=False)
-MASK, TARGET = ("agents", "observation", "targets_mask"), ("agents", "action", "target")
+TARGET = ("agents", "action", "target")
 WITHOUT = "THE EXTRA maexp[{}] IS NOT INSTALLED: {} is not tested"
 
 
@@ -29,7 +30,7 @@ def world():
 
 
 def make_env(world, **settings) -> ExplorationEnv:
-    return ExplorationEnv(world, 3, 3, seed=2, **SMALL | {"observation": SHOWN} | settings)
+    return ExplorationEnv(world, 3, 3, seed=2, **SHORT | {"observation": SHOWN} | settings)
 
 
 def taken(mask: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -51,19 +52,19 @@ def test_the_spec_shows_what_the_env_takes(world):
 def test_random_actions_are_legal(world):
     env = make_env(world)
     steps = env.rollout(4, break_when_any_done=False)
-    assert taken(steps[MASK], steps[TARGET]).all() and not steps[MASK].all()
+    assert taken(steps[TARGETS_MASK], steps[TARGET]).all() and not steps[TARGETS_MASK].all()
     td = env.rand_step(env.reset())
-    assert taken(td[MASK], td[TARGET]).all()
+    assert taken(td[TARGETS_MASK], td[TARGET]).all()
     drawn = torch.stack([env.rand_action(td.clone())[TARGET] for _ in range(60)])
-    assert (drawn.amax(0) == td[MASK].sum(-1) - 1).all(), "every one of them is drawn"
+    assert (drawn.amax(0) == td[TARGETS_MASK].sum(-1) - 1).all(), "every one of them is drawn"
     env.fake_tensordict().update(env.rand_action(env.fake_tensordict()))  # shows none: no error
 
 
 def test_torchrls_mask_of_actions_fits(world):
-    env = TransformedEnv(make_env(world), ActionMask(TARGET, MASK))
+    env = TransformedEnv(make_env(world), ActionMask(TARGET, TARGETS_MASK))
     check_env_specs(env)
     steps = env.rollout(4, break_when_any_done=False)
-    assert taken(steps[MASK], steps[TARGET]).all()
+    assert taken(steps[TARGETS_MASK], steps[TARGET]).all()
 
 
 def test_a_robot_without_targets_has_one_choice(world):
@@ -76,11 +77,11 @@ def test_a_robot_without_targets_has_one_choice(world):
     state["collided"][:, 0] = 1
     td = env.step(env.rand_action(td))["next"]
     assert not td["agents", "observation", "alive"][:, 0].any()
-    assert td[MASK][:, 0].tolist() == [[True] + [False] * 7] * 3
+    assert td[TARGETS_MASK][:, 0].tolist() == [[True] + [False] * 7] * 3
     assert not td["agents", "observation", "targets"][:, 0].any()
-    choice = MaskedCategorical(logits=torch.zeros(3, 3, 8), mask=td[MASK])
+    choice = MaskedCategorical(logits=torch.zeros(3, 3, 8), mask=td[TARGETS_MASK])
     assert torch.isfinite(choice.log_prob(choice.sample())).all() and torch.isfinite(choice.entropy()).all()
-    td[TARGET] = torch.where(td[MASK].sum(-1) > 1, td[MASK].sum(-1) - 1, 0)
+    td[TARGET] = torch.where(td[TARGETS_MASK].sum(-1) > 1, td[TARGETS_MASK].sum(-1) - 1, 0)
     env.step(td)
     chosen = env.target_view.tracker.state["chosen"].squeeze(-1)
     assert (chosen[:, 0] == -1).all() and (chosen[:, 1:] >= 0).any()
@@ -91,7 +92,7 @@ def test_networks_think_of_it_as_of_none(world):
     td = make_env(world).rollout(3, break_when_any_done=False).reshape(-1)
     features, comm = (td["agents", "observation", name] for name in ("targets", "comm"))
     features[::2, 0] = 0.0
-    none = td[MASK].clone()
+    none = td[TARGETS_MASK].clone()
     none[::2, 0] = False
     one = first_if_none(none)
     assert one.any(-1).all() and not none.any(-1).all()
@@ -126,16 +127,16 @@ def interfaces():
 
 def test_agents_choose_targets(world, interfaces):
     env, twin = (
-        parallel_env(world, 3, action="targets", **SMALL),
-        ExplorationEnv(world, 1, 3, observation=ObservationConfig(targets=24, pictures=False), **SMALL),
+        parallel_env(world, 3, action="targets", **SHORT),
+        ExplorationEnv(world, 1, 3, observation=ObservationConfig(targets=24, pictures=False), **SHORT),
     )
     twin._set_seed(5)
     seen, infos = env.reset(seed=5)
     expected = twin.reset()
     assert env.action_space("robot_0").n == 24 and env.state_space.contains(env.state())
-    for _ in range(SMALL["macro_steps"]):
+    for _ in range(SHORT["macro_steps"]):
         for i, name in enumerate(env.agents):
-            mask = expected[MASK][0, i].numpy()
+            mask = expected[TARGETS_MASK][0, i].numpy()
             assert env.observation_space(name).contains(seen[name]) and "targets_mask" not in seen[name]
             assert np.array_equal(seen[name]["action_mask"], mask) and np.array_equal(infos[name]["action_mask"], mask)
             assert np.array_equal(seen[name]["targets"], expected["agents", "observation", "targets"][0, i].numpy())
@@ -151,7 +152,7 @@ def test_the_env_says_what_agents_take(world, interfaces):
     """Where nothing is said of the action it is the env's own."""
     direct = PlannerConfig(name="direct")
     spaces = [
-        parallel_env(world, 2, **SMALL, **one).action_space("robot_0")
+        parallel_env(world, 2, **SHORT, **one).action_space("robot_0")
         for one in (
             {},
             {"observation": SHOWN},
@@ -162,24 +163,24 @@ def test_the_env_says_what_agents_take(world, interfaces):
         )
     ]
     assert [getattr(one, "n", one.shape) for one in spaces] == [None, 8, (2,), 24, 8, (2,)]
-    kept = parallel_env(world, 2, action="targets", observation=ObservationConfig(targets=4), **SMALL)
+    kept = parallel_env(world, 2, action="targets", observation=ObservationConfig(targets=4), **SHORT)
     assert kept.reset()[0]["robot_1"]["map"].any() and kept.state().shape == (3, 125, 125)
-    other = parallel_env(world, 2, action="goal", observation=SHOWN, **SMALL)
+    other = parallel_env(world, 2, action="goal", observation=SHOWN, **SHORT)
     assert "targets_mask" in other.reset()[0]["robot_0"]
     with pytest.raises(ValueError, match="planner=direct takes controls, action='targets'"):
-        parallel_env(world, 2, action="targets", planner=direct, **SMALL)
+        parallel_env(world, 2, action="targets", planner=direct, **SHORT)
 
 
 @pytest.mark.parametrize("action", [8, -1, 1.5])
 def test_targets_that_are_none_are_refused(world, interfaces, action):
-    env = parallel_env(world, 2, action="targets", observation=SHOWN, **SMALL)
+    env = parallel_env(world, 2, action="targets", observation=SHOWN, **SHORT)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"target=\[\[0.*must hold whole numbers of 0 to 7"):
         env.step({"robot_0": 0, "robot_1": action})
 
 
 def test_a_batch_tells_its_masks(world, interfaces):
-    batch = vector_env(world, 3, 2, action="targets", **SMALL)
+    batch = vector_env(world, 3, 2, action="targets", **SHORT)
     seen, info = batch.reset(seed=1)
     for _ in range(6):
         assert batch.observation_space.contains(seen) and "team_map" not in seen
@@ -195,14 +196,14 @@ def test_a_batch_tells_its_masks(world, interfaces):
 def test_one_team_is_the_batchs_first(world, interfaces, action):
     from gymnasium.utils.env_checker import check_env
 
-    env, batch = team_env(world, 2, action=action, **SMALL), vector_env(world, 1, 2, action=action, **SMALL)
+    env, batch = team_env(world, 2, action=action, **SHORT), vector_env(world, 1, 2, action=action, **SHORT)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*infinity.*")
         check_env(env, skip_render_check=True)
     env.reset(seed=3)
     batch.reset(seed=3)
-    for _ in range(SMALL["macro_steps"]):
+    for _ in range(SHORT["macro_steps"]):
         one = env.action_space.sample()
         many = {name: value[None] for name, value in one.items()} if isinstance(one, dict) else one[None]
         seen, reward, ended, cut, info = env.step(one)
@@ -223,7 +224,7 @@ def test_batches_that_gymnasium_makes(world, interfaces):
     """An env made here, sent to processes that each play a copy."""
     from gymnasium.vector import AsyncVectorEnv
 
-    env = team_env(world, 2, action="targets", **SMALL)
+    env = team_env(world, 2, action="targets", **SHORT)
     batch = AsyncVectorEnv([lambda: copy.deepcopy(env)] * 2, context="fork")
     try:
         seen, info = batch.reset(seed=[3, 4])

@@ -6,14 +6,12 @@ import math
 import pytest
 import torch
 from torchrl.collectors import Collector
-from toy_env import ToyEnv
+from toy_env import SMALL_MODEL, ToyEnv
 
 from maexp.agents import ALGORITHMS, make_critic, make_loss, make_policy
 from maexp.agents.algorithms.catalogue import find_algorithm
 from maexp.agents.algorithms.losses import NonFiniteLoss
-from maexp.agents.settings.model import ModelConfig
 
-TINY = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 FAST = {  # the toy's best settings in few steps; the defaults are for long runs on real maps
     "clipped": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64),
     "trust": dict(fisher_size=64, max_kl=0.06, critic_epochs=2, minibatch_size=64),
@@ -60,7 +58,7 @@ def test_learns_the_toy_in_seconds(name, seed):
 def test_one_update_moves_policy_and_critic_and_reports(name):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=8)
-    policy, critic, updater = build(name, env, TINY)
+    policy, critic, updater = build(name, env, SMALL_MODEL)
     before = [p.clone() for p in (*policy.parameters(), *critic.parameters())]
     (batch,) = batches(env, policy, 1)
     stored = batch.clone()
@@ -79,7 +77,7 @@ def test_one_update_moves_policy_and_critic_and_reports(name):
 def test_reference_settings_run(name):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=8)
-    policy, _, updater = build(name, env, TINY, tuning="reference")
+    policy, _, updater = build(name, env, SMALL_MODEL, tuning="reference")
     (batch,) = batches(env, policy, 1)
     assert all(math.isfinite(v) for v in updater.update(batch).values())
 
@@ -88,13 +86,13 @@ def test_reference_settings_run(name):
 def test_a_restored_updater_goes_on_bit_for_bit(name):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=8)
-    policy, _, updater = build(name, env, TINY)
+    policy, _, updater = build(name, env, SMALL_MODEL)
     first, second = batches(env, policy, 2)
     updater.update(first)
     saved = copy.deepcopy(updater.state_dict())
     torch.manual_seed(5)
     updater.update(second)
-    other_policy, _, other = build(name, env, TINY)
+    other_policy, _, other = build(name, env, SMALL_MODEL)
     other.load_state_dict(saved)
     torch.manual_seed(5)
     other.update(second)
@@ -107,7 +105,7 @@ def test_a_restored_updater_goes_on_bit_for_bit(name):
 @pytest.mark.parametrize("name", ["mappo", "itrpo", "vda2c"])
 def test_teams_of_several_sizes_share_one_update(name):
     torch.manual_seed(0)
-    policy, _, updater = build(name, ToyEnv(num_envs=8), TINY, minibatch_size=16)
+    policy, _, updater = build(name, ToyEnv(num_envs=8), SMALL_MODEL, minibatch_size=16)
     mixed = [next(batches(ToyEnv(num_envs=6, num_robots=n), policy, 1)) for n in (1, 2, 4)]
     assert all(math.isfinite(v) for v in updater.update(*mixed).values())
 
@@ -117,7 +115,7 @@ def test_a_loss_takes_a_collector_batch_in_user_code(name):
     """Design 2: make_policy, make_critic, make_loss, one Collector batch, an optimizer of one's own."""
     torch.manual_seed(0)
     env = ToyEnv(num_envs=4)
-    policy, critic = make_policy(env, TINY), make_critic(name, env, TINY)
+    policy, critic = make_policy(env, SMALL_MODEL), make_critic(name, env, SMALL_MODEL)
     loss = make_loss(name, policy, critic)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     assert sum(p.numel() for p in loss.parameters()) == sum(
@@ -133,7 +131,7 @@ def test_a_loss_takes_a_collector_batch_in_user_code(name):
 
 def test_learning_rates_decay_with_progress():
     env = ToyEnv(num_envs=4)
-    policy, _, updater = build("ippo", env, TINY, lr=1e-3, critic_lr=2e-3, final_lr_share=0.1)
+    policy, _, updater = build("ippo", env, SMALL_MODEL, lr=1e-3, critic_lr=2e-3, final_lr_share=0.1)
     (batch,) = batches(env, policy, 1)
     updater.update(batch, progress=0.5)
     assert updater.policy_optimizer.param_groups[0]["lr"] == pytest.approx(5.5e-4)
@@ -143,7 +141,7 @@ def test_learning_rates_decay_with_progress():
 def test_first_returns_set_the_critics_scale():
     torch.manual_seed(0)
     env = ToyEnv(num_envs=32)
-    policy, critic, updater = build("mappo", env, TINY)
+    policy, critic, updater = build("mappo", env, SMALL_MODEL)
     (batch,) = batches(env, policy, 1)
     batch["next", "agents", "reward"] = batch["next", "agents", "reward"] * 50 + 300
     updater.prepare(batch)
@@ -158,7 +156,7 @@ def test_first_returns_set_the_critics_scale():
 def test_numbers_that_are_none_stop_the_update_by_name(name):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=4)
-    policy, critic, updater = build(name, env, TINY)
+    policy, critic, updater = build(name, env, SMALL_MODEL)
     (batch,) = batches(env, policy, 1)
     bad = batch.clone()
     bad["next", "agents", "reward"][0, 0, 0] = float("nan")

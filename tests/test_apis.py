@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from episodes import SHORT
 from worlds import room
 
 from maexp.envs import ExplorationEnv, PlannerConfig, RobotConfig, parallel_env, vector_env
@@ -14,7 +15,6 @@ pytest.importorskip("pettingzoo", reason="THE EXTRA maexp[pettingzoo] IS NOT INS
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-SMALL = {"local_steps": 3, "macro_steps": 4, "num_threads": 1}
 DIRECT = PlannerConfig(name="direct")
 
 
@@ -52,17 +52,17 @@ def crash(world, collided: str):
 @pytest.mark.parametrize("collided", ["stay", "leave"])
 @pytest.mark.parametrize("settings", [{}, {"action": "region"}, {"action": "goal"}, {"planner": DIRECT}])
 def test_pettingzoos_own_tests(world, settings, collided):
-    settings = SMALL | settings | {"collided": collided}
+    settings = SHORT | settings | {"collided": collided}
     parallel_api_test(parallel_env(world, 3, **settings), num_cycles=30)
     parallel_seed_test(lambda: parallel_env(world, 3, **settings), num_cycles=30)
 
 
 def test_agents_live_what_the_env_computes(world):
-    env, twin = parallel_env(world, 3, **SMALL), ExplorationEnv(world, 1, 3, **SMALL)
+    env, twin = parallel_env(world, 3, **SHORT), ExplorationEnv(world, 1, 3, **SHORT)
     twin._set_seed(5)
     seen, _ = env.reset(seed=5)
     expected = twin.reset()
-    for _ in range(SMALL["macro_steps"]):
+    for _ in range(SHORT["macro_steps"]):
         actions = sampled(env)
         for i, name in enumerate(env.possible_agents):
             assert env.observation_space(name).contains(seen[name])
@@ -80,7 +80,7 @@ def test_agents_live_what_the_env_computes(world):
 
 
 def test_seeds_name_episodes(world):
-    env = parallel_env(world, 2, **SMALL)
+    env = parallel_env(world, 2, **SHORT)
     first, second = (env.reset(seed=3)[0]["robot_0"]["pose"], env.reset()[0]["robot_0"]["pose"])
     assert not np.array_equal(first, second)
     assert np.array_equal(env.reset(seed=3)[0]["robot_0"]["pose"], first)
@@ -109,7 +109,7 @@ def test_a_robot_that_collided_leaves(world):
 
 
 def test_success_terminates_all(world):
-    env = parallel_env(world, 3, success_coverage=0.05, **SMALL)
+    env = parallel_env(world, 3, success_coverage=0.05, **SHORT)
     env.reset(seed=0)
     _, _, ended, cut, _ = env.step(sampled(env))
     assert all(ended.values()) and not any(cut.values()) and env.agents == []
@@ -117,7 +117,7 @@ def test_success_terminates_all(world):
 
 @pytest.mark.parametrize("share", [(-1.0, -1.0), (0.0, 0.0), (0.3, -0.77), (1.0, 1.0)])
 def test_a_goal_is_a_place_of_the_extent(world, share):
-    env = parallel_env(world, 2, action="goal", **SMALL)
+    env = parallel_env(world, 2, action="goal", **SHORT)
     env.reset(seed=0)
     env.step({name: np.array(share, np.float32) for name in env.agents})
     low, high = (np.array(corner) for corner in world.extent)
@@ -126,7 +126,7 @@ def test_a_goal_is_a_place_of_the_extent(world, share):
 
 
 def test_a_region_is_its_centre(world):
-    env = parallel_env(world, 2, action="region", **SMALL)
+    env = parallel_env(world, 2, action="region", **SHORT)
     env.reset(seed=0)
     env.step({"robot_0": 8 * 2 + 5, "robot_1": np.int64(0)})
     low, high = (np.array(corner) for corner in world.extent)
@@ -134,11 +134,11 @@ def test_a_region_is_its_centre(world):
 
 
 def test_pictures(world):
-    env = parallel_env(world, 2, render_mode="rgb_array", **SMALL)
+    env = parallel_env(world, 2, render_mode="rgb_array", **SHORT)
     env.reset(seed=0)
     frame = env.render()
     assert frame.dtype == np.uint8 and frame.shape[1:] == (512, 3) and frame.std() > 10
-    batch = vector_env(world, 2, 2, render_mode="rgb_array", **SMALL)
+    batch = vector_env(world, 2, 2, render_mode="rgb_array", **SHORT)
     batch.reset(seed=0)
     frames = batch.render()
     assert len(frames) == 2 and not np.array_equal(*frames)
@@ -147,7 +147,7 @@ def test_pictures(world):
 
 @pytest.mark.parametrize("settings", [{}, {"action": "region"}, {"action": "goal"}, {"planner": DIRECT}])
 def test_spaces_of_the_batch(world, settings):
-    batch = vector_env(world, 3, 2, **SMALL | settings)
+    batch = vector_env(world, 3, 2, **SHORT | settings)
     seen, _ = batch.reset(seed=1)
     for _ in range(2):
         assert batch.observation_space.contains(seen)
@@ -166,7 +166,7 @@ def play(batch, steps: int, seed: int = 7) -> list[tuple]:
 
 
 def test_next_step_autoreset(world):
-    batch = vector_env(world, 3, 2, **SMALL)
+    batch = vector_env(world, 3, 2, **SHORT)
     assert batch.metadata["autoreset_mode"].value == "NextStep"
     steps = play(batch, 6)
     assert steps[3][3].all() and (steps[3][4]["local_steps"] == 12).all()
@@ -178,8 +178,8 @@ def test_next_step_autoreset(world):
 
 
 def test_same_step_autoreset(world):
-    batch = vector_env(world, 3, 2, autoreset_mode="SameStep", **SMALL)
-    steps, expected = play(batch, 5), play(vector_env(world, 3, 2, **SMALL), 5)
+    batch = vector_env(world, 3, 2, autoreset_mode="SameStep", **SHORT)
+    steps, expected = play(batch, 5), play(vector_env(world, 3, 2, **SHORT), 5)
     seen, reward, _, cut, info = steps[3]
     assert cut.all() and np.array_equal(reward, expected[3][1]) and reward.any()
     assert info["_final_obs"].all() and not info["local_steps"].any()
@@ -190,7 +190,7 @@ def test_same_step_autoreset(world):
 
 
 def test_without_autoreset(world):
-    batch = vector_env(world, 3, 2, autoreset_mode="Disabled", **SMALL)
+    batch = vector_env(world, 3, 2, autoreset_mode="Disabled", **SHORT)
     last = play(batch, 4)[3]
     assert last[3].all()
     with pytest.raises(RuntimeError, match=r"teams \[0, 1, 2\] are done"):
@@ -208,7 +208,7 @@ def test_without_autoreset(world):
 
 def test_teams_that_end_at_different_times(world):
     """Only those that were done start anew; the others' step counts."""
-    batch = vector_env(world, 4, 2, success_coverage=0.25, **SMALL | {"macro_steps": 9})
+    batch = vector_env(world, 4, 2, success_coverage=0.25, **SHORT | {"macro_steps": 9})
     steps = play(batch, 30)
     ended = np.stack([one[2] | one[3] for one in steps])
     after = np.stack([one[4]["local_steps"] for one in steps])[1:]
@@ -217,7 +217,7 @@ def test_teams_that_end_at_different_times(world):
 
 
 def test_gymnasiums_wrappers_take_it(world):
-    batch = RecordEpisodeStatistics(vector_env(world, 3, 2, **SMALL))
+    batch = RecordEpisodeStatistics(vector_env(world, 3, 2, **SHORT))
     batch.reset(seed=1)
     total, last = np.zeros(3), {}
     for _ in range(4):
@@ -259,14 +259,14 @@ ACTIONS = [
 
 @pytest.mark.parametrize(("actions", "told"), ACTIONS, ids=[told for _, told in ACTIONS])
 def test_bad_actions(world, actions, told):
-    env = parallel_env(world, 2, **SMALL)
+    env = parallel_env(world, 2, **SHORT)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=told):
         env.step(actions)
 
 
 def test_nothing_before_reset(world):
-    env, batch = parallel_env(world, 2, **SMALL), vector_env(world, 2, 2, **SMALL)
+    env, batch = parallel_env(world, 2, **SHORT), vector_env(world, 2, 2, **SHORT)
     for call in (lambda: env.step({}), env.state, lambda: batch.step(batch.action_space.sample())):
         with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
             call()

@@ -1,13 +1,13 @@
 """The example of a learned planner: its network in NumPy is the one that is trained, and it goes where frontier is."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from paths import ROOT
 
-FOLDER = Path(__file__).resolve().parents[1] / "docs" / "examples" / "policies"
+FOLDER = ROOT / "docs" / "examples" / "policies"
 WEIGHTS = FOLDER / "ariadne.npz"
 
 

@@ -107,7 +107,7 @@ def test_a_branch_of_the_same_choice_goes_as_the_original():
     branches.branch(0, torch.ones(3, 2, dtype=torch.bool))
     ours, names = branches.env.simulation.tensors, ("pose", "covered", "covered_sum", "seen_free", "viewers_boundary")
     action = td["agents", "action"]
-    ours["wanted"].copy_(from_regions(env, action["region"], action["offset"]).repeat_interleave(2, 0))
+    ours["wanted"].copy_(from_regions(env.simulation, action["region"], action["offset"]).repeat_interleave(2, 0))
     branches.env.simulation.set_goals()
     branches.env.simulation.step(0, env.local_steps)
     assert all(torch.equal(env.simulation.tensors[name], one) for name, one in before.items())

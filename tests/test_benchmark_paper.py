@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from paths import ROOT
 
 from maexp.agents.benchmark.paper_results import COLUMNS, PAPER
 
@@ -59,7 +60,7 @@ def paper_best(scenario: str, metric: str) -> set[str]:
 
 
 def paper_page() -> str:
-    return (Path(__file__).resolve().parents[1] / "docs" / "log" / "2026-11-22-paper-slips.md").read_text()
+    return (ROOT / "docs" / "log" / "2026-11-22-paper-slips.md").read_text()
 
 
 def test_the_slips_that_the_log_lists_are_the_papers_bold_against_its_numbers():

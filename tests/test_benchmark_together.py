@@ -5,12 +5,11 @@ import shutil
 
 import pytest
 import torch
+from tiny_benchmark import settings
 
 from maexp.agents.benchmark.cell import EnvShelf, finished, run_cell
-from maexp.agents.benchmark.plan import Cell, cell_overrides, compose_settings, list_cells, training_cell
+from maexp.agents.benchmark.plan import Cell, cell_overrides, list_cells, training_cell
 from maexp.agents.cli import main
-from maexp.agents.commands.benchmark import prepare
-from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 
 pytestmark = pytest.mark.slow  # trainings
@@ -35,10 +34,6 @@ WORDS = [
     "iterations=null",
     "train_maps=null",
 ]
-
-
-def settings(*words: str):
-    return compose_settings("benchmark", prepare(make_overrides("benchmark", list(words))).words)
 
 
 def test_cells_of_all_scenarios_share_one_training():

@@ -8,10 +8,11 @@ from worlds import room
 
 from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
 from maexp.agents.networks.distributions import ACTION
+from maexp.agents.networks.target_chooser import NEVER, SCORE
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.training import branching
-from maexp.agents.training.branching import NEVER, SCORE, BranchPlayer, main, training_maps
+from maexp.agents.training.branching import BranchPlayer, main, training_maps
 from maexp.envs import ExplorationEnv, ObservationConfig, make_map
 
 

@@ -16,7 +16,7 @@ from maexp.agents.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from maexp.envs import files
+from maexp.envs import whole_file
 
 
 def state(number: int) -> dict:
@@ -61,7 +61,7 @@ def test_a_write_that_dies_leaves_the_old_ones(run, monkeypatch):
     def die(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files.os, "replace", die)
+    monkeypatch.setattr(whole_file.os, "replace", die)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(run / "checkpoints", state(4), 4, keep=3)
     with warnings.catch_warnings():

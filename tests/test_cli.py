@@ -25,9 +25,7 @@ TINY = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("somewhere")
 
 
 def refuse(capsys, *words: str) -> str:
@@ -177,11 +175,6 @@ BAD = {
 def test_bad_input_gets_one_sentence(case, capsys):
     words, named = BAD[case]
     assert named in refuse(capsys, *words)
-
-
-def write_xyz(path: Path, points: np.ndarray) -> str:
-    np.savetxt(path, points)
-    return str(path)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty file", "no points", "nan", "infinite", "no room"])

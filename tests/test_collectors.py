@@ -22,7 +22,7 @@ from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.collect import Teams, WorkerLost, batch_statistics, divide_teams
 from maexp.agents.training.logs import tag
-from maexp.agents.training.train import make_both
+from maexp.agents.training.prepare import make_both
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.metrics import episode_metrics
 

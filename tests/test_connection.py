@@ -5,15 +5,14 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hosted_play import ENVS, EXAMPLES, STEPS, TESTS, alive, play_hosted, wait_for
 from mazes import OFFSET, REGION, make_env
-from test_hosted import ENVS, EXAMPLES, STEPS, alive, play_hosted
 
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
@@ -26,7 +25,6 @@ from maexp.agents.suites.players import Player
 
 pytestmark = pytest.mark.slow  # processes
 
-TESTS = Path(__file__).resolve().parent
 SERVE = "import sys; from maexp.agents.policies.connection import serve; serve('127.0.0.1', 0, sys.argv[1:])"
 
 
@@ -182,14 +180,6 @@ def free_port() -> int:
     """Of this machine."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return server.getsockname()[1]
-
-
-def wait_for(what, seconds: float = 20.0) -> None:
-    """Until it is so."""
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def test_a_listener_that_takes_one_after_another_is_enough():

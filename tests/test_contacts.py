@@ -12,6 +12,7 @@ from worlds import room
 
 from maexp.agents import make_policy
 from maexp.agents.errors import UserError
+from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
 from maexp.agents.networks.target_chooser import TargetChooser
 from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.lookahead import LookaheadPlanner
@@ -25,7 +26,6 @@ from maexp.envs import CommConfig, ExplorationEnv, LookaheadConfig, ObservationC
 from maexp.envs.features import FAR, FEATURES, RADIO_TABLE, feature_names
 from maexp.kernels.constants import FREE
 
-TARGETS, MASK = ("agents", "observation", "targets"), ("agents", "observation", "targets_mask")
 ACTION = ("agents", "action", "target")
 COUNT = 24
 TELL = COUNT  # the last candidate
@@ -59,7 +59,7 @@ def test_specs_hold():
         check_env_specs(env)
         for td in play(env, env.rand_action, 3):
             assert torch.isfinite(td[TARGETS]).all() and td[TARGETS].abs().max() < 30.0
-            assert (td[TARGETS][~td[MASK]] == 0).all()
+            assert (td[TARGETS][~td[TARGETS_MASK]] == 0).all()
             assert td[TARGETS].shape == (2, 3, COUNT + 1, len(feature_names(True)))
 
 
@@ -71,8 +71,8 @@ def test_who_was_connected_when_and_what_is_untold():
     known = env.simulation.tensors["known_weight"]
     disc = float(env.strategy._disc())
     for name in ("untold", "base_since", "mates_untold", "mates_since"):
-        assert (column(td, name)[td[MASK]] == 0).all(), name
-    assert (column(td, "base_linked")[td[MASK]] == 1).all() and not td[MASK][..., TELL].any()
+        assert (column(td, name)[td[TARGETS_MASK]] == 0).all(), name
+    assert (column(td, "base_linked")[td[TARGETS_MASK]] == 1).all() and not td[TARGETS_MASK][..., TELL].any()
     before = known[0].tolist()
     put(env, {0: (30.0, 8.0)})
     env.simulation.tensors["macro_step"] += 3
@@ -80,8 +80,8 @@ def test_who_was_connected_when_and_what_is_untold():
     there, lost = known[0].tolist(), [before[0], 0]
     assert there[0] > before[0]
     untold = math.log1p((there[0] - lost[0]) / disc)
-    some = td[MASK][0, 0]
-    assert some[TELL] and not td[MASK][0, 1, TELL], "who is connected has nobody to go to"
+    some = td[TARGETS_MASK][0, 0]
+    assert some[TELL] and not td[TARGETS_MASK][0, 1, TELL], "who is connected has nobody to go to"
     for name, wanted in {
         "untold": untold,
         "mates_untold": untold,  # both were connected until then
@@ -138,7 +138,7 @@ def test_who_goes_to_tell_gets_there_and_is_released():
     start(env, (4.0, 8.0), (6.0, 12.0))
     put(env, {0: (30.0, 8.0)})
     td, told = env.observe(), []
-    assert td[MASK][0, 0, TELL]
+    assert td[TARGETS_MASK][0, 0, TELL]
     knew = int(env.simulation.tensors["known_weight"][0, 2])
     for step in range(20):
         index = torch.tensor([[TELL if step == 0 else 0, 0]])
@@ -159,7 +159,7 @@ def test_with_other_strategies_nobody_chooses_to_tell():
         env = make(comm=CommConfig(range=6.0, base_station=BASE, strategy=name, period=9))
         start(env, (4.0, 8.0), (6.0, 12.0))
         put(env, {0: (30.0, 8.0)})
-        assert bool(env.observe()[MASK][0, 0, TELL]) == offered
+        assert bool(env.observe()[TARGETS_MASK][0, 0, TELL]) == offered
 
 
 def test_a_saved_state_goes_on_bit_for_bit():
@@ -170,7 +170,7 @@ def test_a_saved_state_goes_on_bit_for_bit():
     for _ in range(3):
         acted = env.rand_action(td.clone())
         td, same = step_mdp(env.step(acted.clone())), step_mdp(other.step(acted.clone()))
-        assert torch.equal(td[TARGETS], same[TARGETS]) and torch.equal(td[MASK], same[MASK])
+        assert torch.equal(td[TARGETS], same[TARGETS]) and torch.equal(td[TARGETS_MASK], same[TARGETS_MASK])
 
 
 def test_a_reset_of_some_envs_leaves_the_others():
@@ -179,7 +179,7 @@ def test_a_reset_of_some_envs_leaves_the_others():
     td = play(env, env.rand_action, 3)[-1]
     after = env.reset(td.clone().set("_reset", torch.tensor([[False], [True], [False], [True]])))
     assert torch.equal(after[TARGETS][[0, 2]], td[TARGETS][[0, 2]])
-    assert torch.equal(after[MASK][[0, 2]], td[MASK][[0, 2]])
+    assert torch.equal(after[TARGETS_MASK][[0, 2]], td[TARGETS_MASK][[0, 2]])
     assert (column(after, "base_since")[[1, 3]] <= 1 / 40).all(), (
         "never connected counts from before the first decision"
     )
@@ -211,7 +211,7 @@ def test_weights_are_taken_by_a_policy_that_is_told():
     with torch.no_grad():
         one, two = (each(td.clone())["agents", "action", "preference"] for each in (policy, universal))
     torch.testing.assert_close(one[..., :COUNT], two[..., :COUNT], atol=1e-4, rtol=1e-5)
-    assert not td[MASK][..., TELL].any()
+    assert not td[TARGETS_MASK][..., TELL].any()
 
 
 @pytest.mark.parametrize(

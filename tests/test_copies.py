@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from episodes import SHORT
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import RewardSum
@@ -13,7 +14,6 @@ from worlds import room
 
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, RadarConfig, RobotConfig
 
-SMALL = {"local_steps": 3, "macro_steps": 4, "num_threads": 1}
 TARGETS = ObservationConfig(targets=8, pictures=False)
 MIXED = [RobotConfig(kind="differential", max_yaw_rate=1.0), RobotConfig(wheelbase="length"), RobotConfig()]
 CASES = {
@@ -54,7 +54,7 @@ def assert_same(ours: list, theirs: list) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_copy_goes_on_bit_for_bit(maps, case):
-    env = ExplorationEnv(maps, 2, 3, seed=4, **SMALL | CASES[case])
+    env = ExplorationEnv(maps, 2, 3, seed=4, **SHORT | CASES[case])
     td = play(env, env.reset(), 2)[-1]
     copies = {name: way(env) for name, way in WAYS.items()}
     expected = play(env, td.clone())
@@ -65,7 +65,7 @@ def test_a_copy_goes_on_bit_for_bit(maps, case):
 
 
 def test_a_copy_shares_nothing_that_changes(maps):
-    env = ExplorationEnv(maps, 2, 3, seed=4, **SMALL)
+    env = ExplorationEnv(maps, 2, 3, seed=4, **SHORT)
     td = env.reset()
     other = copy.deepcopy(env)
     before = {name: value.clone() for name, value in other.state_dict().items()}
@@ -76,20 +76,20 @@ def test_a_copy_shares_nothing_that_changes(maps):
 
 def test_an_env_that_was_never_reset_can_be_sent(maps):
     for settings in ({}, {"observation": TARGETS}):
-        env = ExplorationEnv(maps, 2, 3, seed=4, **SMALL | settings)
+        env = ExplorationEnv(maps, 2, 3, seed=4, **SHORT | settings)
         other = pickle.loads(pickle.dumps(env))
         assert_same([env.reset()], [other.reset()])
 
 
 def test_evaluation_episodes_go_on(maps):
-    env = ExplorationEnv(maps, 2, 3, seed=4, **SMALL)
+    env = ExplorationEnv(maps, 2, 3, seed=4, **SHORT)
     env.set_episodes(torch.tensor([7, 4]))
     other = pickle.loads(pickle.dumps(env))
     assert_same([env.reset()], [other.reset()])
 
 
 def test_a_hook_stays_behind(maps):
-    env = ExplorationEnv(maps, 1, 2, seed=4, **SMALL)
+    env = ExplorationEnv(maps, 1, 2, seed=4, **SHORT)
     calls = []
     env.set_step_hook(lambda env: calls.append(1))
     other = copy.deepcopy(env)
@@ -98,7 +98,7 @@ def test_a_hook_stays_behind(maps):
 
 
 def test_transformed_envs_are_sent_too(maps):
-    env = TransformedEnv(ExplorationEnv(maps, 2, 3, seed=4, **SMALL), RewardSum(reset_keys=["_reset"]))
+    env = TransformedEnv(ExplorationEnv(maps, 2, 3, seed=4, **SHORT), RewardSum(reset_keys=["_reset"]))
     td = env.reset()
     other = pickle.loads(pickle.dumps(env))
     assert_same(play(env, td.clone()), play(other, td.clone()))
@@ -120,7 +120,7 @@ def test_other_interfaces_go_on(maps, interface, action):
     import maexp.envs
 
     sizes = {"num_envs": 2} if interface == "vector_env" else {}
-    env = getattr(maexp.envs, interface)(maps, num_robots=3, seed=4, action=action, **SMALL | sizes)
+    env = getattr(maexp.envs, interface)(maps, num_robots=3, seed=4, action=action, **SHORT | sizes)
 
     def draw():
         if interface == "parallel_env":

@@ -8,7 +8,7 @@ from tensordict.nn import InteractionType
 from tools.distinct import steps_to
 
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.actor import TARGETS_MASK, make_policy
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.policies.load import load_policy_folder
 from maexp.agents.settings.model import ModelConfig
@@ -17,7 +17,6 @@ from maexp.envs.targets import TargetTracker
 
 TARGET = ("agents", "action", "target")
 PREFERENCE = ("agents", "action", "preference")
-MASK = ("agents", "observation", "targets_mask")
 
 
 def make_env(num_envs=4, num_robots=3, shown=24, **settings) -> ExplorationEnv:
@@ -132,10 +131,10 @@ def test_a_network_says_what_a_robot_gets_instead():
     """Its logits rank the rest; without them the classical values do."""
     env = make_env(1, 2)
     td = env.reset()
-    count = int(td[MASK][0, 0].sum())
-    assert count >= 3 and torch.equal(td[MASK][0, 0], td[MASK][0, 1])
+    count = int(td[TARGETS_MASK][0, 0].sum())
+    assert count >= 3 and torch.equal(td[TARGETS_MASK][0, 0], td[TARGETS_MASK][0, 1])
     block = env.target_view.state["block"][0]
-    assert torch.equal(block[0][td[MASK][0, 0]].sort().values, block[1][td[MASK][0, 1]].sort().values)
+    assert torch.equal(block[0][td[TARGETS_MASK][0, 0]].sort().values, block[1][td[TARGETS_MASK][0, 1]].sort().values)
     same = int((block[1] == block[0, 0]).nonzero()[0])  # what is first for one robot, as the other counts it
     td[TARGET] = torch.tensor([[0, same]])
     chosen = {}

@@ -8,14 +8,13 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 from torchrl.objectives.multiagent import MAPPOLoss
-from toy_env import ToyEnv
+from toy_env import TINY_MODEL, ToyEnv
 
 from maexp.agents import ModelConfig, make_critic, make_loss, make_policy
 from maexp.agents.algorithms.advantages import write_advantages
 from maexp.agents.networks.actor import REGION_HEADS
 from maexp.agents.networks.distributions import OFFSET, REGION, Heads, RegionHeads, divergence
 
-TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 BATCH, ROBOTS, REGIONS = 5, 3, 7
 REGION_LOG_PROB, OFFSET_LOG_PROB = (("agents", "action", f"{head}_log_prob") for head in ("region", "offset"))
 
@@ -111,7 +110,7 @@ def test_offsets_are_drawn_from_the_region_that_was_drawn():
 def test_torchrls_own_loss_takes_the_policy_with_one_ratio_per_robot():
     torch.manual_seed(0)
     env = ToyEnv(num_envs=6)
-    policy, critic = make_policy(env, TINY), make_critic("mappo", env, TINY)
+    policy, critic = make_policy(env, TINY_MODEL), make_critic("mappo", env, TINY_MODEL)
     ours = make_loss("mappo", policy, critic, entropy_coeff=0.01, value_norm=False)
     plain = MAPPOLoss(policy, critic, entropy_coeff=0.01)
     names = ("advantage", "value_target", "value", "reward")

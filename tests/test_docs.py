@@ -6,12 +6,12 @@ import shutil
 import subprocess
 import sys
 from dataclasses import fields
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
 import torch
+from paths import ROOT
 from tensordict.nn import set_composite_lp_aggregate
 from tensordict.nn.probabilistic import composite_lp_aggregate
 
@@ -23,7 +23,6 @@ from maexp.envs.specs import REWARD_TERMS
 from maexp.kernels.state import STATE
 from maexp.kernels.types import PICTURE_CHANNELS
 
-ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "docs" / "examples"
 PATCHES = sorted((EXAMPLES / "patches").glob("*.diff"))
 PAGES = sorted((ROOT / "docs").rglob("*.md")) + [ROOT / "README.md"]

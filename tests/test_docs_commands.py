@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import open3d
 import pytest
+from paths import ROOT
 from small_suite import make_small_suite
 from worlds import room
 
 from maexp.agents.cli import VERBS, main
 from maexp.agents.files import write_json
 from maexp.agents.progress import Progress
-from maexp.envs.importing.export import export_ros_map
+from maexp.envs.importing.import_report import ImportReport
+from maexp.envs.importing.map_server_files import export_ros_map
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.importing.report import ImportReport
 
-ROOT = Path(__file__).resolve().parents[1]
 HAS_ONNX = all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript", "safetensors"))
 HAS_BAGS = importlib.util.find_spec("rosbags") is not None
 LOG = ROOT / "docs" / "log"  # what was run once, with the code of its day

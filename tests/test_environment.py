@@ -24,11 +24,6 @@ from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
 from maexp.kernels.types import PICTURE_CHANNELS
 
 
-@pytest.fixture(scope="module")
-def maps():
-    return [make_map("maze_small", 0), make_map("maze_small", 1), make_map("random_obstacles", 0)]
-
-
 @pytest.mark.parametrize("robots", [1, 3])
 def test_specs(maps, robots):
     check_env_specs(ExplorationEnv(maps, num_envs=2, num_robots=robots))

@@ -10,11 +10,6 @@ from maexp.envs import ExplorationEnv, PlannerConfig, make_map
 from maexp.kernels import simulation as stepping
 
 
-@pytest.fixture(scope="module")
-def maps():
-    return [make_map("maze_small", 0), make_map("maze_small", 1), make_map("random_obstacles", 0)]
-
-
 def test_same_bits_for_any_number_of_envs_and_threads(maps):
     plan = actions(6, 3, 4)
     many = play(ExplorationEnv(maps, num_envs=6, seed=3, num_threads=2, macro_steps=3), plan)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from test_train import TINY, assert_same_runs, resume, run
+from tiny_training import TINY, assert_same_runs, resume, run
 from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy
@@ -20,18 +20,10 @@ from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkp
 from maexp.envs import ExplorationEnv, ObservationConfig
 from maexp.envs.features import FEATURES
 
-pytestmark = pytest.mark.slow  # trainings
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("somewhere", "no_pictures")]  # trainings
 
 WORDS = ("algorithm=expert_iteration", "action=targets", "algorithm.branch_horizon=1", "algorithm.candidates=3")
 ROW = TRAININGS["expert_iteration"]
-
-
-@pytest.fixture
-def somewhere(tmp_path, monkeypatch):
-    """A folder of its own, and no pictures: these have tests of their own."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("draw_rollout", "draw_curves"):
-        monkeypatch.setattr(f"maexp.agents.commands.train.{name}", lambda *args: None)
 
 
 def make_env(robots: int = 2, envs: int = 4, **others) -> ExplorationEnv:
@@ -135,7 +127,7 @@ def test_the_share_that_is_branched_at():
     assert 0.15 < tried.float().mean() < 0.45
 
 
-def test_resumed_is_uninterrupted(somewhere):
+def test_resumed_is_uninterrupted():
     words = (*WORDS, "algorithm.final_lr_share=1")  # which else would fall sooner in the shorter run
     whole = run("whole", 4, *words)
     parts = resume(run("parts", 2, *words), 4)
@@ -144,7 +136,7 @@ def test_resumed_is_uninterrupted(somewhere):
     assert {"branched", "headroom", "advantage_error"} <= set(rows[0].split(","))
 
 
-def test_several_team_sizes_and_scenarios(somewhere):
+def test_several_team_sizes_and_scenarios():
     teams = ["num_envs=4", "num_robots=1,2", "scenario.also=[indoor_small]"]
     assert main(["train", *TINY, *WORDS, *teams, "total_frames=8", "episodes=2", "classical=[]"]) == 0
 
@@ -159,7 +151,7 @@ def test_several_team_sizes_and_scenarios(somewhere):
         (("tuning=reference",), "Leave tuning out"),
     ],
 )
-def test_settings_that_do_not_go_together(words, sentence, somewhere, capsys):
+def test_settings_that_do_not_go_together(words, sentence, capsys):
     assert main(["train", "algorithm=expert_iteration", *words]) == 2
     error = capsys.readouterr().err
     assert sentence in error and "Traceback" not in error
@@ -170,7 +162,7 @@ def test_the_six_stay_six():
     assert len(ALGORITHMS) == 6 and "expert_iteration" not in ALGORITHMS
 
 
-def test_begins_from_another_run(somewhere, capsys):
+def test_begins_from_another_run(capsys):
     """With its policy and its decisions, on another scenario; stopped and resumed it is as in one go."""
     first = run("first", 2, *WORDS)
     known = find_checkpoint(first)[1]

@@ -1,6 +1,7 @@
 """Kills, full disks, damaged and hostile files: what was there before stays whole, and one sentence says what happened.
 
-Checkpoints that are killed while they are written, and Ctrl-C: test_train.py. Damaged maps: test_fuzz_import.py.
+Checkpoints that are killed while they are written, and Ctrl-C: test_train_stopped.py. Damaged maps:
+test_fuzz_import.py.
 """
 
 import itertools
@@ -29,16 +30,11 @@ from maexp.agents.training.checkpoint import find_checkpoint, save_checkpoint
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import ExplorationEnv, MapError, PointCloudMap, make_map
 
-pytestmark = pytest.mark.slow  # full disks, files that cannot be read
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("somewhere")]  # full disks, files that cannot be read
 
 CELL = Cell("maze_small", "random", 0)
 KILLS = int(os.environ.get("MAEXP_KILLS", 5))
 RUN = [*SMALL, "episodes=2", "evaluate_episodes=2"]
-
-
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 # Killed while writing

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 from metrics_file import read_metrics
-from test_train import TINY, assert_same
-from toy_env import OFFSET, ToyEnv
+from tiny_training import TINY, assert_same
+from toy_env import OFFSET, SMALL_MODEL, ToyEnv
 
 from maexp.agents import ALGORITHMS, make_policy
 from maexp.agents.algorithms.updaters import Meter
@@ -17,21 +17,12 @@ from maexp.agents.networks.actor import ALIVE, MAP
 from maexp.agents.networks.distributions import OFFSET as OFFSET_KEY
 from maexp.agents.networks.distributions import REGION
 from maexp.agents.policies.load import load_chooser
-from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.checkpoint import find_checkpoint, load_checkpoint
 from maexp.agents.training.imitation import imitate, negative_log_likelihood
 
-pytestmark = pytest.mark.slow  # trainings
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("somewhere", "no_pictures")]  # trainings
 
-SMALL = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
 WARM = [*TINY, "planner=wavefront", "warm_start=nearest_frontier", "warm_start_frames=12", "checkpoint_keep=9"]
-
-
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("draw_rollout", "draw_curves"):
-        monkeypatch.setattr(f"maexp.agents.commands.train.{name}", lambda *args: None)
 
 
 def run(folder: str, *words: str) -> Path:
@@ -42,7 +33,7 @@ def run(folder: str, *words: str) -> Path:
 def build(name, env):
     row = ALGORITHMS[name]
     settings = row.configure(minibatch_size=32, anchor_coeff=0.5)
-    policy, critic = make_policy(env, SMALL), row.make_critic(env, SMALL, settings)
+    policy, critic = make_policy(env, SMALL_MODEL), row.make_critic(env, SMALL_MODEL, settings)
     loss = row.make_loss(policy, critic, settings)
     return policy, loss, row.make_updater(loss, settings)
 

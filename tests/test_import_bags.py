@@ -12,11 +12,11 @@ from maexp.agents.cli import main
 from maexp.envs import MapError, import_map
 from maexp.envs.importing import import_map_with_report
 from maexp.envs.importing.bag_messages import to_points
-from maexp.envs.importing.export import export_ros_map
 from maexp.envs.importing.grid import FREE, OBSTACLE
+from maexp.envs.importing.import_report import ImportReport
+from maexp.envs.importing.map_server_files import export_ros_map
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.importing.report import ImportReport
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: bags are not tested")
 from bag_writer import cloud, grid, transforms, write_bag

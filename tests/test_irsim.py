@@ -10,7 +10,7 @@ from worlds import room
 
 from maexp.agents.cli import main
 from maexp.agents.irsim import ours
-from maexp.agents.irsim.config import DT, TrialConfig
+from maexp.agents.irsim.config import TrialConfig
 from maexp.agents.irsim.coverage import Coverage, map_errors
 from maexp.agents.irsim.floor import make_floor
 from maexp.agents.irsim.follower import Follower
@@ -18,7 +18,9 @@ from maexp.agents.irsim.mapping import TeamGrid
 from maexp.agents.irsim.odometry import Odometry
 from maexp.agents.irsim.people import Walkers
 from maexp.agents.irsim.simulator import Scan
+from maexp.agents.irsim.trial_planners import team_planner
 from maexp.agents.policies import POLICIES
+from maexp.kernels.constants import DT
 
 pytestmark = pytest.mark.slow  # another simulator
 
@@ -207,7 +209,7 @@ def test_a_short_trial(world, disturbed):
     env = ours.make_team(world, 2, trial_config)
     starts = ours.draw_starts(env, 0)
     moments = []
-    trial = run_trial(world, "nearest_frontier", starts, trial_config, moments.append)
+    trial = run_trial(world, team_planner("nearest_frontier", trial_config), starts, trial_config, moments.append)
     assert np.allclose(trial.poses[0], starts, atol=1e-5)
     assert len(trial.coverage) == 41 and len(moments) == 3
     assert (np.diff(trial.coverage) >= 0).all() and trial.coverage[-1] > trial.coverage[0] + 0.05
@@ -221,7 +223,7 @@ def test_a_short_trial(world, disturbed):
         assert trial.drift == pytest.approx(0.0, abs=1e-9) and trial.errors < 0.01
         curve, _ = ours.run_ours(env, POLICIES["nearest_frontier"](env), 0)
         assert len(curve) == 41 and abs(curve[0] - trial.coverage[0]) < 0.05
-        again = run_trial(world, "nearest_frontier", starts, trial_config)
+        again = run_trial(world, team_planner("nearest_frontier", trial_config), starts, trial_config)
         assert again.coverage == trial.coverage
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 from oracle import faults
-from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
-from worlds import act, play_alike, room
+from worlds import drive, play_alike, room
 
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, FaultsConfig, PlannerConfig
@@ -17,12 +16,6 @@ WORLD = room(40, 22)
 def make(faults: FaultsConfig | None, robots: int = 3, envs: int = 2, **settings) -> ExplorationEnv:
     settings = {"local_steps": 4, "macro_steps": 15, "num_threads": 1, "seed": 3, "success_coverage": 1.0} | settings
     return ExplorationEnv(WORLD, envs, robots, faults=faults, **settings)
-
-
-def drive(env: ExplorationEnv, steps: int, seed: int = 0) -> list[TensorDict]:
-    """Tensordicts after each macro step of random actions, from where the env is."""
-    generator = torch.Generator().manual_seed(seed)
-    return [env.step(act(env, generator))["next"] for _ in range(steps)]
 
 
 @pytest.mark.parametrize("seconds", [0.8, float("inf")])

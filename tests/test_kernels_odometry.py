@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 from oracle import odometry
-from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
-from worlds import act, play_alike, room
+from worlds import drive, play_alike, room
 
 from maexp.agents.policies import POLICIES
 from maexp.envs import (
@@ -30,11 +29,6 @@ KINDS = [RobotConfig(kind=kind) for kind in ("ackermann", "differential", "omnid
 def make(odometry: OdometryConfig | None, robots: int = 3, envs: int = 2, **settings) -> ExplorationEnv:
     settings = {"local_steps": 4, "macro_steps": 15, "num_threads": 1, "seed": 3, "success_coverage": 1.0} | settings
     return ExplorationEnv(settings.pop("maps", WORLD), envs, robots, odometry=odometry, **settings)
-
-
-def drive(env: ExplorationEnv, steps: int, seed: int = 0) -> list[TensorDict]:
-    generator = torch.Generator().manual_seed(seed)
-    return [env.step(act(env, generator))["next"] for _ in range(steps)]
 
 
 @pytest.mark.parametrize("planner", ["direct", "wavefront"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import find_browser, open_tab
+from paths import ROOT
 
 from maexp.agents.cli import main
 from maexp.agents.suites import rows, site
@@ -222,7 +223,7 @@ def test_names_of_policies_make_no_paths():
 
 
 def test_the_rows_of_this_project_are_of_its_suites_and_in_its_tables(tmp_path):
-    board = Path(__file__).parents[1] / "docs" / "leaderboard"
+    board = ROOT / "docs" / "leaderboard"
     kept = read_all(board)
     for row in kept:
         assert row["verified"] and row["suite"]["checksum"] == load_suite(row["suite"]["name"]).checksum

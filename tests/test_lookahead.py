@@ -118,7 +118,7 @@ def test_a_single_candidate_is_the_rollout_policy():
     td = env.rollout(3, POLICIES["multi_criteria"](env))
     for step in range(3):
         action = td["agents", "action"][:, step]
-        where = from_regions(env, action["region"], action["offset"])
+        where = from_regions(env.simulation, action["region"], action["offset"])
         torch.testing.assert_close(found[step], where, atol=1e-5, rtol=0)
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from toy_env import ToyEnv
+from toy_env import TINY_MODEL, ToyEnv
 
 from maexp.agents import make_critic, make_loss, make_policy
 from maexp.agents.algorithms import ALGORITHMS
@@ -12,9 +12,7 @@ from maexp.agents.algorithms.advantages import ADVANTAGE, TARGET, TEAM_TARGET, w
 from maexp.agents.algorithms.losses import ClippedLoss, policy_divergence
 from maexp.agents.networks.actor import ALIVE, MAP
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE
-from maexp.agents.settings.model import ModelConfig
 
-TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 GAMMA, LAMBDA = 0.9, 0.7
 
 
@@ -22,7 +20,7 @@ def setup(name, envs=5, steps=7, robots=3, seed=0, **settings):
     """Policy, critic, loss and a rollout that holds terminated, truncated and cut-off episodes."""
     torch.manual_seed(seed)
     env = ToyEnv(num_envs=envs, num_robots=robots, steps=3, seed=seed)
-    policy, critic = make_policy(env, TINY), make_critic(name, env, TINY)
+    policy, critic = make_policy(env, TINY_MODEL), make_critic(name, env, TINY_MODEL)
     for p in (*policy.parameters(), *critic.parameters()):
         torch.nn.init.normal_(p, std=0.3)
     loss = make_loss(name, policy, critic, gamma=GAMMA, lmbda=LAMBDA, **settings)

@@ -15,11 +15,9 @@ from tools.predictor.train import PredictorConfig
 
 from maexp.agents.errors import UserError
 from maexp.agents.networks.map_predictor import (
-    CARD,
     CONTRACT,
     NETWORK,
     STRIDE,
-    WEIGHTS,
     MapPredictor,
     contract_of,
     distance_to_free,
@@ -30,6 +28,7 @@ from maexp.agents.networks.map_predictor import (
     predictor_names,
     sample_worlds,
 )
+from maexp.agents.runtime.folder import CARD, WEIGHTS
 from maexp.agents.settings.groups import ScenarioSettings
 from maexp.agents.settings.indices import map_indices
 from maexp.envs import make_map

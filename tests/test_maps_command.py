@@ -13,12 +13,9 @@ from maexp.agents.cli import main
 from maexp.agents.commands.maps_folder import find_files
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.importing import draw_import, import_map_with_report
-from maexp.envs.importing.report import SHOWN_POINTS, ScannedPoints
+from maexp.envs.importing.import_report import SHOWN_POINTS, ScannedPoints
 
-
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("somewhere")
 
 
 def ink(path) -> tuple[float, float]:

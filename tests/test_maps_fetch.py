@@ -15,7 +15,7 @@ from maexp.agents import map_sets
 from maexp.agents.cli import main
 from maexp.envs import PointCloudMap
 from maexp.envs.importing import download
-from maexp.envs.importing.export import export_ros_map
+from maexp.envs.importing.map_server_files import export_ros_map
 
 LICENCE = b"Do as you like.\n"
 BUILDINGS = {"hall_1": ("hall", "training"), "hall_2": ("hall", "training"), "shed": ("shed", "test")}

@@ -13,7 +13,7 @@ from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.training.collect import make_collector
 from maexp.envs import SCENARIOS
-from maexp.envs.importing.export import export_ros_map
+from maexp.envs.importing.map_server_files import export_ros_map
 
 TEAM = {"random_obstacles": 1, "maze": 2, "maze_small": 4}  # robots; three elsewhere
 

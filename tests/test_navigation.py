@@ -79,7 +79,7 @@ def test_actions_mean_the_points_they_came_from():
     env = make_env(3)
     env.reset()
     points = keyed_uniform(env, 2) * 36.0
-    region, offset = to_regions(env, points)
+    region, offset = to_regions(env.simulation, points)
     td = env.reset()
     td[REGION], td[OFFSET] = region, offset
     env.step(td)
@@ -87,7 +87,7 @@ def test_actions_mean_the_points_they_came_from():
     td[GOAL], td[REGION] = points, 63 - region
     env.step(td)
     assert torch.equal(env.simulation.tensors["goal"], points), "goals in metres count before regions, to the bit"
-    region, offset = to_regions(env, points + 1000.0)
+    region, offset = to_regions(env.simulation, points + 1000.0)
     assert (region == 63).all() and (offset == 1.0).all()
 
 

@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
+from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.features import FEATURES
 from maexp.envs.navigation import Navigation
 
 MAPS = [make_map("maze_small", 0), make_map("maze", 1)]
-TARGETS, MASK = ("agents", "observation", "targets"), ("agents", "observation", "targets_mask")
 
 
 def assert_up_to_date(nav: Navigation, env: ExplorationEnv) -> None:
@@ -40,7 +40,7 @@ def test_what_is_kept_is_what_is_there(reach):
     td, nav, kept = env.reset(), env.target_view.tracker.nav, 0
     for step in range(8):
         scores = td[TARGETS][..., FEATURES.index("score")]
-        td["agents", "action", "target"] = torch.where(td[MASK], scores, -math.inf).argmax(-1)
+        td["agents", "action", "target"] = torch.where(td[TARGETS_MASK], scores, -math.inf).argmax(-1)
         before = nav.known.clone()
         td = env.step_and_maybe_reset(td)[1]
         changed = (nav.known != before).flatten(1).any(1)

@@ -17,7 +17,7 @@ from maexp.envs import ExplorationEnv, MapError, RadarConfig, RobotConfig
 from maexp.envs.render import draw_teams
 from maexp.envs.scenarios import SCENARIOS, default_macro_steps
 from maexp.envs.viewing.quads import make_quads
-from maexp.envs.viewing.scene import Stage
+from maexp.envs.viewing.stage import Stage
 
 FLOOR = room(72, 64, spacing=0.25)  # 18 x 16 m
 ROW = SCENARIOS["pointcloud"]

@@ -13,8 +13,8 @@ import pytest
 from conftest import pytest_configure
 from lonely import PLAN_WITH_A_POLICY, share_packages
 from packaging.requirements import Requirement
+from paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("kernels", "envs", "agents", "conf")
 
 

@@ -12,7 +12,7 @@ from maexp.agents.evaluation.films import play_teams
 from maexp.agents.policies import POLICIES
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.render import EXPLORED, LIGHT, UNEXPLORED
-from maexp.envs.viewing.scene import Stage
+from maexp.envs.viewing.stage import Stage
 
 pytest.importorskip("viser", reason="THE EXTRA maexp[view] IS NOT INSTALLED: the page is not tested")
 from maexp.envs.viewing.page import TEAM, Page, _paint, write_page

@@ -4,11 +4,10 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 PATCHES = ("scenario", "robot_parameter", "classical_planner", "target_feature", "reward_term")
 PLAY = """
 import torch

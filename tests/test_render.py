@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 from scipy import ndimage
+from worlds import index_of
 
 from maexp.envs.map import PointCloudMap
 from maexp.envs.raster import map_raster
@@ -66,10 +67,6 @@ def colour_at(frame, place, position, size=SIZE) -> tuple:
     raster = map_raster(place, size)
     column, row = np.floor(raster.to_pixels(position)).astype(int)
     return tuple(frame[row, column].tolist())
-
-
-def index_of(points, position) -> int:
-    return int(np.argmin(np.linalg.norm(points[:, :2] - position, axis=1)))
 
 
 def near(points, position, reach) -> np.ndarray:

@@ -4,20 +4,21 @@ import ast
 import importlib
 import sys
 import xml.etree.ElementTree as xml
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from paths import ROOT
 
 from maexp.agents.runtime import TeamPlanner, frames
+from maexp.envs.quaternions import read_yaw
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
 from bag_writer import GRID, STORE, TF, grid, transforms
 from rosbags.interfaces import Nodetype
 
-PACKAGE = Path(__file__).resolve().parents[1] / "docs" / "ros2" / "maexp_ros"
+PACKAGE = ROOT / "docs" / "ros2" / "maexp_ros"
 ZERO = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 
@@ -140,7 +141,7 @@ def test_goals_and_markers_are_real_messages(conversion):
     frames.fill_pose(pose.pose, *way[-1], frames.heading_of(way))
     got = passed_on(pose).pose
     assert (got.position.x, got.position.y) == (2.0, 3.0)
-    assert frames.read_yaw(got.orientation) == pytest.approx(np.pi / 2)
+    assert read_yaw(got.orientation) == pytest.approx(np.pi / 2)
     point, array = made("geometry_msgs/msg/Point"), blank("visualization_msgs/msg/MarkerArray")
     array.markers = [blank("visualization_msgs/msg/Marker") for _ in range(3)]
     conversion.fill_way(array.markers[0], point, 1, way)

@@ -12,7 +12,7 @@ pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED
 
 from maexp.agents.ros2.convert import read_nanoseconds
 from maexp.agents.ros2.dds import Wire
-from maexp.agents.ros2.goals import (
+from maexp.agents.ros2.goal_sending import (
     ABORTED,
     CANCELED,
     EXECUTING,

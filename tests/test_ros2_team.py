@@ -10,7 +10,7 @@ pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED
 from maexp.agents.errors import UserError
 from maexp.agents.ros2.convert import transform
 from maexp.agents.ros2.dds import EPISODE, Wire
-from maexp.agents.ros2.goals import (
+from maexp.agents.ros2.goal_sending import (
     CANCELED,
     SUCCEEDED,
     NavigationServer,

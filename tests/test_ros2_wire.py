@@ -9,7 +9,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from maexp.agents.ros2.dds import TOPICS, Wire, quality, read_domain
-from maexp.agents.ros2.messages import CLASSES, HEADER, NAVIGATE, TABLE, wire_name
+from maexp.agents.ros2.ros_types import CLASSES, HEADER, NAVIGATE, TABLE, wire_name
 
 GOAL = "geometry_msgs/PoseStamped pose\nstring behavior_tree"
 PROGRESS = """geometry_msgs/PoseStamped current_pose

@@ -5,14 +5,12 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from lonely import PLAN_WITH_A_POLICY, share_packages
+from paths import ROOT
 
 from maexp.agents.runtime import CHOICES
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")

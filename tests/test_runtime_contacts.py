@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 from runtime_cases import moment
-from test_contacts import ACTION, BASE, COUNT, HERE, MASK, PLACE, TARGETS, TELL, make
+from test_contacts import ACTION, BASE, COUNT, HERE, PLACE, TELL, make
 from test_runtime_watch import CELL, SETTINGS, World
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents import ModelConfig, make_policy
+from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
 from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.runtime import RobotPlanner, TeamPlanner, Word
 from maexp.agents.runtime.contacts import BASE as STATION
@@ -20,8 +21,7 @@ from maexp.agents.runtime.frames import OccupancyGrid
 from maexp.agents.runtime.grid import KnownGrid
 from maexp.envs import CommConfig, ExplorationEnv
 from maexp.envs.features import FEATURES, RADIO_TABLE, feature_names
-from maexp.kernels.constants import FREE
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT, FREE
 
 RADIOS = {
     "range": HERE,
@@ -136,7 +136,7 @@ def test_features_are_those_of_the_env(kind, folder):
                 continue
             scene, ours = seen
             row, there = sorted([k, *robots.planners[k]._lately, *mates_of(env, k)]).index(k), td[TARGETS][0, k].numpy()
-            mask, features = td[MASK][0, k].numpy(), ours.features[row]
+            mask, features = td[TARGETS_MASK][0, k].numpy(), ours.features[row]
             pairs = match(env, k, scene, ours.target[row], ours.mask[row], mask)
             news = abs(float(env.strategy.known[0, k] - env.strategy.state["told"][0, k, 2]))
             if mask[TELL] != ours.mask[row, TELL]:
@@ -200,7 +200,7 @@ def test_a_policy_plays_an_episode_from_the_runtime(policy, folder):
                 gaps.append(np.linalg.norm(plan.goals[0] - base))
             if duty[k] and not linked[k]:
                 assert plan.tells[0], "whatever its policy says on the way"
-            elif robots.direct() and td[MASK][0, k].any():
+            elif robots.direct() and td[TARGETS_MASK][0, k].any():
                 asked, same = asked + 1, same + (index[k] == wanted[k])
             told += bool(plan.tells[0]) and not duty[k]
             duty[k] = bool(plan.tells[0])

@@ -11,11 +11,10 @@ from tools.gallery import draw_gallery
 from tools.map_statistics import measure_map, rasterise
 
 from maexp.envs.checker import check_map
-from maexp.envs.scenarios import SCENARIOS, make_map, split
+from maexp.envs.scenarios import GENERATED, SCENARIOS, make_map, split
 from maexp.envs.scenarios.lattice import wall_points
 from maexp.envs.scenarios.table import find_scenario
 
-GENERATED = [name for name, scenario in SCENARIOS.items() if scenario.build is not None]
 LATTICE = [name for name in GENERATED if name != "random_obstacles_adaptive"]
 INDICES = (0, 5, 16, 1000)  # training and held-out maps of every scenario, and one beyond the table
 

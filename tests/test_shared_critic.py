@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from mazes import MAPS
 
 from maexp.agents.algorithms.advantages import write_advantages
 from maexp.agents.algorithms.catalogue import find_algorithm
@@ -13,9 +14,8 @@ from maexp.agents.networks.actor import COMM, SEEN, TARGETS, TARGETS_MASK, make_
 from maexp.agents.networks.critics import TEAM_VALUE, VALUE
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
-from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig
 
-MAPS = [make_map("maze_small", k) for k in (0, 3)]
 BIAS = "module.0.module.network.encoder.inputs.0.bias"
 SHARING = ["ippo", "mappo", "vdppo", "vda2c"]
 

@@ -65,7 +65,7 @@ def test_a_full_disk_is_one_sentence(copied_run, monkeypatch, capsys):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("maexp.agents.suites.folder.np.savez_compressed", full)
+    monkeypatch.setattr("maexp.agents.suites.run_files.np.savez_compressed", full)
     assert main(["suite", "run", f"resume={copied_run}"]) == 2
     assert "free some space" in capsys.readouterr().err
     assert not [one for one in (copied_run / "actions").iterdir() if "indoor_small-0000" in one.name]

@@ -12,7 +12,7 @@ from mazes import OFFSET, REGION
 
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.suites import folder
+from maexp.agents.suites import run_files
 from maexp.agents.suites.play import Batch, build_env, build_maps, build_replay, play_batch, replay_batch
 from maexp.agents.suites.players import Player
 from maexp.agents.suites.suite import load_suite
@@ -48,7 +48,7 @@ def test_actions_give_the_same_bits_played_in_other_batches(suite_run, small_sui
     with player.open(env) as policy:
         noted = [play_batch(suite, env, policy, first) for first in (0, 2)]
     whole = build_env(part, build_maps(part), 4, suite.seed, ObservationConfig(pictures=False), device="cpu")
-    rows = {name: np.concatenate([getattr(one, name) for one in noted]) for name in folder.ARRAYS}
+    rows = {name: np.concatenate([getattr(one, name) for one in noted]) for name in run_files.ARRAYS}
     goal = np.concatenate([one.sent["goal"] for one in noted])
     metrics = {name: np.concatenate([one.metrics[name] for one in noted]) for name in suite.metrics}
     again = replay_batch(suite, whole, Batch(0, sent={"goal": goal}, metrics=metrics, **rows))
@@ -72,16 +72,16 @@ def test_a_run_that_noted_regions_and_offsets_plays_again(small_suite, tmp_path)
     noted = play_batch(suite, build_replay(part, maps, 4, suite.seed), policy, 0)
     region, offset = (np.stack([one[k] for one in said], 1) for k in (0, 1))
     earlier = replace(noted, sent={"region": region.astype(np.uint8), "offset": offset})
-    folder.write_batch(tmp_path, suite, part.name, earlier)
-    read = folder.read_batch(tmp_path, suite, part.name, 0)
+    run_files.write_batch(tmp_path, suite, part.name, earlier)
+    read = run_files.read_batch(tmp_path, suite, part.name, 0)
     assert list(read.sent) == ["region", "offset"]
     again = replay_batch(suite, build_replay(part, maps, 4, suite.seed), read)
     assert all(np.array_equal(one, again.metrics[name], equal_nan=True) for name, one in noted.metrics.items())
     assert np.array_equal(noted.sent["goal"], again.sent["goal"])
     earlier.sent["region"][0, 0] = 64
-    folder.write_batch(tmp_path, suite, part.name, earlier)
+    run_files.write_batch(tmp_path, suite, part.name, earlier)
     with pytest.raises(UserError, match="is damaged or holds something else"):
-        folder.read_batch(tmp_path, suite, part.name, 0)
+        run_files.read_batch(tmp_path, suite, part.name, 0)
 
 
 def edit_json(change):
@@ -111,7 +111,7 @@ def edit_files(change):
 
     def edit(where: Path) -> None:
         change(where)
-        edit_json(lambda content: content["files"].update(folder.list_files(where)))(where)
+        edit_json(lambda content: content["files"].update(run_files.list_files(where)))(where)
 
     return edit
 

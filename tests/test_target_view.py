@@ -4,23 +4,22 @@ import math
 
 import pytest
 import torch
+from mazes import MAPS
 from oracle.targets import columns as oracle_columns
 from torchrl.envs.utils import check_env_specs, step_mdp
 from worlds import ways_to_blocks
 
 from maexp.agents.algorithms.catalogue import find_algorithm
-from maexp.agents.networks.actor import make_policy
+from maexp.agents.networks.actor import TARGETS, TARGETS_MASK, make_policy
 from maexp.agents.networks.target_chooser import score_by_criteria
 from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collect import make_collector
-from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, make_map
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
 from maexp.envs.choices import BETA, rank_by_criteria
 from maexp.envs.features import FEATURES, feature_names
 
-MAPS = [make_map("maze_small", k) for k in (0, 3)]
 COUNT = 40  # no team knows more targets
-TARGETS, MASK = ("agents", "observation", "targets"), ("agents", "observation", "targets_mask")
 ACTION = ("agents", "action", "target")
 
 
@@ -36,7 +35,7 @@ def column(td, name: str) -> torch.Tensor:
 
 def choose(td) -> torch.Tensor:
     """The candidate with the highest classical score."""
-    return torch.where(td[MASK], column(td, "score"), -math.inf).argmax(-1)
+    return torch.where(td[TARGETS_MASK], column(td, "score"), -math.inf).argmax(-1)
 
 
 def play(env, steps: int, td=None) -> list:
@@ -53,8 +52,8 @@ def test_specs_hold_and_features_are_finite():
     check_env_specs(env)
     for td in play(env, 4):
         assert torch.isfinite(td[TARGETS]).all() and td[TARGETS].abs().max() < 20.0
-        assert (td[TARGETS][~td[MASK]] == 0).all()
-        assert td[MASK].any(-1)[td["agents", "observation", "alive"]].float().mean() > 0.5
+        assert (td[TARGETS][~td[TARGETS_MASK]] == 0).all()
+        assert td[TARGETS_MASK].any(-1)[td["agents", "observation", "alive"]].float().mean() > 0.5
 
 
 @pytest.mark.parametrize("planner", ["wavefront", "dwa"])
@@ -74,7 +73,7 @@ def test_the_highest_score_is_what_cost_utility_takes(planner):
 def test_columns_mean_what_their_names_say():
     env = make_env()
     td = play(env, 3)[-1]
-    view, mask = env.target_view, td[MASK]
+    view, mask = env.target_view, td[TARGETS_MASK]
     nav, reach = view.tracker.nav, 10.0
     gap = view.state["point"] - nav.centers().unsqueeze(2)
     assert mask.any()
@@ -97,7 +96,7 @@ def test_columns_mean_what_their_names_say():
 def test_one_more_env_changes_nothing():
     three, four = play(make_env(3), 4), play(make_env(4), 4)
     for a, b in zip(three, four, strict=True):
-        assert torch.equal(a[TARGETS], b[TARGETS][:3]) and torch.equal(a[MASK], b[MASK][:3])
+        assert torch.equal(a[TARGETS], b[TARGETS][:3]) and torch.equal(a[TARGETS_MASK], b[TARGETS_MASK][:3])
 
 
 def test_a_reset_of_some_envs_leaves_the_others():
@@ -124,10 +123,10 @@ def test_a_reset_of_some_envs_looks_at_these_alone(planner, reach):
     assert not torch.equal(nav.distance[[1, 3]], before[[1, 3]])
     kept = env.target_view.state_dict()
     wanted = env.observe()
-    for key in (TARGETS, MASK):
+    for key in (TARGETS, TARGETS_MASK):
         assert torch.equal(after[key][[1, 3]], wanted[key][[1, 3]]) and wanted[key][[1, 3]].any()
         assert not after[key][[0, 2]].any()
-    some = wanted[MASK]
+    some = wanted[TARGETS_MASK]
     for name, value in env.target_view.state_dict().items():
         listed = value.shape[:3] == some.shape  # absent candidates stand for nothing
         assert torch.equal(kept[name][some], value[some]) if listed else torch.equal(kept[name], value), name
@@ -154,7 +153,7 @@ def test_a_saved_state_goes_on_bit_for_bit(planner):
 
 def test_robots_that_hear_nobody_know_of_no_plans():
     td = play(make_env(comm=CommConfig(range=0.1)), 2)[-1]
-    mask = td[MASK]
+    mask = td[TARGETS_MASK]
     assert (column(td, "claimed")[mask] == 0).all() and (column(td, "mates")[mask] == 0).all()
     assert (column(td, "plan_gap")[mask] == 4.0).all() and (column(td, "nearest")[mask] == 1).all()
 
@@ -227,8 +226,8 @@ def test_all_algorithms_learn_to_choose(name):
     settings = row.configure(minibatch_size=6)
     loss = row.make_loss(policy, row.make_critic(env, model, settings), settings)
     batch = make_collector(env, policy, 3).next()
-    taken = batch[MASK].gather(-1, batch[ACTION].unsqueeze(-1)).squeeze(-1)
-    assert taken[batch[MASK].any(-1)].all() and (batch[ACTION][~batch[MASK].any(-1)] == 0).all()
+    taken = batch[TARGETS_MASK].gather(-1, batch[ACTION].unsqueeze(-1)).squeeze(-1)
+    assert taken[batch[TARGETS_MASK].any(-1)].all() and (batch[ACTION][~batch[TARGETS_MASK].any(-1)] == 0).all()
     before = policy.state_dict()["module.0.module.network.head.weight"].clone()
     logs = row.make_updater(loss, settings).update(batch)
     assert math.isfinite(logs["loss_critic"]) and not torch.equal(
@@ -243,7 +242,7 @@ def test_an_untrained_policy_is_the_classical_planner():
     env = make_env()
     policy = make_policy(env, ModelConfig(action="targets", starts_from="cost_utility"))
     for td in play(env, 3):
-        some = td[MASK].any(-1)
+        some = td[TARGETS_MASK].any(-1)
         assert torch.equal(policy(td.clone())[ACTION][some], choose(td)[some])
 
 
@@ -281,4 +280,4 @@ def test_choices_are_drawn_in_a_collector_and_the_likeliest_elsewhere():
     batch = next(iter(collector))
     collector.shutdown()
     assert (batch[ACTION] > 0).any(), "drawn"
-    assert (policy(batch.select(TARGETS, MASK, *policy.in_keys))[ACTION] == 0).all(), "the first of equals"
+    assert (policy(batch.select(TARGETS, TARGETS_MASK, *policy.in_keys))[ACTION] == 0).all(), "the first of equals"

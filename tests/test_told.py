@@ -9,8 +9,9 @@ from worlds import room
 
 from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
 from maexp.agents.networks.distributions import ACTION
+from maexp.agents.networks.target_chooser import NEVER, SCORE
 from maexp.agents.policies.classical import FrontierPlanner
-from maexp.agents.training.branching import NEVER, SCORE, BranchPlayer
+from maexp.agents.training.branching import BranchPlayer
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, make_map
 from maexp.envs.choices import rank_by_criteria
 

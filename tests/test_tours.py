@@ -1,17 +1,17 @@
 """The example of teams that plan tours: what its tours are, and that it plays."""
 
 import runpy
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from paths import ROOT
 
 from maexp.agents.runtime import CHOICES
 from maexp.agents.runtime.scene import ArrayScene
 from maexp.kernels.constants import OPEN
 
-EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "policies" / "tours.py"
+EXAMPLE = ROOT / "docs" / "examples" / "policies" / "tours.py"
 INF = np.inf
 
 

@@ -1,21 +1,15 @@
-"""Training: the files of a run; stopped, killed or in one go, a run comes to the same bits."""
+"""Training: the files of a run, its teams and scenarios, its validation, and what it refuses."""
 
 import json
-import os
-import random
 import re
-import signal
-import subprocess
-import sys
-import time
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from metrics_file import read_metrics
 from small_run import PLACE
+from tiny_training import BATCH, CLOCKS, TINY, assert_same, assert_same_runs, resume, run
 
 from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
@@ -25,81 +19,8 @@ from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import make_map
 
-pytestmark = pytest.mark.slow  # trainings; a short one is among the README's commands
-
-TINY = [
-    "scenario=maze_small",
-    "action=regions",
-    "scenario.maps=[0,1]",
-    "scenario.held_out=[70]",
-    "scenario.macro_steps=3",
-    "scenario.local_steps=5",
-    "num_envs=3",
-    "num_robots=2",
-    "collector.steps=2",
-    "checkpoint_every=2",
-    "episodes=0",
-    "evaluate_every=0",
-    "evaluate_episodes=4",
-]
-BATCH = 6
-CLOCKS = (
-    "seconds",
-    "frames_per_second",
-    "time_wait",
-    "time_simulate",
-    "time_policy",
-    "time_advantage",
-    "time_update",
-    "time_validation",
-)
-
-
-@pytest.fixture(autouse=True)
-def somewhere(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture(autouse=True)
-def no_film(monkeypatch):
-    """Pictures have tests of their own."""
-    monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", lambda *args: None)
-    monkeypatch.setattr("maexp.agents.commands.train.draw_curves", lambda *args: None)
-
-
-def run(folder: str, iterations: int, *words: str) -> Path:
-    assert main(["train", *TINY, f"hydra.run.dir={folder}", f"total_frames={iterations * BATCH}", *words]) == 0
-    return Path(folder)
-
-
-def resume(folder: Path, iterations: int, *words: str) -> Path:
-    assert main(["train", f"resume={folder}", f"total_frames={iterations * BATCH}", *words]) == 0
-    return folder
-
-
-def assert_same(first, second, place="checkpoint") -> None:
-    """The same bits everywhere, but for clocks and the words of the command line."""
-    if isinstance(first, dict):
-        assert first.keys() == second.keys(), place
-        for name in first:
-            if name not in ("seconds", "overrides"):
-                assert_same(first[name], second[name], f"{place}/{name}")
-    elif torch.is_tensor(first):
-        assert first.dtype == second.dtype and torch.equal(first.nan_to_num(), second.nan_to_num()), place
-    elif isinstance(first, list | tuple):
-        assert len(first) == len(second), place
-        for index, pair in enumerate(zip(first, second, strict=True)):
-            assert_same(*pair, f"{place}/{index}")
-    else:
-        assert first == second or first != first, place
-
-
-def assert_same_runs(first: Path, second: Path) -> None:
-    assert_same(find_checkpoint(first)[1], find_checkpoint(second)[1])
-    rows = [read_metrics(one / "metrics.csv") for one in (first, second)]
-    assert len(rows[0]) == len(rows[1])
-    for pair in zip(*rows, strict=True):
-        assert_same(*({name: value for name, value in row.items() if name not in CLOCKS} for row in pair), "metrics")
+# Trainings; a short one is among the README's commands.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("somewhere", "no_pictures")]
 
 
 def test_the_files_of_a_run(capsys):
@@ -202,15 +123,6 @@ def test_a_checkpoint_and_classical_policies_play_the_same_episodes(capsys):
     assert "The trained team N=1" in printed and "The trained team N=2" in printed
 
 
-@pytest.mark.parametrize("algorithm", ["mappo", "matrpo"])
-def test_resumed_is_uninterrupted(algorithm):
-    """On maps on which the coverage falls, too: the best is never where a run happened to stop."""
-    words = [f"algorithm={algorithm}", "scenario=indoor_medium"]
-    whole = run("whole", 6, *words)
-    parts = resume(run("parts", 3, *words), 6)
-    assert_same_runs(whole, parts)
-
-
 def test_teams_of_several_sizes_in_one_batch(capsys):
     """Resumed is uninterrupted; the teams are those that runs of one size would have; each size is evaluated."""
     words = ["num_robots=1,3", "num_envs=5", "classical=[]"]
@@ -289,16 +201,6 @@ def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
     ]
 
 
-def test_rows_after_the_checkpoint_are_dropped_and_a_damaged_one_passed_over(capsys):
-    whole = run("whole", 6)
-    broken = run("broken", 5)
-    newest = list_checkpoints(broken / "checkpoints")[0]
-    newest.write_bytes(newest.read_bytes()[:1000])
-    resume(broken, 6)
-    assert "warning" in capsys.readouterr().err
-    assert_same_runs(whole, broken)
-
-
 @pytest.mark.parametrize("steps, frames, ends", [("null", 9, 3), ("2", 6, 0)])
 def test_a_batch_is_an_episode_of_every_team_unless_told_otherwise(steps, frames, ends):
     folder = run("whole", 1, f"collector.steps={steps}")
@@ -331,22 +233,6 @@ def test_the_gain_is_the_paired_difference_to_the_best_planner(monkeypatch):
 def test_without_a_classical_planner_there_is_no_gain(words):
     row = read_metrics(run("run", 1, "evaluate_every=1", *words) / "metrics.csv")[1]
     assert row["validation_coverage_auc"] > 0 and row["validation_gain"] != row["validation_gain"]
-
-
-def test_resumed_the_planners_need_not_play_again(monkeypatch, capsys):
-    """The columns of the validation, too, are those of a run in one go; other settings let the planners play anew."""
-    from maexp.agents.training import validation
-
-    played, play_best = [], validation.play_best
-    monkeypatch.setattr(validation, "play_best", lambda *args: played.append(1) or play_best(*args))
-    whole = run("whole", 5, "evaluate_every=2")
-    parts = run("parts", 3, "evaluate_every=2")
-    assert len(played) == 2
-    assert_same_runs(whole, resume(parts, 5))
-    assert len(played) == 2
-    assert "gain over" in capsys.readouterr().err
-    resume(parts, 6, "evaluate_episodes=2")
-    assert len(played) == 3
 
 
 def test_evaluations_in_between_change_nothing():
@@ -401,72 +287,3 @@ def test_a_loss_that_is_no_number_stops_the_run_and_is_named(monkeypatch, capsys
 def test_too_much_memory_is_refused_before_the_run(capsys):
     assert main(["train", *TINY, "collector.steps=100000000", "hydra.run.dir=run"]) == 2
     assert "lower num_envs or collector.steps" in capsys.readouterr().err
-
-
-PROGRAM = """
-import sys, torch
-torch.set_num_threads(1)
-from maexp.agents.commands import train
-train.draw_rollout = train.draw_curves = lambda *args: None
-from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
-from maexp.agents.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-def start(*words: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-c", PROGRAM, "train", *words], stderr=subprocess.PIPE, text=True)
-
-
-def wait_for_rows(folder: Path, count: int, process: subprocess.Popen) -> None:
-    path = folder / "metrics.csv"
-    while process.poll() is None and (not path.is_file() or len(path.read_text().splitlines()) <= count):
-        time.sleep(0.005)
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_with_a_checkpoint():
-    process = start(*TINY, "hydra.run.dir=run", "total_frames=600000", "checkpoint_every=100000")
-    wait_for_rows(Path("run"), 2, process)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
-    assert find_checkpoint("run")[1]["iteration"] >= 2
-    assert "Traceback" not in process.stderr.read()
-
-
-def test_a_signal_after_an_iteration_was_kept_loses_none(monkeypatch):
-    """Ctrl-C between the look at the signals and the end of the iteration: the next one ends the run, and is saved."""
-    shown = []
-
-    def show(self, done, note=""):
-        shown.append(done)
-        if len(shown) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr("maexp.agents.training.train.Progress.show", show)
-    words = [*TINY, "hydra.run.dir=run", "total_frames=600000", "checkpoint_every=100000"]
-    assert main(["train", *words]) == 130
-    rows = [int(row["iteration"]) for row in read_metrics(Path("run/metrics.csv"))]
-    assert find_checkpoint("run")[1]["iteration"] == rows[-1] == 3
-
-
-@pytest.mark.slow
-def test_killed_at_random_moments_and_resumed(tmp_path):
-    """kill -9 while the run trains, logs or saves; after each, resume; at the end the bits of one go."""
-    attempts = int(os.environ.get("MAEXP_KILLS", 4))
-    iterations, rng, kills = 8 * attempts, random.Random(os.environ.get("MAEXP_KILL_SEED", 0)), 0
-    whole = run("whole", iterations, "checkpoint_every=1")
-    words = [*TINY, "hydra.run.dir=killed", f"total_frames={iterations * BATCH}", "checkpoint_every=1"]
-    folder = tmp_path / "killed"
-    for attempt in range(attempts):
-        process = start(*words) if attempt == 0 else start(f"resume={folder}")
-        done = find_checkpoint(folder)[1]["iteration"] if attempt else 0
-        wait_for_rows(folder, min(done + 2, iterations - 1), process)
-        time.sleep(rng.random() * 0.2)
-        kills += process.poll() is None
-        process.kill()
-        process.wait()
-    print(f"killed {kills} times")
-    assert kills >= attempts // 2
-    resume(folder, iterations)
-    assert_same_runs(whole, folder)

@@ -3,14 +3,11 @@
 import pytest
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
-from toy_env import ToyEnv
+from toy_env import TINY_MODEL, ToyEnv
 
 from maexp.agents import make_policy
 from maexp.agents.algorithms.catalogue import ALGORITHMS, make_critic, make_loss
 from maexp.agents.algorithms.trust_region import TRPO, conjugate_gradient, flatten
-from maexp.agents.settings.model import ModelConfig
-
-TINY = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 
 
 class Bandit:
@@ -114,7 +111,7 @@ def test_a_loss_without_numbers_moves_nothing():
 def team_batch(num_envs=24):
     torch.manual_seed(0)
     env = ToyEnv(num_envs=num_envs)
-    policy, critic = make_policy(env, TINY), make_critic("itrpo", env, TINY)
+    policy, critic = make_policy(env, TINY_MODEL), make_critic("itrpo", env, TINY_MODEL)
     loss = make_loss("itrpo", policy, critic)
     updater = ALGORITHMS["itrpo"].make_updater(loss)
     with torch.no_grad():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from worlds import index_of
 
 from maexp.agents.cli import main
 from maexp.agents.evaluation.films import play_teams
@@ -17,7 +18,7 @@ from maexp.envs.viewing import show
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at, paint
 from maexp.envs.viewing.quads import make_quads
-from maexp.envs.viewing.scene import GROUND, WALL_SHARE, Stage
+from maexp.envs.viewing.stage import GROUND, WALL_SHARE, Stage
 
 pytestmark = pytest.mark.slow  # a browser's page
 
@@ -30,10 +31,6 @@ def room(width=20, height=16, **heights) -> PointCloudMap:
     wall = (x == 0) | (y == 0) | (x == width - 1) | (y == height - 1) | ((x == 10) & (y >= 5) & (y <= 10))
     points = np.column_stack([x, y]).astype(float)
     return PointCloudMap(points[~wall], points[wall], 1.0, name="room", **heights)
-
-
-def index_of(points, position) -> int:
-    return int(np.argmin(np.linalg.norm(points[:, :2] - position, axis=1)))
 
 
 def team(place: PointCloudMap, **changes) -> dict:

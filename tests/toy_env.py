@@ -10,9 +10,13 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from maexp.agents.settings.model import ModelConfig
+
 SIDE = 2
 PIXELS = 16
 OFFSET = (0.5, -0.5)
+SMALL_MODEL = ModelConfig(channels=4, grid_features=4, heads=1, feedforward=1, critic_hidden=8)
+TINY_MODEL = ModelConfig(channels=2, grid_features=2, heads=1, feedforward=1, critic_hidden=4)
 
 
 class ToyEnv(EnvBase):

@@ -126,3 +126,14 @@ def ways_to_blocks(nav) -> torch.Tensor:
     ways = torch.full((*nav.way.shape[:2], nav.num_blocks + 1), torch.inf)
     ways.scatter_(2, (nav.block + 1).expand(nav.way.shape), nav.way)  # entry 0 takes what fills up
     return ways[..., 1:]
+
+
+def drive(env: ExplorationEnv, steps: int, seed: int = 0) -> list[TensorDict]:
+    """Tensordicts after each macro step of random actions, from where the env is."""
+    generator = torch.Generator().manual_seed(seed)
+    return [env.step(act(env, generator))["next"] for _ in range(steps)]
+
+
+def index_of(points: np.ndarray, position) -> int:
+    """The point [n, 2 or 3] nearest to a position."""
+    return int(np.argmin(np.linalg.norm(points[:, :2] - position, axis=1)))

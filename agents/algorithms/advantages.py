@@ -12,6 +12,7 @@ ADVANTAGE = ("agents", "advantage")
 TARGET = ("agents", "value_target")
 TEAM_TARGET = ("team", "value_target")
 TEAM_ADVANTAGE = ("team", "advantage")
+TEAM_REWARD = ("team", "reward")
 
 
 class TeamGAE(GAE):
@@ -22,18 +23,20 @@ class TeamGAE(GAE):
     """
 
     def set_keys(self, **keys) -> None:
-        """The advantage's key is the robots'; the team's own is kept beside its value."""
+        """The keys of advantage and reward are the robots'; the team's own are kept beside its value."""
         if "advantage" in keys:
             self.robot_advantage = keys["advantage"]
             keys = keys | {"advantage": TEAM_ADVANTAGE}
+        if "reward" in keys:
+            self.robot_reward = keys["reward"]
+            keys = keys | {"reward": TEAM_REWARD}
         super().set_keys(**keys)
 
-    def _prepare_signals(self, reward, done, terminated, value):
-        return reward.sum(-2), done, terminated
-
     def forward(self, tensordict: TensorDictBase, **kwargs) -> TensorDictBase:
+        reward = tensordict.get(("next", self.robot_reward))
+        tensordict.set(("next", TEAM_REWARD), reward.sum(-2))
         tensordict = super().forward(tensordict, **kwargs)
-        robots = tensordict.get(("next", self.tensor_keys.reward)).shape[-2]
+        robots = reward.shape[-2]
         advantage = tensordict.get(self.tensor_keys.advantage).unsqueeze(-2)
         return tensordict.set(self.robot_advantage, advantage.expand(*advantage.shape[:-2], robots, 1))
 

@@ -10,6 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.algorithms.catalogue import TRAININGS
+from maexp.agents.command_words import as_list, check_names
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES
@@ -19,7 +20,6 @@ from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.training.named import NamedPolicy, check_planner, find_player, name_players
-from maexp.agents.words import as_list, check_names
 from maexp.envs.scenarios import cut_last_fifth, find_scenario, split
 
 PLAN, FORMAT = "benchmark.json", "maexp-benchmark-1"

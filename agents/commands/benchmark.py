@@ -30,10 +30,11 @@ from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import BenchmarkSettings
-from maexp.agents.training.train import stop_on_signals, write_config
+from maexp.agents.signals import STOPPED, stop_on_signals
+from maexp.agents.training.train import write_config
 
 NOTE = "What is absent here each cell has from its scenario and its algorithm: see cells/*/*/*/config.yaml."
-FAILED, STOPPED = 1, 130
+FAILED = 1
 SHOWN = 2  # running cells in the line of progress
 LONG = 24.0  # hours that need confirm=true
 

@@ -36,13 +36,13 @@ from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
+from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
 from maexp.agents.training.named import NamedPolicy, check_planner, find_players, suit_observation
 from maexp.agents.training.train import write_config
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 PICTURES = 4
-STOPPED = 130
 
 
 def prepare(overrides: list[str]) -> Recipe:

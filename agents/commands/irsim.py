@@ -23,7 +23,7 @@ def check(cfg: IrsimSettings) -> None:
     """Raise UserError for what is missing, before a folder is made."""
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
-    from maexp.agents.irsim.players import check_player
+    from maexp.agents.irsim.trial_planners import check_player
 
     check_player(cfg.policy, find_player(cfg.policy))
     if importlib.util.find_spec("irsim") is None:
@@ -33,9 +33,9 @@ def check(cfg: IrsimSettings) -> None:
 def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
     from maexp.agents.irsim import ours
-    from maexp.agents.irsim.pictures import draw_curves, draw_moment
-    from maexp.agents.irsim.players import make_planner
+    from maexp.agents.irsim.drawing import draw_curves, draw_moment
     from maexp.agents.irsim.trial import run_trial
+    from maexp.agents.irsim.trial_planners import make_planner
 
     with blame_input():
         world = import_map(cfg.floor, read(ImportOptions, cfg.importing))
@@ -75,7 +75,8 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
 
 def make_config(cfg: IrsimSettings, world: PointCloudMap):
     """The trial of these settings; what is not given is that of the floor's scenario."""
-    from maexp.agents.irsim.config import DT, TOLERANCE, TrialConfig
+    from maexp.agents.irsim.config import TOLERANCE, TrialConfig
+    from maexp.kernels.constants import DT
 
     scenario = find_scenario(world.scenario)
     team = [(scenario.max_speed, cfg.radar_range or scenario.radar_range)] * cfg.num_robots
@@ -102,7 +103,7 @@ def make_config(cfg: IrsimSettings, world: PointCloudMap):
 
 def measure(curve: list[float], seconds: float) -> dict[str, float | None]:
     """Coverage at the end and on average over the time, and when 85 and 95 % were seen [s]; None: never."""
-    from maexp.agents.irsim.config import DT
+    from maexp.kernels.constants import DT
 
     values = np.array(curve)
     whole = np.concatenate([values, np.full(max(round(seconds / DT) + 1 - len(values), 0), values[-1])])

@@ -8,10 +8,9 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import LeaderboardSettings
+from maexp.agents.suites.suite import RESULTS
 
 # What needs torch is imported where it is used.
-
-RESULTS = "results.json"
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> None:
@@ -87,7 +86,7 @@ def _tell_replaced(path: Path, before: dict, row: dict) -> None:
 def _read_all(cfg: LeaderboardSettings) -> Iterator[dict]:
     """The rows of all places, one by one."""
     from maexp.agents.suites import rows
-    from maexp.agents.suites.folder import read_json
+    from maexp.agents.suites.run_files import read_json
 
     for place in _places(cfg):
         kind = find_kind(place)

@@ -20,7 +20,7 @@ from maexp.envs.importing.bags import is_bag
 from maexp.envs.importing.options import make_options
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map
-from maexp.envs.scenarios import SCENARIOS, make_map
+from maexp.envs.scenarios import GENERATED, SCENARIOS, make_map
 
 UNUSABLE = 1
 FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy .mcap .db3 (rosbag2)"
@@ -42,7 +42,7 @@ def check(cfg: MapsSettings) -> None:
         maps_fetch.check(cfg.file, cfg.mirror)
         return
     if cfg.task == "make" and cfg.file not in SCENARIOS:
-        raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(_generated())}.")
+        raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(GENERATED)}.")
     if cfg.out and Path(cfg.out).exists():
         raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
     if cfg.out and cfg.task == "check" and Path(cfg.out).suffix != ".npz":
@@ -136,10 +136,6 @@ def read_map(cfg: MapsSettings) -> tuple[PointCloudMap, ImportReport | None]:
 def import_options(cfg: MapsSettings) -> dict[str, Any]:
     """The settings of the import."""
     return vars(read(ImportOptions, cfg.importing))
-
-
-def _generated() -> list[str]:
-    return [name for name, one in SCENARIOS.items() if one.build is not None]
 
 
 def print_scenarios() -> None:

@@ -13,9 +13,9 @@ from maexp.agents.files import short, write_text
 from maexp.agents.tables import markdown_table
 from maexp.envs.checker import check_map
 from maexp.envs.importing import draw_import, import_map_with_report
-from maexp.envs.importing.api import GRIDS, POINTS
 from maexp.envs.importing.bags import BAGS, is_bag
 from maexp.envs.importing.clouds import CLOUDS
+from maexp.envs.importing.formats import GRIDS, POINTS
 from maexp.envs.importing.occupancy import find_image
 
 YAMLS = (".yaml", ".yml")

@@ -6,6 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from maexp.agents.command_words import as_list
 from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.driver import DriverSettings, TeamDriver, read_settings
@@ -13,7 +14,6 @@ from maexp.agents.runtime.robot_driver import RobotDriver
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import Ros2Settings
 from maexp.agents.suites.suite import load_suite, suite_names
-from maexp.agents.words import as_list
 
 KEPT = ("place", "seed", "name")
 """Settings of a served suite that `resume` keeps."""

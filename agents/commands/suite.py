@@ -14,14 +14,14 @@ from maexp.agents.progress import Progress
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import SuiteSettings
-from maexp.agents.signals import ended_by_signals
+from maexp.agents.signals import STOPPED, ended_by_signals
 from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.
 
 KEPT = ("place", "policy", "name", "seed", "num_envs", "decision_limit")
 """Settings of a run that `resume` keeps."""
-DIFFERENT, STOPPED = 1, 130
+DIFFERENT = 1
 
 
 def prepare(overrides: list[str]) -> Recipe:
@@ -34,11 +34,11 @@ def prepare_again(overrides: list[str], kept: tuple[str, ...]) -> Recipe:
     place = find_override(overrides, "resume")
     if place is None:
         return Recipe(overrides)
-    from maexp.agents.suites import folder as files
+    from maexp.agents.suites import run_files
 
     if changed := [name for name in (*kept, "hydra.run.dir") if find_override(overrides, name) is not None]:
         raise UserError(f"resume={place} keeps what was played and where: leave {changed[0]} out.")
-    saved = files.read_json(Path(place).expanduser() / files.RUN)["settings"]
+    saved = run_files.read_json(Path(place).expanduser() / run_files.RUN)["settings"]
     if missing := [name for name in kept if name not in saved]:
         raise UserError(f"{place} is no run of this command (it has no {missing[0]}): resume it as it was begun.")
     return Recipe(overrides, values={name: saved[name] for name in kept}, source=place)
@@ -118,19 +118,18 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
         words: that go on with it, as "suite run".
     """
     from maexp.agents.build import pick_device
-    from maexp.agents.suites import folder as files
-    from maexp.agents.suites import report
+    from maexp.agents.suites import report, run_files
     from maexp.agents.suites.run import SuiteRun
 
     seed = settings["seed"]
     with blame_input():
         device = pick_device(device)
     with lock(where, f"maexp {words.split()[0]}"):
-        if (where / files.RUN).exists():
+        if (where / run_files.RUN).exists():
             _check_same_suite(where, suite)
         else:
-            content = {"format": files.FORMAT, "suite": files.describe_suite(suite, seed), "settings": settings}
-            write_text(where / files.RUN, files.dump(content) + "\n")
+            content = {"format": run_files.FORMAT, "suite": run_files.describe_suite(suite, seed), "settings": settings}
+            write_text(where / run_files.RUN, run_files.dump(content) + "\n")
         try:
             total = len(suite.parts) * suite.episodes
             with ended_by_signals(), Progress(f"{player.name} on {suite.name}", total) as progress:
@@ -146,15 +145,15 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
         for sentence in report.describe_results(suite, results):
             print(sentence)
         report.draw_profiles(suite, results, where / "profile.png")
-    print(f"Written to {short(where)}: {files.RESULTS}, {files.ACTIONS}/, profile.png, {files.RUN}")
+    print(f"Written to {short(where)}: {run_files.RESULTS}, {run_files.ACTIONS}/, profile.png, {run_files.RUN}")
     print(f"Next: {command('suite', 'verify', short(where))}")
     return 0
 
 
 def _check_same_suite(where: Path, suite: Suite) -> None:
-    from maexp.agents.suites import folder as files
+    from maexp.agents.suites import run_files
 
-    before = files.read_json(where / files.RUN)["suite"]
+    before = run_files.read_json(where / run_files.RUN)["suite"]
     if before["checksum"] != suite.checksum:
         raise UserError(
             f"{short(where)} was begun with version {before['version']} of {suite.name} (checksum "
@@ -182,12 +181,11 @@ def _verify(cfg: SuiteSettings, where: None) -> int:
 
 
 def _freeze(cfg: SuiteSettings, where: None) -> int:
-    from maexp.agents.suites import folder as files
-    from maexp.agents.suites import report
+    from maexp.agents.suites import report, run_files
     from maexp.agents.suites.frozen import freeze
 
     suite = load_suite(cfg.place)
-    made = files.describe_code() | {"machine": files.describe_machine(), "date": time.strftime("%Y-%m-%d")}
+    made = run_files.describe_code() | {"machine": run_files.describe_machine(), "date": time.strftime("%Y-%m-%d")}
     with Progress(f"random and {suite.reference} on {suite.name}", 2 * len(suite.parts) * suite.episodes) as progress:
         with blame_input():
             frozen = freeze(suite, made, progress.advance)

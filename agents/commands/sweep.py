@@ -25,12 +25,12 @@ from maexp.agents.settings.overrides import find_override, find_sweeps, quote, s
 from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.schema import register_schema
 from maexp.agents.settings.verbs import TrainSettings
+from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import list_checkpoints
 
 SWEEP, FORMAT = "sweep.json", "maexp-sweep-1"
 DONE = "done"
 """In the folder of a run that has come to its end."""
-STOPPED = 130
 
 
 def run_sweep(verb: str, overrides: list[str]) -> int:

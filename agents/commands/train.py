@@ -20,22 +20,20 @@ from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import TrainSettings
+from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, starts_as, warm_start
 from maexp.agents.training.logs import check_logger, log_results
 from maexp.agents.training.named import NamedPolicy, find_players, suit_observation
+from maexp.agents.training.prepare import check_collector, check_expert, describe_workers
 from maexp.agents.training.train import (
     TrainingRun,
-    check_collector,
-    check_expert,
-    describe_workers,
     train,
     write_config,
 )
 from maexp.agents.training.validation import judged
 from maexp.envs import ExplorationEnv
 
-STOPPED = 130
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
 

@@ -24,7 +24,7 @@ from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS
 from maexp.envs.viewing import show
 from maexp.envs.viewing.episode import Episode
-from maexp.envs.viewing.scene import Stage
+from maexp.envs.viewing.stage import Stage
 
 CUT_SHARE = 0.06  # walls of an episode's picture are cut here, a share of the map's longer side: robots stay in sight
 ENDINGS = (".png", ".html")

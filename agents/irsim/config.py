@@ -53,7 +53,3 @@ class TrialConfig:
                 raise ValueError(f"{one.name}={value!r} must be a finite number, {least}")
         if self.beams < 8 or self.beams > 3600:
             raise ValueError(f"beams={self.beams} must be 8 to 3600")
-
-
-DT = 0.1
-"""Seconds of a step, as in our simulator."""

@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
-from .config import DT, TrialConfig
+from maexp.kernels.constants import DT
+
+from .config import TrialConfig
 from .odometry import wrapped
 from .simulator import Scan
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
+from maexp.kernels.constants import DT
 
-from .config import DT, TrialConfig
+from .config import TrialConfig
 
 
 def make_team(world: PointCloudMap, num_robots: int, config: TrialConfig, targets: int = 0) -> ExplorationEnv:

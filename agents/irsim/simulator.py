@@ -13,7 +13,9 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from .config import DT, TrialConfig
+from maexp.kernels.constants import DT
+
+from .config import TrialConfig
 from .floor import FloorCells
 from .people import PERSON_RADIUS, PERSON_SPEED, Walkers
 

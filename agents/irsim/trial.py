@@ -9,14 +9,16 @@ import numpy as np
 
 from maexp.agents.runtime import TeamPlanner
 from maexp.envs import PointCloudMap
+from maexp.kernels.constants import DT
 
-from .config import DT, TrialConfig
+from .config import TrialConfig
 from .coverage import Coverage, map_errors
 from .floor import make_floor
 from .follower import Follower
 from .mapping import TeamGrid
 from .odometry import Odometry
 from .simulator import Simulator
+from .trial_planners import ForeignTeam
 
 BORDER = 3.0  # [m] of the team's grid around the floor, for beliefs that drift
 
@@ -61,7 +63,7 @@ class FilmFrame:
 
 def run_trial(
     world: PointCloudMap,
-    policy: str | TeamPlanner,
+    planner: TeamPlanner | ForeignTeam,
     starts: np.ndarray,
     config: TrialConfig,
     watch: Callable[[FilmFrame], None] | None = None,
@@ -70,26 +72,13 @@ def run_trial(
 
     Args:
         world: a floor.
-        policy: a name or folder that `TeamPlanner` knows, or who plans as one does.
+        planner: who plans for the team, `maexp.agents.irsim.trial_planners.make_planner`.
         starts: x, y [m] and heading [rad].
         config: the team and what disturbs it.
         watch: called at every decision.
     """
     floor = make_floor(world)
     simulator = Simulator(floor, starts, config)
-    planner = (
-        policy
-        if not isinstance(policy, str)
-        else TeamPlanner(
-            policy,
-            radar_range=config.radar_range,
-            robot_radius=config.clearance,
-            seed=config.seed,
-            max_speed=config.max_speed,
-            max_accel=config.max_accel,
-            seconds=config.decide,
-        )
-    )
     rng = np.random.default_rng([config.seed, 11])
     alive = np.ones(len(starts), bool)  # a bumper tells who has collided: the others take it for an obstacle
     odometry = Odometry(simulator.poses, config.pose_noise, config.pose_drift, rng)

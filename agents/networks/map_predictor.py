@@ -16,12 +16,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-FREE, OBSTACLE = 1, 2  # of `maexp.kernels.frontier`, which needs Warp; unknown is 0
+from maexp.agents.runtime.folder import WEIGHTS
+from maexp.kernels.constants import FREE, OBSTACLE
+
 PATCH = 2  # cells along a side that the network looks at as one place
 LEVELS = 4
 STRIDE = PATCH * 2 ** (LEVELS - 1)  # grids are filled up with unknown ground to multiples of so many cells
 PREDICTORS = Path(__file__).resolve().parents[1] / "predictors"
-WEIGHTS, NETWORK, CONTRACT, CARD = "weights.safetensors", "predictor.onnx", "predictor.json", "card.md"
+NETWORK, CONTRACT = "predictor.onnx", "predictor.json"
 
 
 class Layer(nn.Module):

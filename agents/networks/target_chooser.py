@@ -23,7 +23,7 @@ TELLS = feature_names(radio=True).index("tells")
 UNKNOWN_FAR, PLAN_GAP = (FEATURES.index(name) for name in ("unknown_far", "plan_gap"))
 NEARNESS = FEATURES.index("nearness")  # above 0 for every target
 OUTPUT_GAIN = 10.0  # of the logits: with 1, Adam's small steps would take too long to overrule a score
-NEVER = -1e9  # logit of what cannot be chosen
+NEVER = -1e9  # logit or preference of what cannot be chosen, where numbers must be finite
 PART = 96  # teams that are learned from together
 COUNT = 10.0  # candidates that sums are measured in
 

@@ -45,7 +45,7 @@ class FrontierPlanner:
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Region [E, N] and offset [E, N, 2] of `goals`; the argument only ties the policy to an observation."""
-        return to_regions(self.tracker.env, self.goals())
+        return to_regions(self.tracker.env.simulation, self.goals())
 
     @torch.no_grad()
     def goals(self) -> torch.Tensor:

@@ -21,7 +21,7 @@ from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
 from maexp.envs.features import RADIO_TABLE, TABLE, feature_names
 from maexp.envs.scenarios import Scenario, find_scenario
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 OPSET = 18
 MOST = {"batch": 4096, "robots": 64, "candidates": 1024}

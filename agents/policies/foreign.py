@@ -40,8 +40,8 @@ from maexp.agents.policies.classical import as_module
 from maexp.envs import ExplorationEnv
 from maexp.envs.navigation import known_grids
 from maexp.envs.regions import to_regions
+from maexp.kernels.constants import DT
 from maexp.kernels.launches import finish_filling, launch_on
-from maexp.kernels.types import DT
 
 LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib"))
 VALUES = np.array([-1, 0, 100], np.int8)
@@ -143,7 +143,7 @@ class TeamSight:
         """
         points = torch.from_numpy(np.asarray(goals, np.float32)).to(self.env.device)
         own = self.env.simulation.believed["center"][..., :2]
-        return to_regions(self.env, torch.where(points.isnan().any(-1, keepdim=True), own, points))
+        return to_regions(self.env.simulation, torch.where(points.isnan().any(-1, keepdim=True), own, points))
 
 
 def _largest(values: torch.Tensor) -> float:

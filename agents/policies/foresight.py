@@ -21,8 +21,7 @@ from maexp.agents.runtime.team import Team
 from maexp.envs.config import LookaheadConfig, RobotConfig
 from maexp.envs.features import drive_until_next
 from maexp.envs.grid_team import GridTeam, room_for
-from maexp.kernels.constants import OBSTACLE, UNKNOWN
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT, OBSTACLE, UNKNOWN
 
 AHEAD = 1.6  # radar ranges that a robot could drive in an imagined decision, at least: nearer, nothing new is seen
 MOST_STEPS = 300  # local steps of such a decision, unless more are asked for

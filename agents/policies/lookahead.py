@@ -16,12 +16,12 @@ from maexp.agents.policies.rollouts import (
     Rollouts,
     branches_of,
     check_rollout_policy,
-    pick_places,
     search_in_turn,
 )
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.choices import Array, Scene, value_targets
+from maexp.envs.target_view import pick_places
 from maexp.envs.targets import TensorScene
 
 

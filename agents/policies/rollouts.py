@@ -16,6 +16,7 @@ from maexp.agents.runtime.shipped import shipped_names
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.belief import Beliefs, Guess, guess_nearest
 from maexp.envs.branches import Branches
+from maexp.envs.target_view import pick_places
 from maexp.envs.targets import TargetTracker
 
 ROLLOUT_POLICY = "lookahead.rollout_policy"
@@ -214,11 +215,6 @@ def pick_tried(offered: torch.Tensor, tried: torch.Tensor) -> torch.Tensor:
     """What branches try, [T * K, N, ...], of what robots are offered, [T, N, K, ...]; `tried` int64 [T, K, N]."""
     rows, robots = torch.arange(len(tried), device=tried.device), torch.arange(tried.shape[2], device=tried.device)
     return offered[rows.view(-1, 1, 1), robots, tried].flatten(0, 1)
-
-
-def pick_places(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Entries [E, N, M, 2] of [E, N, T, 2]; `index` int64 [E, N, M]."""
-    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))
 
 
 def check_rollout_policy(config: LookaheadConfig) -> None:

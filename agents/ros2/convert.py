@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from maexp.agents.irsim.floor import FloorCells
-from maexp.agents.ros2.messages import CLASSES
-from maexp.agents.runtime.frames import NOWHERE, OccupancyGrid, Pose, fill_grid, fill_pose, fill_turn
+from maexp.agents.ros2.ros_types import CLASSES
+from maexp.agents.runtime.frames import NOWHERE, OccupancyGrid, Pose, fill_grid, fill_pose
+from maexp.envs.quaternions import fill_turn
 
 SECOND = 10**9
 BEAMS = 360

@@ -22,7 +22,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from maexp.agents.ros2.messages import CLASSES, NAVIGATE
+from maexp.agents.ros2.ros_types import CLASSES, NAVIGATE
 
 BLOCKING = 0.1  # seconds that a write may wait for slow readers
 MOST = 1_000  # messages taken at once

@@ -32,10 +32,10 @@ from maexp.agents.ros2.convert import (
     transform,
 )
 from maexp.agents.ros2.dds import EPISODE, Wire
-from maexp.agents.ros2.goals import ABORTED, SUCCEEDED, NavigationServer
+from maexp.agents.ros2.goal_sending import ABORTED, SUCCEEDED, NavigationServer
 from maexp.agents.runtime.frames import Pose
 from maexp.envs import ExplorationEnv, ObservationConfig
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 TICK = round(DT * SECOND)
 LOOKS = 2  # ticks between two scans

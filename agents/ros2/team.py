@@ -14,7 +14,7 @@ import numpy as np
 from maexp.agents.errors import UserError
 from maexp.agents.ros2.convert import SECOND, read_nanoseconds
 from maexp.agents.ros2.dds import EPISODE, Wire
-from maexp.agents.ros2.goals import SENDERS
+from maexp.agents.ros2.goal_sending import SENDERS
 from maexp.agents.runtime.driver import Decision, TeamDriver
 
 POLL = 0.1  # seconds between two looks where nothing comes

@@ -34,9 +34,9 @@ def read_floor(path: str | Path, cell: float) -> tuple[np.ndarray, float]:
     """
     try:
         from maexp.envs.importing.grid import FREE as OPEN  # late: robots have neither PyYAML nor Pillow
+        from maexp.envs.importing.import_report import ImportReport
         from maexp.envs.importing.occupancy import read_occupancy
         from maexp.envs.importing.options import ImportOptions
-        from maexp.envs.importing.report import ImportReport
     except ImportError as error:
         raise ValueError(f"{path} is read with PyYAML and Pillow: pip install pyyaml pillow ({error})") from None
     grid = read_occupancy(Path(path), ImportOptions(), ImportReport(str(path)))

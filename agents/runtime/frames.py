@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from maexp.envs.quaternions import fill_turn, read_yaw
+
 Pose = tuple[float, float, float]
 """x, y [m] and yaw [rad]."""
 NOWHERE: Pose = (0.0, 0.0, 0.0)
@@ -59,11 +61,6 @@ def read_time(stamp) -> float:
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
-def read_yaw(turn) -> float:
-    """Angle about z [rad] of a geometry_msgs/Quaternion."""
-    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
-
-
 def read_pose(pose) -> Pose:
     """Of a geometry_msgs/Pose."""
     return pose.position.x, pose.position.y, read_yaw(pose.orientation)
@@ -73,11 +70,6 @@ def fill_pose(pose, x: float, y: float, yaw: float) -> None:
     """Writes a place into a geometry_msgs/Pose."""
     pose.position.x, pose.position.y, pose.position.z = float(x), float(y), 0.0
     fill_turn(pose.orientation, yaw)
-
-
-def fill_turn(turn, yaw: float) -> None:
-    """Writes an angle about z [rad] into a geometry_msgs/Quaternion."""
-    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
 
 
 def compose(pose: Pose, inner: Pose) -> Pose:

@@ -9,11 +9,12 @@ from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from maexp.envs.config.robot import ROBOT_KINDS
+from maexp.envs.config.robot import ROBOT_KINDS, RobotKind
+from maexp.envs.config.targets import SPARE, Spare
 from maexp.kernels.constants import FREE, UNREACHED
 
 from .choices import CHOICES
@@ -30,7 +31,6 @@ from .team import Team, read_team
 from .watch import Watch
 from .ways import snap, trace_from
 
-SPARE = ("wait", "home")
 LOG = logging.getLogger("maexp.runtime")
 DEFAULTS = Contract("", 1, radar_range=5.0, robot_radius=0.3, motion=Motion(1.0, 1.0, 1.0))
 
@@ -107,10 +107,10 @@ class TeamPlanner:
         max_accel: float | None = None,
         seconds: float | None = None,
         distinct: bool = True,
-        spare: Literal["wait", "home"] = "wait",
+        spare: Spare = "wait",
         seed: int = 0,
         lookahead: Any = None,
-        drive: Literal["differential", "omnidirectional", "ackermann"] = "differential",
+        drive: RobotKind = "differential",
         deadline: float | None = None,
         comm: Any = None,
         time_limit: float | None = None,

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Literal
 
+from maexp.envs.config.env import Knower
 from maexp.envs.fields import check_settings, replaced, setting
 
 
@@ -119,7 +120,7 @@ class ExpertSettings(AlgorithmSettings):
         4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
     )
     branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
-    learn_from: Literal["union", "base", "everyone"] = setting(
+    learn_from: Knower = setting(
         "union",
         "whose knowledge a branch is worth: the team's, the base station's, or that of the robot that knows least",
     )

@@ -16,7 +16,7 @@ from maexp.agents.speed.shared import describe_point, spread, sweep_points, writ
 from maexp.agents.tables import print_table
 from maexp.agents.training.checkpoint import seed_everything
 from maexp.agents.training.collect import Stopwatch, TeamCollector, make_collector
-from maexp.agents.training.train import make_actor
+from maexp.agents.training.prepare import make_actor
 from maexp.envs import ExplorationEnv
 
 TEAM_SIZES = [3]

@@ -14,6 +14,7 @@ from maexp.agents.suites.suite import Part, Suite
 from maexp.agents.tables import NONE, brackets, fixed, markdown_table, print_table
 from maexp.envs.config import CommConfig
 from maexp.envs.metrics import label_copies
+from maexp.kernels.constants import DT
 
 COLUMNS = ("part", "score", "95 % interval", RANDOM, "reference", "between", "less reference", "95 % at", "lost")
 
@@ -36,7 +37,7 @@ def describe_suite(suite: Suite) -> list[str]:
         if part.fetched:
             maps = f"{part.fetched}: {', '.join(part.map_names())}"
         robots = f"{part.num_robots} {part.robot['kind']}, {part.robot['max_speed']:g} m/s"
-        seconds = f"{0.1 * part.limit:g}, a decision every {0.1 * part.local_steps:g}"
+        seconds = f"{DT * part.limit:g}, a decision every {DT * part.local_steps:g}"
         rows.append([name, maps, robots, f"{part.radar['range']:g}", part.starts, seconds])
         rows[-1] += [radios[name] or "everyone", f"{part.success_coverage:.0%} of {part.done}"] * any(radios.values())
     return [*lines, "", *markdown_table(heads, rows), "", *_describe_sources(suite), f"File: {suite.path}"]
@@ -74,7 +75,7 @@ def print_results(suite: Suite, results: dict[str, Any]) -> None:
 
 def _more(part: dict) -> list[str]:
     steps = part.get("coverage_step_95", {"n": 0})
-    when = f"{0.1 * steps['mean']:.1f} s ({steps['n']})" if steps["n"] else NONE
+    when = f"{DT * steps['mean']:.1f} s ({steps['n']})" if steps["n"] else NONE
     return [when, f"{part['collisions']['mean']:.2f}" if "collisions" in part else ""]
 
 

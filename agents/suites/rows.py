@@ -13,12 +13,13 @@ import numpy as np
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.films import play_teams
 from maexp.agents.files import short, write_text
-from maexp.agents.suites import folder
+from maexp.agents.suites import run_files
 from maexp.agents.suites.play import Replay, build_maps, build_replay
 from maexp.agents.suites.suite import Suite, load_suite
 from maexp.agents.suites.verify import verify
 from maexp.envs.metrics import label_copies
 from maexp.envs.viewing.episode import Episode
+from maexp.kernels.constants import DT
 
 FORMAT = "maexp-leaderboard-row-1"
 KEPT = ("suite", "policy", "score", "random", "reference", "decisions", "run")
@@ -60,7 +61,7 @@ def make_row(
     Raises:
         UserError: it is damaged, not of the suite's own maps, or not what it says.
     """
-    results = folder.read_json(where / folder.RESULTS)
+    results = run_files.read_json(where / run_files.RESULTS)
     if check:
         _check_verified(where, verify(where, file, advance))
     suite = load_suite(file or str(results["suite"]["name"]))
@@ -97,13 +98,13 @@ def _describe_part(suite: Suite, part: str, summary: dict, results: dict) -> dic
         "episodes": episodes[score],
         "copies": label_copies(np.array(episodes["map"]), values).tolist(),
         "lost": len(episodes["lost"]),
-        "seconds": 0.1 * suite.parts[part].limit,
+        "seconds": DT * suite.parts[part].limit,
     }
 
 
 def make_film(suite: Suite, part: str, where: Path) -> dict[str, Any]:
     """The first episode of a part as a page can show it."""
-    noted = folder.read_batch(where, suite, part, 0)
+    noted = run_files.read_batch(where, suite, part, 0)
     known = suite.parts[part]
     env = build_replay(known, build_maps(known), 1, suite.seed)
     every = max(1, known.limit // FRAMES)
@@ -155,7 +156,7 @@ def _plain(name: str) -> str:
 def write_row(where: Path, row: dict[str, Any]) -> Path:
     """Write a row into a leaderboard; one of the same name is replaced."""
     path = where / file_of(row)
-    write_text(path, folder.dump(row) + "\n")
+    write_text(path, run_files.dump(row) + "\n")
     return path
 
 

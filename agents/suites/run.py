@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.suites import folder
+from maexp.agents.suites import run_files
 from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
 from maexp.agents.suites.play import Batch, build_env, build_maps, play_batch
 from maexp.agents.suites.players import Player
@@ -46,26 +46,26 @@ class SuiteRun:
             batches[name], points[name] = self._play_part(name)
         with blame_input():
             rivals = read_frozen(self.suite) if self.seed is None else play_rivals(self.suite, self.seed)["results"]
-        summary = summarise_suite(self.suite, folder.to_results(self.player.name, self.suite, batches), rivals)
-        code = folder.describe_code()
+        summary = summarise_suite(self.suite, run_files.to_results(self.player.name, self.suite, batches), rivals)
+        code = run_files.describe_code()
         content = {
-            "format": folder.FORMAT,
-            "suite": folder.describe_suite(self.suite, self.seed),
+            "format": run_files.FORMAT,
+            "suite": run_files.describe_suite(self.suite, self.seed),
             "policy": self.player.name,
             **summary,
-            "decisions": folder.describe_decisions(batches),
-            "episodes": folder.describe_episodes(self.suite, batches),
+            "decisions": run_files.describe_decisions(batches),
+            "episodes": run_files.describe_episodes(self.suite, batches),
             "maps": points,
-            "files": folder.list_files(self.where),
+            "files": run_files.list_files(self.where),
             "run": {
                 "policy": self.player.word,
                 **code,
-                "machine": folder.describe_machine(),
+                "machine": run_files.describe_machine(),
                 "device": str(self.device),
                 "seconds": round(time.perf_counter() - begin, 1),
             },
         }
-        folder.write_results(self.where, content)
+        run_files.write_results(self.where, content)
         return content
 
     def _play_part(self, name: str) -> tuple[list[Batch], dict[str, str]]:
@@ -79,7 +79,7 @@ class SuiteRun:
         played, env = [], None
         with ExitStack() as stack:
             for first in range(0, suite.episodes, size):
-                if folder.batch_file(self.where, name, first).exists():
+                if run_files.batch_file(self.where, name, first).exists():
                     played.append(self._read(name, first))
                 else:
                     if env is None:
@@ -89,7 +89,7 @@ class SuiteRun:
                             )
                             policy = stack.enter_context(self.player.open(env))
                     played.append(play_batch(suite, env, policy, first))
-                    folder.write_batch(self.where, suite, name, played[-1])
+                    run_files.write_batch(self.where, suite, name, played[-1])
                     self._tell_lost(name, played[-1])
                 self.advance(len(played[-1].decisions))
         return played, sums(part, maps, self.seed)
@@ -103,6 +103,6 @@ class SuiteRun:
     def _read(self, name: str, first: int) -> Batch:
         """A batch that was played before."""
         try:
-            return folder.read_batch(self.where, self.suite, name, first)
+            return run_files.read_batch(self.where, self.suite, name, first)
         except UserError as error:
             raise UserError(f"{str(error).rstrip('.')}: remove it, and it is played again.") from error

@@ -40,6 +40,8 @@ PART_KEYS = (
     "planner",
     "comm",
 )
+RESULTS = "results.json"
+"""In the folder of a run that is complete."""
 SCORE = "score"
 """What counts in each part, as if it were a metric, where parts have different scores."""
 OTHER_MAPS = 10_000, 2**31

@@ -9,7 +9,7 @@ import numpy as np
 
 from maexp.agents.errors import UserError
 from maexp.agents.map_sets import MapsError
-from maexp.agents.suites import folder
+from maexp.agents.suites import run_files
 from maexp.agents.suites.frozen import check_maps, play_rivals, read_frozen, sums
 from maexp.agents.suites.play import Batch, build_maps, build_replay, replay_batch
 from maexp.agents.suites.score import summarise_suite
@@ -41,41 +41,41 @@ def verify(where: Path, file: str | None = None, advance: Callable[[int], None] 
     found = Findings()
     report: dict[str, Any] = {"folder": str(where)}
     try:
-        stated = folder.read_json(where / folder.RESULTS)
+        stated = run_files.read_json(where / run_files.RESULTS)
         suite = load_suite(file or str(stated["suite"]["name"]))
         report |= {name: stated[name] for name in ("suite", "policy")}
         same = {name: stated["run"]["machine"][name] for name in ("platform", "processor")}
-        now = folder.describe_machine()
+        now = run_files.describe_machine()
         report["same_platform"] = all(now[name] == one for name, one in same.items())
-        report["same_versions"] = folder.describe_code()["versions"] == stated["run"]["versions"]
+        report["same_versions"] = run_files.describe_code()["versions"] == stated["run"]["versions"]
         if _same_suite(suite, stated["suite"], found):
             _check_files(where, stated["files"], found)
             _check_numbers(where, suite, stated, found, advance)
     except MapsError:
         raise  # that says nothing about the folder
     except UserError as error:
-        found.add(folder.RESULTS, str(error))
+        found.add(run_files.RESULTS, str(error))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        found.add(folder.RESULTS, f"an entry is missing or of another kind ({type(error).__name__}: {error})")
+        found.add(run_files.RESULTS, f"an entry is missing or of another kind ({type(error).__name__}: {error})")
     return report | {"verified": not found, "differences": list(found[:FEW]), "number_of_differences": len(found)}
 
 
 def _same_suite(suite: Suite, stated: dict, found: Findings) -> bool:
     suite.check()
-    now = folder.describe_suite(suite, None)
+    now = run_files.describe_suite(suite, None)
     for name in ("version", "checksum"):
         if stated[name] != now[name]:
             why = f"suite.{name}: played with another version of {suite.name}"
-            found.add(folder.RESULTS, why, stated[name], now[name])
+            found.add(run_files.RESULTS, why, stated[name], now[name])
             return False
     if stated["frozen_maps"] and stated["seed"] != suite.seed:
-        found.add(folder.RESULTS, "suite.seed", stated["seed"], suite.seed)
+        found.add(run_files.RESULTS, "suite.seed", stated["seed"], suite.seed)
     return True
 
 
 def _check_files(where: Path, stated: dict[str, str], found: Findings) -> None:
     """Every file is there and as it was written, and no other."""
-    there = folder.list_files(where)
+    there = run_files.list_files(where)
     for name in sorted({*stated, *there}):
         if stated.get(name) != there.get(name):
             told = "the file was changed" if name in stated and name in there else "the file is not in both"
@@ -94,12 +94,12 @@ def _check_numbers(where: Path, suite: Suite, stated: dict, found: Findings, adv
     for name in stated["files"]:
         if name not in played:
             found.add(name, "no episode of the suite is in it")
-    compare(found, folder.RESULTS, "episodes", stated["episodes"], folder.describe_episodes(suite, batches), 0.0)
+    compare(found, run_files.RESULTS, "episodes", stated["episodes"], run_files.describe_episodes(suite, batches), 0.0)
     rivals = read_frozen(suite) if seed is None else play_rivals(suite, seed)["results"]
-    summary = summarise_suite(suite, folder.to_results(stated["policy"], suite, batches), rivals)
-    summary["decisions"] = folder.describe_decisions(batches)
+    summary = summarise_suite(suite, run_files.to_results(stated["policy"], suite, batches), rivals)
+    summary["decisions"] = run_files.describe_decisions(batches)
     for key, value in summary.items():
-        compare(found, folder.RESULTS, key, stated[key], value, CLOSE)
+        compare(found, run_files.RESULTS, key, stated[key], value, CLOSE)
 
 
 def _replay_part(
@@ -109,13 +109,13 @@ def _replay_part(
     maps = build_maps(part, seed)
     if seed is None or part.fetched:
         check_maps(suite, part, maps)
-    compare(found, folder.RESULTS, f"maps.{name}", stated["maps"][name], sums(part, maps, seed), 0.0)
+    compare(found, run_files.RESULTS, f"maps.{name}", stated["maps"][name], sums(part, maps, seed), 0.0)
     played, first, env = [], 0, None
     while first < suite.episodes:
         try:
-            noted = folder.read_batch(where, suite, name, first)
+            noted = run_files.read_batch(where, suite, name, first)
         except UserError as error:
-            found.add(str(folder.batch_file(where, name, first).relative_to(where)), str(error))
+            found.add(str(run_files.batch_file(where, name, first).relative_to(where)), str(error))
             return played
         count = len(noted.decisions)
         if first + count > suite.episodes:
@@ -134,7 +134,7 @@ def _replay_part(
 
 def _name_of(where: Path, part: str, batch: Batch) -> str:
     """The file of a batch, as `results.json` names it."""
-    return str(folder.batch_file(where, part, batch.first).relative_to(where))
+    return str(run_files.batch_file(where, part, batch.first).relative_to(where))
 
 
 def _compare_batches(where: Path, noted: Batch, again: Batch, part: str, found: Findings) -> None:

@@ -29,20 +29,18 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
 from maexp.agents.networks.actor import PREFERENCE, TARGETS, TARGETS_MASK
 from maexp.agents.networks.distributions import ACTION
+from maexp.agents.networks.target_chooser import NEVER, SCORE, TRAVEL
 from maexp.agents.policies.lookahead import list_candidates
-from maexp.agents.policies.rollouts import Rollouts, branches_of, pick_places
+from maexp.agents.policies.rollouts import Rollouts, branches_of
 from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.training.told import ToldRollouts
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
-from maexp.envs.features import FEATURES
 from maexp.envs.fields import check_settings, setting
-from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, find_scenario, split
+from maexp.envs.scenarios import GENERATED, cut_last_fifth, find_scenario, split
+from maexp.envs.target_view import pick_places
 
 SHOWN = 24  # candidates that a policy sees
 DEPARTURE = 0.3  # random part of what a departing robot thinks of candidates [radar discs]
-NEVER = -1e9  # stands for what there is not, where numbers must be finite
-GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
-SCORE, TRAVEL = FEATURES.index("score"), FEATURES.index("travel")
 
 
 @dataclass(frozen=True)

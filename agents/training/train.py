@@ -1,7 +1,6 @@
 """The training loop: collect, learn, log, keep; then evaluate beside others."""
 
 import math
-import signal
 import time
 import warnings
 from collections.abc import Iterator
@@ -11,34 +10,25 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
-
 from maexp.agents.build import (
     Learner,
     MapSuite,
-    choose_device,
     load_maps,
-    make_env,
-    make_learner,
-    other_scenarios,
-    set_steps,
 )
 from maexp.agents.checksums import changed_maps, checksums
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import command, short, write_text
-from maexp.agents.memory import check_batch_memory
 from maexp.agents.networks.weights import load_matching
 from maexp.agents.progress import Progress
-from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.env import find_followers
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.overrides import without
-from maexp.agents.settings.resolved import algorithm_settings, model_settings, resolve, to_yaml
+from maexp.agents.settings.resolved import model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.verbs import TrainSettings
+from maexp.agents.signals import stop_on_signals
 from maexp.agents.tables import brackets
 from maexp.agents.training.checkpoint import (
     check_action,
@@ -48,14 +38,13 @@ from maexp.agents.training.checkpoint import (
     seed_everything,
     set_random_state,
 )
-from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics, divide_teams, make_collector
+from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics
 from maexp.agents.training.logs import MetricsLog
+from maexp.agents.training.prepare import describe_teams, describe_workers, make_both
 from maexp.agents.training.validation import COLUMNS, ENDS, Validation, judged
 from maexp.agents.versions import find_commit
-from maexp.envs import ExplorationEnv, PointCloudMap
 
 CONFIG = "config.yaml"
-BACKENDS = ("single", "processes", "ray")
 
 
 def train(run: "TrainingRun") -> None:
@@ -325,106 +314,6 @@ class TrainingRun:
         )
 
 
-def make_both(
-    cfg: TrainSettings, maps: list[PointCloudMap], words: TrainSettings | None = None
-) -> tuple[Learner, Experience]:
-    """The networks that learn and what gathers their experience, each on its device.
-
-    Args:
-        cfg: the settings
-        maps: those of the first scenario
-        words: the settings that the run's own words come to, where `cfg` holds values of a checkpoint too
-
-    Raises:
-        UserError, ValueError: settings that cannot be used.
-    """
-    check_collector(cfg.collector)
-    alone, workers = cfg.collector.backend == "single", cfg.collector.workers
-    here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
-    words = cfg if words is None else words
-    others = other_scenarios(cfg, words)
-    if others and not alone:
-        raise UserError(f"scenario.also={list(cfg.scenario.also)} needs collector=single.")
-    places = [(cfg, maps), *((one, load_maps(one.scenario).train) for one in others)]
-    sizes = team_sizes(cfg.num_robots)
-    teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
-    whole = words.collector.steps is None  # episodes, which differ in length from scenario to scenario
-    envs = [
-        make_env(
-            *places[k // len(sizes)],
-            one.num_robots,
-            one.num_envs if alone else 1,
-            device=here if alone else there,
-            first_env=one.first_env,
-        )
-        for k, one in enumerate(teams)
-    ]
-    set_steps(cfg, envs[0])
-    steps = [env.macro_steps if whole else cfg.collector.steps for env in envs]
-    for env, one, length in zip(envs, teams, steps, strict=True):
-        check_batch_memory(env, length, one.num_envs)
-    like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
-    learner = make_learner(cfg, like)
-    if alone:
-        actors = [make_actor(cfg, learner.policy, env) for env in envs]
-        pairs = zip(envs, actors, steps, strict=True)
-        return learner, Experience([make_collector(env, actor, length, there) for env, actor, length in pairs])
-    from maexp.agents.training.workers import make_workers  # here: most runs have none
-
-    return learner, make_workers(cfg, maps, teams, learner.policy)
-
-
-def make_actor(cfg: TrainSettings, policy: TensorDictModuleBase, env: ExplorationEnv) -> TensorDictModuleBase:
-    """What acts in the training episodes of an env: the policy, with what the algorithm does besides."""
-    settings = algorithm_settings(cfg)
-    if not isinstance(settings, ExpertSettings):
-        return policy
-    from maexp.agents.training.branching import BranchingActor  # builds on the planners
-
-    return BranchingActor(policy, env, settings)
-
-
-def check_expert(cfg: TrainSettings) -> None:
-    """Raise UserError for settings that expert iteration cannot work with."""
-    if cfg.algorithm.name != "expert_iteration":
-        return
-    if model_settings(cfg).action != "targets" or cfg.planner.name == "direct":
-        raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
-    if cfg.tuning == "reference":
-        raise UserError("tuning=reference: the original platform has no algorithm=expert_iteration. Leave tuning out.")
-    if cfg.collector.backend != "single":
-        raise UserError(
-            f"algorithm=expert_iteration plays its branches where it acts: it needs collector=single, not "
-            f"collector={cfg.collector.backend}."
-        )
-
-
-def check_collector(settings: DictConfig) -> None:
-    """Raise UserError for settings of `collector` that do not go together."""
-    if settings.backend not in BACKENDS:
-        raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
-    if settings.backend == "single":
-        for name, default in (("workers", 1), ("overlap", False)):
-            if settings[name] != default:
-                raise UserError(f"collector.{name}={settings[name]} needs collector=processes or collector=ray.")
-    if settings.ray_address is not None and settings.backend != "ray":
-        raise UserError(f"collector.ray_address={settings.ray_address} needs collector=ray.")
-
-
-def describe_teams(cfg: TrainSettings) -> str:
-    """The settings that choose a run's teams, as they are written on the command line."""
-    return f"num_envs={cfg.num_envs} num_robots={','.join(map(str, team_sizes(cfg.num_robots)))}"
-
-
-def describe_workers(cfg: TrainSettings) -> str:
-    """Which processes simulate, for messages and to tell whether a checkpoint's state fits."""
-    workers, backend = cfg.collector.workers, cfg.collector.backend
-    if backend == "single":
-        return "one process"
-    one, several = {"processes": ("worker process", "worker processes"), "ray": ("Ray worker", "Ray workers")}[backend]
-    return f"{workers} {one if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"
-
-
 @contextmanager
 def name_iteration(run: TrainingRun) -> Iterator[None]:
     """A loss that became NaN or infinite, or a lost worker, ends the run with its name; the checkpoints stay."""
@@ -445,25 +334,6 @@ def ending(experience: Experience) -> Iterator[None]:
         yield
     finally:
         experience.shutdown()
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[list[int]]:
-    """A list that fills on Ctrl-C or SIGTERM, so that the loop can end cleanly; a second one ends at once."""
-    received: list[int] = []
-
-    def handle(number, frame):
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-        print("\nEnding after this iteration, with a checkpoint to go on from; once more ends at once.", flush=True)
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def write_config(settings: dict, folder: Path, verb: str, overrides: list[str], note: str = "", **others: Any) -> None:

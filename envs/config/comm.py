@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from maexp.envs.fields import setting, words_of
-from maexp.kernels.constants import LOSS
+from maexp.kernels.constants import DT, LOSS
 
 from .group import Group
 
 CELL_BYTES = 4  # of a message that tell of a cell: its number and what it is
-STEP = 0.1  # of the simulation [s]
 LONGEST_DELAY = 25.0  # of a message [s]
 CELLS_OF_RADAR = 80  # that IR2's sensor reaches
 
@@ -45,7 +44,7 @@ class CommConfig(Group):
         math.inf,
         "of a radio; what does not fit waits, what it learned first is sent first",
         unit="B/s",
-        low=CELL_BYTES / STEP,
+        low=CELL_BYTES / DT,
         infinite=True,
     )
     delay: float = setting(0.0, "until a message arrives", unit="s", low=0, high=LONGEST_DELAY)
@@ -73,12 +72,12 @@ class CommConfig(Group):
     @property
     def message_cells(self) -> int:
         """Cells that a radio sends in a step."""
-        return int(min(self.bandwidth * STEP / CELL_BYTES + 1e-6, 1e9))
+        return int(min(self.bandwidth * DT / CELL_BYTES + 1e-6, 1e9))
 
     @property
     def message_steps(self) -> int:
         """Steps until a message arrives."""
-        return round(self.delay / STEP)
+        return round(self.delay / DT)
 
     @property
     def has_base(self) -> bool:

@@ -22,6 +22,9 @@ from .targets import TargetsConfig
 if TYPE_CHECKING:
     from maexp.envs.map import PointCloudMap
 
+Knower = Literal["union", "base", "everyone"]
+"""Whose knowledge counts: what the team has seen together, what the base station knows, or what every robot knows that
+has neither collided nor failed."""
 STARTS = ("drawn", "together", "fixed")
 """Where robots start, besides poses that are given: drawn at every reset, each by itself or all beside each other, or
 drawn once for each map and kept."""
@@ -60,7 +63,7 @@ class EnvSettings:
         above=0,
         high=1,
     )
-    done: Literal["union", "base", "everyone"] = setting(
+    done: Knower = setting(
         "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
     )
     num_threads: int | None = setting(None, "CPU threads of the simulation; results do not depend on it")
@@ -108,8 +111,7 @@ GROUPS: dict[str, type[Group]] = {
 }
 """The groups of settings by their names."""
 DONE = words_of(EnvSettings, "done")
-"""Whose coverage ends an episode, numbered as in kernels/radio.py: what the team has seen together, what the base
-station knows, or what every robot knows that has neither collided nor failed."""
+"""Whose coverage ends an episode, numbered as in kernels/radio.py."""
 
 
 def per_robot(what: str, config, kind: type, count: int) -> list:

@@ -9,6 +9,8 @@ from maexp.envs.scenarios import Scenario
 
 from .group import Group
 
+RobotKind = Literal["ackermann", "differential", "omnidirectional"]
+
 BODY = ("length", "width", "collision_threshold")
 """What a radius decides of a robot."""
 
@@ -20,7 +22,7 @@ class RobotConfig(Group):
 
     group = "robot"
 
-    kind: Literal["ackermann", "differential", "omnidirectional"] = setting("ackermann", "how it drives")
+    kind: RobotKind = setting("ackermann", "how it drives")
     length: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_length")
     width: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_width")
     wheelbase: float | Literal["width", "length"] | None = setting(

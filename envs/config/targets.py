@@ -3,9 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from maexp.envs.fields import setting
+from maexp.envs.fields import setting, words_of
 
 from .group import Group
+
+Spare = Literal["wait", "home"]
+"""Where robots go for which no target is left."""
 
 
 @dataclass(frozen=True)
@@ -17,6 +20,9 @@ class TargetsConfig(Group):
     distinct: bool = setting(
         True, "robots that hear each other go to different targets; else each goes where it likes best"
     )
-    spare: Literal["wait", "home"] = setting(
+    spare: Spare = setting(
         "wait", "where robots go for which no target is left: nowhere, or home to where they started"
     )
+
+
+SPARE = words_of(TargetsConfig, "spare")

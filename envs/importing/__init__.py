@@ -7,12 +7,12 @@ from maexp.kernels.lazy import lazy_names
 
 _HOMES = {
     "ImportOptions": "options",
-    "ImportReport": "report",
-    "ImportStep": "report",
+    "ImportReport": "import_report",
+    "ImportStep": "import_report",
     "draw_import": "picture",
-    "export_ros_map": "export",
-    "import_map": "api",
-    "import_map_with_report": "api",
+    "export_ros_map": "map_server_files",
+    "import_map": "formats",
+    "import_map_with_report": "formats",
 }
 __all__ = [
     "ImportOptions",

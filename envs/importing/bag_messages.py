@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
 
 from maexp.envs.map import MapError
+from maexp.envs.quaternions import read_yaw
 
-from .grid import FREE, MAX_CELLS, OBSTACLE, UNKNOWN, Grid
+from .grid import FREE, MAX_CELLS, MAX_ORIGIN, OBSTACLE, UNKNOWN, Grid
 from .options import ImportOptions
 
-MAX_ORIGIN = 1e8  # [m]
 OCCUPIED, FREE_BELOW = 0.65, 0.25  # shares of 100, as nav2's map saver has them
 REALS = {7: "f4", 8: "f8"}  # PointField's codes of float32 and float64
 
@@ -28,7 +27,7 @@ def to_grid(path: Path, message, options: ImportOptions) -> Grid:
     if not 1e-4 <= cell <= 100:
         raise MapError(f"{path}: the grid's resolution={cell:g} must be between 0.0001 and 100 m a cell")
     corner = (float(info.origin.position.x), float(info.origin.position.y))
-    yaw = yaw_of(info.origin.orientation)
+    yaw = read_yaw(info.origin.orientation)
     if not all(abs(one) <= MAX_ORIGIN for one in (*corner, yaw)):
         raise MapError(f"{path}: the grid's origin={corner} with yaw {yaw:g} is no place; record it again")
     occupied = OCCUPIED if options.occupied_threshold is None else options.occupied_threshold
@@ -44,11 +43,6 @@ def to_grid(path: Path, message, options: ImportOptions) -> Grid:
         span = f"{values.min()} to {values.max()}"
         raise MapError(f"{path}: no cell of the grid is free (values {span}); set free_threshold")
     return Grid(labels, cell, corner, yaw)
-
-
-def yaw_of(turn) -> float:
-    """Angle about z [rad] of a quaternion message; 0 where nobody filled it in."""
-    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
 
 
 def to_points(path: Path, message) -> np.ndarray:

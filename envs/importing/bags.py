@@ -16,9 +16,9 @@ from maexp.envs.map import MAX_POINTS, MapError, check_file
 from .bag_messages import to_grid, to_points
 from .cloud_files import Cloud
 from .grid import FREE, OBSTACLE, Grid
+from .import_report import ImportReport, ScannedImage
 from .levelling import thin
 from .options import ImportOptions
-from .report import ImportReport, ScannedImage
 from .tf_tree import TfTree
 
 BAGS = (".mcap", ".db3")

@@ -13,9 +13,9 @@ from maexp.envs.scenarios import Scenario
 
 from .cloud_extras import read_las, read_mesh, read_octree
 from .cloud_files import Cloud, read_pcd, read_ply, read_xyz
+from .import_report import ImportReport, ScannedPoints
 from .levelling import find_floor, find_strays, guess_up, thin, turn_up
 from .options import ImportOptions
-from .report import ImportReport, ScannedPoints
 from .sources import FloorSource, Source
 from .terrain import TerrainSource
 

@@ -14,8 +14,8 @@ from maexp.envs.scenarios.lattice import wall_points
 from maexp.kernels.types import START_CLEARANCE
 
 from .grid import FREE, OBSTACLE, UNKNOWN, Grid, close_gaps, keep_component, refine, seal, thin_walls
+from .import_report import ImportReport
 from .options import ImportOptions
-from .report import ImportReport
 from .sources import Source
 
 STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of the scenario's

@@ -12,6 +12,7 @@ from maexp.envs.map import MapError
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 MAX_CELLS = 40_000_000
+MAX_ORIGIN = 1e8  # [m]
 EIGHT = np.ones((3, 3), dtype=bool)
 
 

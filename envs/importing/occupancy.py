@@ -14,12 +14,11 @@ from PIL import Image
 
 from maexp.envs.map import MapError, check_file
 
-from .grid import FREE, MAX_CELLS, OBSTACLE, UNKNOWN, Grid
+from .grid import FREE, MAX_CELLS, MAX_ORIGIN, OBSTACLE, UNKNOWN, Grid
+from .import_report import ImportReport, ScannedImage
 from .options import ImportOptions
-from .report import ImportReport, ScannedImage
 
 MAX_YAML_BYTES = 64 * 1024
-MAX_ORIGIN = 1e8  # [m]
 _BRIEF = Repr()
 _BRIEF.maxlevel = 1
 FORMATS = ("PPM", "PNG", "BMP", "TIFF", "JPEG")

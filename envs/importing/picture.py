@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.envs.files import whole_file
 from maexp.envs.map import PointCloudMap
 from maexp.envs.map_plot import draw_map, paint_map
+from maexp.envs.whole_file import whole_file
 
-from .report import ImportReport, ScannedImage, ScannedPoints
+from .import_report import ImportReport, ScannedImage, ScannedPoints
 
 PANEL = 640  # pixels a side
 SHOWN = (0.1, 99.9)  # percentiles of the coordinates in the picture: a single stray point would shrink all others

@@ -1,5 +1,14 @@
 """Generated maps: one file per family, and the table of what belongs to each scenario."""
 
-from .table import SCENARIOS, Scenario, cut_last_fifth, default_macro_steps, find_scenario, make_map, split
+from .table import GENERATED, SCENARIOS, Scenario, cut_last_fifth, default_macro_steps, find_scenario, make_map, split
 
-__all__ = ["SCENARIOS", "Scenario", "cut_last_fifth", "default_macro_steps", "find_scenario", "make_map", "split"]
+__all__ = [
+    "GENERATED",
+    "SCENARIOS",
+    "Scenario",
+    "cut_last_fifth",
+    "default_macro_steps",
+    "find_scenario",
+    "make_map",
+    "split",
+]

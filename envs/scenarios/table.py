@@ -9,6 +9,7 @@ from typing import Any
 
 from maexp.envs.fields import setting
 from maexp.envs.map import PointCloudMap
+from maexp.kernels.constants import DT
 
 from .indoor import build_indoor
 from .maze import build_maze
@@ -182,6 +183,8 @@ _ROWS = [
 ]
 
 SCENARIOS: dict[str, Scenario] = {row.name: row for row in _ROWS}
+GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
+"""Those with maps of their own; the user brings the map of the others."""
 
 
 def find_scenario(name: str) -> Scenario:
@@ -235,8 +238,6 @@ def default_macro_steps(
         team: speed [m/s] and radar range [m] of every robot; None: three as the scenario has them.
         local_steps: of a macro step; None: the scenario's.
     """
-    from maexp.kernels.types import DT  # here: settings and help wait for no Warp
-
     team = team or [(scenario.max_speed, scenario.radar_range)] * 3
     seconds = DT * (local_steps or scenario.local_steps)
     area = max(m.free_area for m in maps)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from maexp.envs.map import MapError, PointCloudMap, read_npz, write_npz
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 _FORMAT = "maexp-episode-1"
 _KINDS = {

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.envs.files import whole_file
 from maexp.envs.render import EXPLORED, OVERLAP, UNEXPLORED, WALL_SEEN, WALL_UNSEEN, percent
 from maexp.envs.viewing.episode import Episode
 from maexp.envs.viewing.paint import look_at
-from maexp.envs.viewing.scene import DrawnScene, Stage
-from maexp.kernels.types import DT
+from maexp.envs.viewing.stage import DrawnScene, Stage
+from maexp.envs.whole_file import whole_file
+from maexp.kernels.constants import DT
 
 HOST = "127.0.0.1"  # this machine only: the page has no password
 RATE = 20.0  # pictures per second, at most

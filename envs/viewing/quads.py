@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maexp.envs.viewing.scene import DrawnScene
+from maexp.envs.viewing.stage import DrawnScene
 
 SHADES = {"top": 1.0, "south": 0.80, "east": 0.68, "west": 0.74, "north": 0.62}  # light from above, a little from -y
 _SIDES = {"south": (0, -1), "east": (1, 0), "north": (0, 1), "west": (-1, 0)}  # outward normals

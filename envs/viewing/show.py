@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from maexp.envs.files import whole_file
 from maexp.envs.render import draw_caption
 from maexp.envs.viewing.paint import Camera, look_at, paint
 from maexp.envs.viewing.quads import Quads, make_quads
-from maexp.envs.viewing.scene import DrawnScene
+from maexp.envs.viewing.stage import DrawnScene
+from maexp.envs.whole_file import whole_file
 
 RENDERERS = ("auto", "open3d", "painter")
 CAPTION = 20  # height of the letters below a picture [px]

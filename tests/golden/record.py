@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from maexp.envs import ExplorationEnv, PlannerConfig, RewardConfig, RobotConfig, make_map
-from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.scenarios import GENERATED, SCENARIOS
 from maexp.envs.specs import REWARD_TERMS
 
 FOLDER = Path(__file__).parent
 ROBOTS, STEPS, SEED = 3, 3, 11
-CASES = {name: (name, "dwa") for name, one in SCENARIOS.items() if one.build is not None}
+CASES = {name: (name, "dwa") for name in GENERATED}
 CASES |= {f"maze_small_{planner}": ("maze_small", planner) for planner in ("wavefront", "direct")}
 CLEARANCE = {"random": 3.0, "maze": 4.0, "indoor": 4.2, "outdoor": 4.2}  # factor by the first word of a scenario
 REWARD = RewardConfig(

@@ -30,15 +30,6 @@ def nearest_pixel(point, corner, size: float) -> tuple[int, int]:
     return math.floor((float(point[0]) - corner[0]) / size), math.floor((float(point[1]) - corner[1]) / size)
 
 
-def pixel_margin(point, corner, size: float) -> float:
-    """Distance of a point to the nearest edge of its pixel [pixels]: tiny, and it may fall either way."""
-    gaps = []
-    for axis in range(2):
-        t = (float(point[axis]) - corner[axis]) / size
-        gaps.append(abs(t - round(t)))
-    return min(gaps)
-
-
 def shown_points(points, reach, corner, size: float, pixels: int = PIXELS) -> dict[tuple[int, int], list]:
     """Which points each pixel shows: those whose nearest pixel centre it is; where there are none, the
     nearest point whose `reach` (n,) [m] extends to the pixel's centre (no holes between points)."""

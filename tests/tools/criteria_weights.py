@@ -18,7 +18,7 @@ from maexp.agents.policies.classical import POLICIES, FrontierPlanner, as_module
 from maexp.agents.policies.trained_rank import TrainedRank
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, choices, make_map
 from maexp.envs.features import FEATURES
-from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.scenarios import GENERATED
 
 FIRST, MAPS, TEAMS = 2000, 48, 96  # no table reports maps from there on
 TERMS = {
@@ -72,7 +72,7 @@ def watch(scenario: str):
 
 
 def imitate() -> None:
-    found = [watch(name) for name, row in SCENARIOS.items() if row.build is not None]
+    found = [watch(name) for name in GENERATED]
     weights = torch.zeros(len(TERMS), requires_grad=True)
     optimizer = torch.optim.LBFGS([weights], max_iter=200, line_search_fn="strong_wolfe")
 

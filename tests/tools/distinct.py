@@ -13,7 +13,7 @@ import torch
 
 from maexp.agents import make_env, make_policy
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded
-from maexp.kernels.types import DT
+from maexp.kernels.constants import DT
 
 GOAL = 0.995
 WORDS = ("scenario.starts=together", f"scenario.success_coverage={GOAL}", "scenario.macro_steps=60", "num_threads=1")

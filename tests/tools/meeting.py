@@ -13,8 +13,8 @@ from torchrl.envs.utils import step_mdp
 from maexp.agents.evaluation.figures import COLOURS, panels
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, PointCloudMap, make_map
-from maexp.envs.files import whole_file
 from maexp.envs.film import write_gif
+from maexp.envs.whole_file import whole_file
 from maexp.kernels import unpack_flags
 
 SCENARIO, MAPS, EPISODE = "indoor_medium", range(26, 38), 6

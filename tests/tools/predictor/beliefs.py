@@ -24,12 +24,12 @@ from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, make_map
 from maexp.envs.fields import check_settings, setting
 from maexp.envs.importing.finish import crop_grid, finish_map
+from maexp.envs.importing.import_report import ImportReport
 from maexp.envs.importing.occupancy import read_occupancy
 from maexp.envs.importing.options import ImportOptions
-from maexp.envs.importing.report import ImportReport
 from maexp.envs.importing.sources import GridSource
 from maexp.envs.nav_grid import build_nav_grid, open_cells
-from maexp.envs.scenarios import SCENARIOS, cut_last_fifth, default_macro_steps, find_scenario, split
+from maexp.envs.scenarios import GENERATED, cut_last_fifth, default_macro_steps, find_scenario, split
 from maexp.envs.targets import TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
@@ -40,7 +40,6 @@ LONGER = 2.0  # episodes go on for so many times the scenario's decisions: late 
 TEAMS = (3, 1, 4, 2)  # robots, round by round
 PLANS = "plans"
 COVERED = 0.99  # share of the free ground that ends an episode
-GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
 EXTRA_MAPS = 1_000_000  # further maps to train on are numbered from here: in no table, no validation, no held-out set
 
 

@@ -16,8 +16,9 @@ from torch import Tensor, nn
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
-from maexp.agents.networks.map_predictor import CARD, CONTRACT, NETWORK, STRIDE, WEIGHTS, MapPredictor, finish_guess
+from maexp.agents.networks.map_predictor import CONTRACT, NETWORK, STRIDE, MapPredictor, finish_guess
 from maexp.agents.policies.export import OPSET, PACKAGES, trace_network
+from maexp.agents.runtime.folder import CARD, WEIGHTS
 from maexp.agents.versions import find_commit
 
 from .beliefs import load_groups

@@ -9,14 +9,14 @@ from pathlib import Path
 from maexp.envs.checker import check_map, repair_map
 from maexp.envs.map import MapError, PointCloudMap, check_file
 
-from .arrays import read_npy_triple, read_npz_map
 from .bags import BAGS, bag_name, is_bag, read_bag
 from .clouds import CLOUDS, make_source, read_cloud
 from .finish import crop_grid, finish_map
 from .grid import Grid
+from .import_report import ImportReport
 from .occupancy import read_occupancy
 from .options import ImportOptions, make_options
-from .report import ImportReport
+from .point_files import read_npy_triple, read_npz_map
 from .sources import GridSource
 
 GRIDS = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".tif", ".tiff")

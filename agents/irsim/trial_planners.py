@@ -51,6 +51,11 @@ def make_planner(word: str, player: NamedPolicy, config: TrialConfig, env: Explo
         trained = {"iteration": player.saved["iteration"]}
         export_policy(player.make(env), env, where / "policy", player.name, f"# {player.name}\n", trained)
         word = str(where / "policy")
+    return team_planner(word, config)
+
+
+def team_planner(word: str, config: TrialConfig) -> TeamPlanner:
+    """A planner for the team of a trial; `word` is a name or folder that it knows."""
     return TeamPlanner(
         word,
         radar_range=config.radar_range,

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from maexp.envs.files import whole_file
 from maexp.envs.render import ROBOT_COLOURS
+from maexp.envs.whole_file import whole_file
+from maexp.kernels.constants import DT
 
-from .config import DT
 from .people import PERSON_RADIUS
 from .trial import FilmFrame
 

@@ -13,7 +13,7 @@ from uuid import uuid4
 
 from maexp.agents.ros2.convert import SECOND, fill_header, fill_time, read_nanoseconds
 from maexp.agents.ros2.dds import Wire
-from maexp.agents.ros2.messages import CLASSES, NAVIGATE
+from maexp.agents.ros2.ros_types import CLASSES, NAVIGATE
 from maexp.agents.runtime.driver import Order
 from maexp.agents.runtime.frames import Pose, fill_pose
 

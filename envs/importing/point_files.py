@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from maexp.envs.map import MapError, PointCloudMap, check_file, read_npz
 from maexp.envs.scenarios import find_scenario
 
+from .import_report import ImportReport
 from .options import ImportOptions
-from .report import ImportReport
 
 KINDS = {
     "free": ("freespace", "free_space", "free"),

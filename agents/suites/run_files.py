@@ -13,11 +13,11 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import short, without_nan, write_file, write_text
 from maexp.agents.suites.play import Batch
 from maexp.agents.suites.score import Results, to_result
-from maexp.agents.suites.suite import Suite, sha256
+from maexp.agents.suites.suite import RESULTS, Suite, sha256
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.map import MapError, read_npz
 
-RUN, RESULTS, ACTIONS = "run.json", "results.json", "actions"
+RUN, ACTIONS = "run.json", "actions"
 FORMAT = "maexp-suite-result-2"
 READ = (FORMAT, "maexp-suite-result-1")  # the first had regions and offsets: results that are published stay valid
 ARRAYS = {"decisions": "i", "seconds": "f", "maps": "U", "reasons": "U"}
