@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from maexp.agents.settings.groups import CollectorSettings, LearnerSettings
+from maexp.envs.choices import CLASSICAL
 from maexp.envs.fields import setting
 
 
@@ -18,7 +19,7 @@ class BenchmarkSettings(LearnerSettings):
     action: str = MISSING  # which file of conf/action
     scenarios: Any = setting(None, "where they are compared")
     algorithms: Any = setting(None, "trained and then evaluated")
-    policies: Any = setting(None, "only evaluated: planners, trained ones, module:function")
+    policies: Any = setting(["random", *CLASSICAL, "oracle"], "only evaluated: planners, trained ones, module:function")
     seeds: Any = setting(None, "of training, starts and maps")
     episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)", low=1)
     num_robots: int = setting(3, "robots in a team", low=1)
