@@ -109,11 +109,11 @@ def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
     maps = [import_map(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
-    names = [one.name for one in maps]
+    names = [world.name for world in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
-    kinds = sorted({one.scenario for one in maps})
-    if scenario.name in RULES and (other := next((one for one in maps if one.scenario != scenario.name), None)):
+    kinds = sorted({world.scenario for world in maps})
+    if scenario.name in RULES and (other := next((world for world in maps if world.scenario != scenario.name), None)):
         raise UserError(
             f"scenario={scenario.name} counts in the pixels of a picture, and {other.name} is a saved map of "
             f"scenario={other.scenario}: give its picture, or use scenario=pointcloud."
@@ -160,12 +160,12 @@ def other_scenarios(cfg: DictConfig, words: DictConfig) -> list[DictConfig]:
         UserError: an entry that is unknown or given twice, or a scenario without maps of its own and without a path.
     """
     entries = [] if cfg.scenario.also is None else OmegaConf.to_container(cfg.scenario.also)
-    entries = [{"name": one} if isinstance(one, str) else one for one in entries]
-    for one in entries:
-        _check_entry(one)
-    names = [one["name"] if len(one) == 1 else str(one) for one in entries]
+    entries = [{"name": entry} if isinstance(entry, str) else entry for entry in entries]
+    for entry in entries:
+        _check_entry(entry)
+    names = [entry["name"] if len(entry) == 1 else str(entry) for entry in entries]
     check_distinct("scenario.also", [cfg.scenario.name, *names])
-    return [_with_scenario(cfg, words, one) for one in entries]
+    return [_with_scenario(cfg, words, entry) for entry in entries]
 
 
 def title_scenario(entry: str | Mapping[str, Any]) -> str:
@@ -192,8 +192,8 @@ def _check_entry(entry: Any) -> None:
             f"scenario.also={name} is no scenario with maps of its own: choose among {known}, or give "
             "{name: pointcloud, path: FILES}."
         )
-    settings = [one.name for one in fields(ScenarioSettings) if one.name not in ("also", "importing")]
-    if unknown := [one for one in entry if one not in settings]:
+    settings = [field.name for field in fields(ScenarioSettings) if field.name not in ("also", "importing")]
+    if unknown := [key for key in entry if key not in settings]:
         raise UserError(f"scenario.also has no setting {unknown[0]}: choose among {', '.join(settings)}.")
 
 
@@ -208,7 +208,7 @@ def _with_scenario(cfg: DictConfig, words: DictConfig, entry: dict[str, Any]) ->
             why = str(error).splitlines()[0]
             raise UserError(f"scenario.also: {setting}={value} of {entry['name']} cannot be: {why}") from error
     unresolved = OmegaConf.to_container(words, resolve=False)
-    for group, setting in (one.split(".") for one in find_followers(words)):
+    for group, setting in (follower.split(".") for follower in find_followers(words)):
         if group != "scenario":
             other[group][setting] = unresolved[group][setting]
     return other

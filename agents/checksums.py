@@ -16,13 +16,13 @@ def checksum(world: PointCloudMap) -> str:
 
 def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
     """Name and checksum of every map."""
-    return {one.name: checksum(one) for one in maps}
+    return {world.name: checksum(world) for world in maps}
 
 
 def changed_maps(saved: dict, maps: list[PointCloudMap]) -> str:
     """Which of `maps` are not what they were when the checkpoint `saved` was written: "a and b have", "" for none."""
     before = saved["maps"]
-    changed = [name for name, one in checksums(maps).items() if before.get(name, one) != one]
+    changed = [name for name, digest in checksums(maps).items() if before.get(name, digest) != digest]
     more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
     return f"{', '.join(changed[:3])}{more} {'has' if len(changed) == 1 else 'have'}" if changed else ""
 

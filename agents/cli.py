@@ -183,7 +183,7 @@ def overview() -> str:
     """What `maexp` alone prints."""
     lines = ["maexp: multi-robot exploration with reinforcement learning on point-cloud maps", ""]
     for name, verb in VERBS.items():
-        lines += [f"  {name:<12}{verb.summary}", *(f"  {'':<12}  {one}" for one in verb.examples), ""]
+        lines += [f"  {name:<12}{verb.summary}", *(f"  {'':<12}  {example}" for example in verb.examples), ""]
     return "\n".join([*lines, "maexp VERB --help lists the settings and choices of a verb."])
 
 
@@ -248,7 +248,7 @@ def _check_flags(name: str, flags: list[str]) -> None:
     allowed |= {"-m", "--multirun"} if name == "train" else set()
     for flag in flags:
         if flag not in allowed:
-            known = ", ".join(sorted(one for one in allowed if one.startswith("--")))
+            known = ", ".join(sorted(word for word in allowed if word.startswith("--")))
             raise UserError(f"maexp {name} has no option {flag}: choose one of {known}.")
 
 

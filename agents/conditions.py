@@ -138,7 +138,7 @@ def write_table(config: ConditionsConfig) -> None:
     for scenario in config.places:
         for team in config.teams:
             found = {name: read(config, scenario, team, name) for name in config.conditions}
-            parts.append(table(f"{scenario}, {team} robots", {name: one for name, one in found.items() if one}))
+            parts.append(table(f"{scenario}, {team} robots", {name: row for name, row in found.items() if row}))
     write_text(Path(config.out) / TABLE, "\n\n".join(parts) + "\n")
 
 
@@ -249,7 +249,9 @@ def keep_plan(config: ConditionsConfig) -> None:
     Raises:
         UserError: it is not.
     """
-    wanted = {"format": FORMAT} | {one.name: getattr(config, one.name) for one in fields(config) if one.name in KEPT}
+    wanted = {"format": FORMAT} | {
+        setting.name: getattr(config, setting.name) for setting in fields(config) if setting.name in KEPT
+    }
     path = Path(config.out) / PLAN
     if not path.exists():
         write_json(path, wanted)

@@ -75,7 +75,7 @@ class MapSet:
 
     @property
     def maps(self) -> list[Entry]:
-        return [one for one in self.entries if one.split != LICENCES]
+        return [entry for entry in self.entries if entry.split != LICENCES]
 
     @property
     def kept(self) -> Path:
@@ -89,19 +89,19 @@ class MapSet:
 
     def describe(self) -> list[str]:
         """Its content and licences."""
-        count = ", ".join(f"{sum(one.split == part for one in self.maps)} for {part}" for part in SPLITS)
-        size = sum(one.bytes for one in self.entries) / 1e6
+        count = ", ".join(f"{sum(entry.split == part for entry in self.maps)} for {part}" for part in SPLITS)
+        size = sum(entry.bytes for entry in self.entries) / 1e6
         lines = [f"{self.name}: {self.about}", f"{len(self.maps)} maps ({count}), {size:.1f} MB. Licences:"]
         return [*lines, *(f"  {licence} {source}" for source, licence in self.sources().items())]
 
     def sources(self) -> dict[str, str]:
         """Repository -> licence."""
-        return {one.source: one.licence for one in self.maps}
+        return {entry.source: entry.licence for entry in self.maps}
 
 
 def set_names() -> list[str]:
     """The sets that come with the package."""
-    return sorted(one.stem for one in SETS.glob("*.yaml"))
+    return sorted(path.stem for path in SETS.glob("*.yaml"))
 
 
 def load_set(name: str) -> MapSet:

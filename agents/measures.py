@@ -60,8 +60,8 @@ class Measure:
 
 
 MEASURES = {
-    one.metric: one
-    for one in (
+    measure.metric: measure
+    for measure in (
         Measure("exploration_ratio", "coverage", "Coverage at the end", "%", 1, 1, "ER"),
         Measure(
             "coverage_auc",
@@ -115,4 +115,4 @@ MEASURES = {
 
 def compared(goal: float) -> list[Measure]:
     """What differences of episodes that end at the coverage `goal` are told in."""
-    return [one for one in MEASURES.values() if one.words and in_reach(one.metric, goal)]
+    return [measure for measure in MEASURES.values() if measure.words and in_reach(measure.metric, goal)]

@@ -15,7 +15,9 @@ def ended_by_signals() -> Iterator[None]:
     def stop(*_) -> None:
         raise KeyboardInterrupt
 
-    wanted = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) != signal.SIG_IGN]  # nohup
+    wanted = [
+        number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) != signal.SIG_IGN
+    ]  # nohup
     before = {number: signal.signal(number, stop) for number in wanted}
     try:
         yield

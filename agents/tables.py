@@ -70,12 +70,12 @@ def markdown_row(cells: Iterable[str]) -> str:
 
 def markdown_table(heads: Sequence[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """The lines of a table."""
-    return [markdown_row(one) for one in (heads, ["---"] * len(heads), *rows)]
+    return [markdown_row(row) for row in (heads, ["---"] * len(heads), *rows)]
 
 
 def latex_row(cells: Iterable[str | None]) -> str:
     """A line of a tabular; None leaves a cell empty."""
-    return f"{' & '.join(one or '' for one in cells)} " + r"\\"
+    return f"{' & '.join(cell or '' for cell in cells)} " + r"\\"
 
 
 def latex_small(text: str) -> str:
@@ -96,7 +96,7 @@ def terminal_table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str
     for number, head in enumerate(heads):
         table.add_column(escape(head), justify="right" if number else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*(escape(one) if isinstance(one, str) else one for one in row))
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 

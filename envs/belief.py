@@ -63,7 +63,7 @@ class Beliefs(Branches):
         local_steps: int | None = None,
     ):
         self.nav, self.unknown = nav, unknown
-        ranges = [one.range for one in env.radar_configs]
+        ranges = [radar.range for radar in env.radar_configs]
         self.true_grids = env.simulation.nav_grids or bank_nav_grids(env.bank, env.device)[0]
         self.sizes = WorldSizes.around(self.true_grids, max(ranges), min(ranges))
         self.rows, self.worlds = nav.rows, teams * nav.rows
@@ -106,7 +106,9 @@ class Beliefs(Branches):
             "block": sizes.block,
         }
         device = self.origin.device
-        self.table = {name: torch.from_numpy(np.ascontiguousarray(one)).to(device) for name, one in columns.items()}
+        self.table = {
+            name: torch.from_numpy(np.ascontiguousarray(column)).to(device) for name, column in columns.items()
+        }
 
     def _allocate(self) -> None:
         sizes, device = self.sizes, self.origin.device
@@ -132,7 +134,7 @@ class Beliefs(Branches):
         """What kernels of worlds take, by their parameters' names."""
         maps, grids = self.env.simulation.maps, self.env.bank.grids[0]
         own = ("wall", "guess", "state", "certain", "count", "index", "pair_begin", "total", "worth", "place")
-        values = {name: wp.from_torch(one) for name, one in self.own.items()}
+        values = {name: wp.from_torch(value) for name, value in self.own.items()}
         values |= {name: wp.from_torch(getattr(self, name)) for name in own}
         return values | {
             "maps": self.origin.simulation.maps,
@@ -184,10 +186,10 @@ class Beliefs(Branches):
         for name in SCALARS:
             maps[name][:count] = self.table[name][place]
         maps["occluder_radius"].view(self.worlds, -1)[:count] = self.table["occluder_radius_max"][place].unsqueeze(1)
-        for name, one in self.grid_views.items():
-            one[:count] = self.table[IN_GRIDS.get(name, name)][place]
-        for name, one in self.own.items():
-            one[:count] = self.table[name][place]
+        for name, view in self.grid_views.items():
+            view[:count] = self.table[IN_GRIDS.get(name, name)][place]
+        for name, tensor in self.own.items():
+            tensor[:count] = self.table[name][place]
         self._fit_blocks(place)
         self.wall[:count] = NOBODY
         self._take_up(teams)
@@ -207,7 +209,7 @@ class Beliefs(Branches):
         place = self.place[:count].long()
         for m in place.unique().tolist():
             worlds = (place == m).nonzero().squeeze(-1)
-            width, height, margin = (int(getattr(self.sizes, one)[m]) for one in ("width", "height", "margin"))
+            width, height, margin = (int(getattr(self.sizes, name)[m]) for name in ("width", "height", "margin"))
             inner = (height - 2 * margin, width - 2 * margin)
             known = self.known[worlds, : math.prod(inner)].view(-1, *inner)
             known = torch.nn.functional.pad(known, (margin,) * 4, value=UNKNOWN)
@@ -238,7 +240,7 @@ class Beliefs(Branches):
 
     def disc(self) -> torch.Tensor:
         """Cells of a radar's disc, float32 [T * copies]."""
-        reach = max(one.range for one in self.env.radar_configs)
+        reach = max(radar.range for radar in self.env.radar_configs)
         edge = self.grid_views["cell"][self.env.simulation.tensors["map_id"].long()]
         return FULL * torch.pi * (reach / edge) ** 2
 
@@ -259,7 +261,7 @@ class Beliefs(Branches):
         number = torch.arange(kept.shape[-1], device=kept.device).expand(len(kept), -1)
         side = self.table["block"][place].unsqueeze(1)
         inner = {name: self.table[name] - 2 * self.table["margin"] for name in ("width", "height")}
-        across, down = (-(-one[place].unsqueeze(1) // side) for one in inner.values())
+        across, down = (-(-cells[place].unsqueeze(1) // side) for cells in inner.values())
         there = (number < across * down).unsqueeze(1)
         index = torch.where(there, self.blocks(number).unsqueeze(1), 0).expand(kept.shape)
         spread = kept.new_zeros((*kept.shape[:2], self.num_blocks))
@@ -272,7 +274,7 @@ class Beliefs(Branches):
         blocks = tracker.nav.blocks
         self.grid_views["cell"].fill_(float(self.sizes.edge.min()))
         tracker.nav._spread_rays(float(tracker.nav.radar_range))  # as long as the finest cells ask for
-        threshold = max(one.collision_threshold for one in self.origin.robot_configs)
+        threshold = max(robot.collision_threshold for robot in self.origin.robot_configs)
         search = np.ceil(np.float32(threshold) / self.sizes.edge + MARGIN_CELLS).astype(np.int32) + 1
         self.table["search"] = torch.from_numpy(search).to(self.origin.device)
         self.block_views = {name: wp.to_torch(getattr(blocks, name)) for name in ("block", "search")}
@@ -280,8 +282,8 @@ class Beliefs(Branches):
     def _fit_blocks(self, place: torch.Tensor) -> None:
         """Blocks of frontier cells as large as in the true grids."""
         if self.tracker is not None:
-            for name, one in self.block_views.items():
-                one[: len(place)] = self.table[name][place]
+            for name, view in self.block_views.items():
+                view[: len(place)] = self.table[name][place]
             reach = self.tracker.nav.radar_range
             self.tracker.disc[: len(place)] = torch.pi * (reach / self.table["resolution"][place]) ** 2
 

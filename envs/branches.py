@@ -144,8 +144,8 @@ class Branches:
     def disc(self) -> torch.Tensor:
         """What a radar's disc of free ground weighs in each branch, float32 [T * copies]."""
         tensors = self.env.simulation.map_tensors
-        area = torch.tensor([one.free_area for one in self.env.maps], device=self.env.device)
-        reach = max(one.range for one in self.env.radar_configs)
+        area = torch.tensor([world.free_area for world in self.env.maps], device=self.env.device)
+        reach = max(radar.range for radar in self.env.radar_configs)
         weight = tensors["total_weight"] / area * torch.pi * reach**2
         return weight[self.env.simulation.tensors["map_id"].long()]
 

@@ -75,9 +75,9 @@ class ContactView:
         memory, steps = self.env.strategy, self.env.macro_steps
         n = self.env.num_robots
         disc, met, told, place = (
-            nav.pick(one) for one in (memory._disc(), *(memory.state[name] for name in ("met", "told", "place")))
+            nav.pick(tensor) for tensor in (memory._disc(), *(memory.state[name] for name in ("met", "told", "place")))
         )
-        known, linked, step = (nav.pick(one) for one in (memory.known, memory.linked, memory.step))
+        known, linked, step = (nav.pick(tensor) for tensor in (memory.known, memory.linked, memory.step))
         since = (step.unsqueeze(-1) - met) / steps
         untold = (known.unsqueeze(-1) - told) / disc.unsqueeze(-1)
         point = moment.to + moment.at.unsqueeze(2)

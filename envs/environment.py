@@ -353,13 +353,13 @@ class ExplorationEnv(EnvBase):
     def _memories(self) -> dict[str, torch.Tensor]:
         """What those remember that look at the simulation, copied."""
         parts = (self.strategy, self.target_view)
-        return {name: one for part in parts if part is not None for name, one in part.state_dict().items()}
+        return {name: value for part in parts if part is not None for name, value in part.state_dict().items()}
 
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
         wanted = {name: own[name] for name in STATE} | self._memories()
-        wrong = [n for n, one in wanted.items() if n not in state_dict or state_dict[n].shape != one.shape]
+        wrong = [n for n, value in wanted.items() if n not in state_dict or state_dict[n].shape != value.shape]
         if wrong:
             raise ValueError(
                 f"the saved simulator state does not fit this env ({', '.join(wrong[:3])}): "

@@ -167,7 +167,7 @@ class Moment:
     def features(self) -> Array:
         """[..., N, M, F], in the order of `feature_names`; 0 where there is no candidate."""
         xp = self.xp
-        columns = [xp.broadcast_to(one.of(self), self.mask.shape) for one in self.table.values()]
+        columns = [xp.broadcast_to(feature.of(self), self.mask.shape) for feature in self.table.values()]
         return xp.where(self.mask[..., None], xp.stack(columns, -1), 0.0)
 
 
@@ -277,7 +277,7 @@ def add_telling(moment: Moment, can: Array, way: Array, begin: Array, to: Array)
     more |= {"mask": can, "travel": way, "to": to, "way": begin, "toward": xp.zeros_like(to)}
     more |= {"value": -BETA * way, "score": -BETA * way}
     axis = can.ndim - 1
-    wider = {name: xp.concatenate([getattr(moment, name), one], axis) for name, one in more.items()}
+    wider = {name: xp.concatenate([getattr(moment, name), columns], axis) for name, columns in more.items()}
     return replace(moment, **wider)
 
 

@@ -64,10 +64,10 @@ def explain(metadata: Mapping) -> str:
 def describe(cls: type) -> list[str]:
     """The settings of a dataclass as a list in reStructuredText: name, default, help; [] where there are none."""
     rows = []
-    for one in fields(cls) if is_dataclass(cls) else ():
-        if one.metadata.get("help"):
-            default = f" = {one.default}" if isinstance(one.default, PRIMITIVES) else ""
-            rows.append(f"- ``{one.name}{default}``: {explain(one.metadata)}")
+    for setting in fields(cls) if is_dataclass(cls) else ():
+        if setting.metadata.get("help"):
+            default = f" = {setting.default}" if isinstance(setting.default, PRIMITIVES) else ""
+            rows.append(f"- ``{setting.name}{default}``: {explain(setting.metadata)}")
     return ["", *rows, ""] if rows else []
 
 
@@ -81,7 +81,7 @@ def kinds(cls: type) -> dict[str, tuple]:
     """The types that each field of a dataclass may have."""
     unions = (Union, UnionType)
     hints = get_type_hints(cls)
-    return {one: get_args(kind) if get_origin(kind) in unions else (kind,) for one, kind in hints.items()}
+    return {name: get_args(kind) if get_origin(kind) in unions else (kind,) for name, kind in hints.items()}
 
 
 def check_settings(settings: Any, group: str = "", error: type[ValueError] = ValueError) -> None:
@@ -90,10 +90,10 @@ def check_settings(settings: Any, group: str = "", error: type[ValueError] = Val
     Values of several numbers (a type that is neither a number, a bool nor a word) are left to whoever reads them.
     """
     allowed = kinds(settings.__class__)
-    for one in fields(settings):
-        if "limits" in one.metadata:
-            name = f"{group}.{one.name}" if group else one.name
-            check_value(name, getattr(settings, one.name), allowed[one.name], one.metadata, error)
+    for setting in fields(settings):
+        if "limits" in setting.metadata:
+            name = f"{group}.{setting.name}" if group else setting.name
+            check_value(name, getattr(settings, setting.name), allowed[setting.name], setting.metadata, error)
 
 
 def check_value(name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError) -> None:

@@ -115,7 +115,7 @@ def imagined_bank(env: ExplorationEnv, sizes: WorldSizes, worlds: int) -> Imagin
     }
     finest, coarsest = float(sizes.edge.min()), float(sizes.edge.max())
     width, height = int(sizes.width.max()), int(sizes.height.max())
-    in_range = (2 * math.ceil(max(one.range for one in env.radar_configs) / finest) + 3) ** 2
+    in_range = (2 * math.ceil(max(radar.range for radar in env.radar_configs) / finest) + 3) ** 2
     grids = NavGrids()
     values = {
         "origin": (np.zeros((worlds, 2), np.float32), wp.vec2),

@@ -100,7 +100,7 @@ def label_copies(maps: np.ndarray, *tables: dict[str, np.ndarray]) -> np.ndarray
         int [episodes], counted from 0 in the order of the first of each.
     """
     columns = [np.unique(maps, return_inverse=True)[1].ravel()]
-    for values in (one for table in tables for one in table.values()):
+    for values in (column for table in tables for column in table.values()):
         values = np.asarray(values, dtype=np.float64) + 0.0  # -0 is 0
         columns.append(np.where(np.isnan(values), np.nan, values).view(np.int64))
     _, first, inverse = np.unique(np.stack(columns, 1), axis=0, return_index=True, return_inverse=True)
@@ -119,19 +119,19 @@ def resample_weights(*factors: np.ndarray, copies: np.ndarray | None = None, see
     """
     codes = [np.unique(labels, return_inverse=True)[1] for labels in factors]
     codes.append(np.arange(len(factors[0])) if copies is None else copies)
-    return _resample_weights(seed, *(tuple(one.ravel().tolist()) for one in codes))
+    return _resample_weights(seed, *(tuple(code.ravel().tolist()) for code in codes))
 
 
 @lru_cache(maxsize=32)
 def _resample_weights(seed: int, *codes: tuple[int, ...]) -> np.ndarray:
     rng = np.random.default_rng(seed)
     labels, copies = np.array(codes[:-1]), np.array(codes[-1])
-    counts = [max(one) + 1 for one in codes[:-1]]
+    counts = [max(code) + 1 for code in codes[:-1]]
     often = [rng.multinomial(count, np.full(count, 1 / count), size=GROUPED_RESAMPLES) for count in counts]
     weights = np.zeros((GROUPED_RESAMPLES, labels.shape[1]), dtype=np.float32)
     for combination in np.unique(labels, axis=1).T:
         episodes = np.flatnonzero((labels == combination[:, None]).all(0))
-        count = np.prod([one[:, code] for one, code in zip(often, combination, strict=True)], axis=0)
+        count = np.prod([times[:, code] for times, code in zip(often, combination, strict=True)], axis=0)
         distinct, group = np.unique(copies[episodes], return_inverse=True)
         drawn = rng.multinomial(count * len(distinct), np.full(len(distinct), 1 / len(distinct)))
         weights[:, episodes] = drawn[:, group]

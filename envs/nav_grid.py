@@ -128,8 +128,8 @@ def bank_block_sides(bank: MapBank, reach: float) -> np.ndarray:
     """Edges of the blocks of frontier cells on each map of a bank, int32 [M], in cells, for a radar's reach [m]."""
     if bank.block_sides is not None:
         return bank.block_sides
-    width, height = np.array([grid_shape(one) for one in bank.maps]).T
-    return block_sides(np.array([one.resolution for one in bank.maps]), reach, width, height)
+    width, height = np.array([grid_shape(world) for world in bank.maps]).T
+    return block_sides(np.array([world.resolution for world in bank.maps]), reach, width, height)
 
 
 def bank_nav_grids(bank: MapBank, device: str = "cpu") -> tuple[NavGrids, int]:

@@ -105,11 +105,11 @@ class Navigation:
         )
         self.origin = wp.to_torch(self.grids.origin)
         self._known, self._frontier = (
-            wp.to_torch(one).view(e, r, cells) for one in (self.known_grids.known, blocks.frontier)
+            wp.to_torch(array).view(e, r, cells) for array in (self.known_grids.known, blocks.frontier)
         )
         self._distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
-        self._target, self._size = (wp.to_torch(one).view(e, r, -1) for one in (blocks.target_cell, blocks.size))
+        self._target, self._size = (wp.to_torch(array).view(e, r, -1) for array in (blocks.target_cell, blocks.size))
         self._looked, self._count = wp.to_torch(blocks.looked), wp.to_torch(blocks.count)
 
     def some(self, envs: torch.Tensor) -> Navigation:

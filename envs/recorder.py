@@ -62,7 +62,7 @@ class CoverageRecorder:
         self._check()
         times = np.unique(np.concatenate([np.array(batch["step"]) for batch in self._batches]))
         coverage = [
-            np.stack([np.interp(times, batch["step"], one) for one in np.stack(batch["coverage"], axis=1)])
+            np.stack([np.interp(times, batch["step"], curve) for curve in np.stack(batch["coverage"], axis=1)])
             for batch in self._batches
         ]
         return times * DT, np.concatenate(coverage)[:episodes]

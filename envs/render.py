@@ -68,7 +68,7 @@ def robot_colour(index: int) -> tuple[int, int, int]:
         return ROBOT_COLOURS[index]
     step = index - len(ROBOT_COLOURS)
     shade = colorsys.hls_to_rgb((0.12 + step * 0.618034) % 1.0, (0.26, 0.35, 0.44)[step % 3], 0.75)
-    return tuple(round(255 * one) for one in shade)
+    return tuple(round(255 * channel) for channel in shade)
 
 
 def smallest_robot(count: int) -> float:

@@ -20,8 +20,8 @@ from maexp.envs.fields import check_settings
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
 from maexp.envs.scenarios import find_scenario
+from maexp.kernels.constants import DT
 from maexp.kernels.sensing import return_chance
-from maexp.kernels.types import DT
 
 LEAST_RETURNS = 0.01  # share of the returns in view that has to count
 

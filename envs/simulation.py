@@ -57,7 +57,7 @@ def robot_tensors(settings: EnvSettings) -> dict[str, torch.Tensor]:
     """Parameters of every robot, [E, N] each (fields of `kernels.dynamics.Robots`)."""
     robots, radars = settings.robot, settings.radar
     factor = settings.planner.clearance_factor
-    same = [one.name for one in fields(RobotConfig) if one.name in Robots.vars]
+    same = [field.name for field in fields(RobotConfig) if field.name in Robots.vars]
     columns = {name: [getattr(r, name) for r in robots] for name in same} | {
         "kind": [KINDS[r.kind] for r in robots],
         "center_offset": [0.5 * r.length if r.kind == "ackermann" else 0.0 for r in robots],
@@ -90,28 +90,28 @@ def radio_struct(settings: EnvSettings) -> Radio:
     """The radios as the kernels read them."""
     comm, radio = settings.comm, Radio()
     radio.power, radio.threshold, radio.noise = comm.power, comm.threshold, comm.noise
-    reach = max(one.range for one in settings.radar)
+    reach = max(radar.range for radar in settings.radar)
     radio.cell = reach / CELLS_OF_RADAR if comm.cell == "auto" else comm.cell
     return radio
 
 
 def perfect_radars(settings: EnvSettings) -> bool:
     """Whether robots know at once all that is in view."""
-    return all(one.perfect for one in settings.radar)
+    return all(radar.perfect for radar in settings.radar)
 
 
 def false_alarms(settings: EnvSettings) -> bool:
     """Whether robots may take free ground for walls."""
-    return any(one.false_alarm > 0.0 for one in settings.radar)
+    return any(radar.false_alarm > 0.0 for radar in settings.radar)
 
 
 def radar_sensing(settings: EnvSettings, bank: MapBank) -> Sensing:
     """What radars miss, as the kernels read it."""
-    chance = [[return_chance(one.missed, one.noise, m.resolution) for one in settings.radar] for m in bank.maps]
+    chance = [[return_chance(radar.missed, radar.noise, m.resolution) for radar in settings.radar] for m in bank.maps]
     sensing, device = Sensing(), str(settings.device)
     sensing.chance = wp.array(chance, dtype=wp.float32, device=device)
-    sensing.false_alarm = wp.array([one.false_alarm for one in settings.radar], dtype=wp.float32, device=device)
-    sensing.needed = wp.array([one.evidence for one in settings.radar], dtype=wp.int32, device=device)
+    sensing.false_alarm = wp.array([radar.false_alarm for radar in settings.radar], dtype=wp.float32, device=device)
+    sensing.needed = wp.array([radar.evidence for radar in settings.radar], dtype=wp.int32, device=device)
     return sensing
 
 
@@ -125,7 +125,7 @@ def fault_steps(settings: EnvSettings) -> torch.Tensor:
 
 def open_ground(bank: MapBank) -> torch.Tensor:
     """Cells of the navigation grids of all maps, one after the other, uint8: 1 on free ground."""
-    return torch.from_numpy(np.concatenate([open_cells(build_nav_grid(one)) for one in bank.maps]).astype(np.uint8))
+    return torch.from_numpy(np.concatenate([open_cells(build_nav_grid(world)) for world in bank.maps]).astype(np.uint8))
 
 
 def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
@@ -212,13 +212,13 @@ def bytes_per_env(settings: EnvSettings, bank: MapBank) -> int:
 def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     """Lengths of the axes of the planner's arrays for one env (`KNOWN`, `PASSABLE`, `SEARCH`, `PATHS`)."""
     limited, robots = settings.limited, settings.num_robots
-    shapes = [grid_shape(one) for one in bank.maps]
+    shapes = [grid_shape(world) for world in bank.maps]
     cells = max(width * height for width, height in shapes)
     return {
         "row": robots if limited else 1,
         "item": robots,
         "place": robots,
-        "mask": robots if limited else len({one.collision_threshold for one in settings.robot}),
+        "mask": robots if limited else len({robot.collision_threshold for robot in settings.robot}),
         "cell": cells,
         "slot": news_capacity(cells),
         "word": max(-(-width // 32) * height for width, height in shapes),
@@ -232,8 +232,8 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
 
 def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
     """What a `Navigation` and the targets that it finds keep of one env."""
-    sides = zip(bank.maps, bank_block_sides(bank, min(one.range for one in settings.radar)).tolist(), strict=True)
-    blocks = max(math.prod(-(-cells // side) for cells in grid_shape(one)) for one, side in sides)
+    sides = zip(bank.maps, bank_block_sides(bank, min(radar.range for radar in settings.radar)).tolist(), strict=True)
+    blocks = max(math.prod(-(-cells // side) for cells in grid_shape(world)) for world, side in sides)
     lengths = grid_sizes(settings, bank) | {"env": 1, "block": blocks, "two": 2}
     if settings.device.type == "cpu":
         lengths["place"] = 0  # all search in one place, which no env counts

@@ -59,7 +59,7 @@ class Strategy:
         comm = env.comm_config
         self.fades = comm.noise > 0.0 or comm.loss > 0.0  # links come and go: one moment says little
         self.asks = self.fades or comm.messages  # who is connected may not know all
-        self.reach = max(one.range for one in env.radar_configs)
+        self.reach = max(radar.range for radar in env.radar_configs)
         self.drive = env.simulation.robot_tensors["max_speed"] * (PACE * DT * env.local_steps)  # of a decision [m]
 
         def zeros(*shape: int, dtype: torch.dtype = torch.int32) -> torch.Tensor:
@@ -239,7 +239,7 @@ class Strategy:
     def _disc(self) -> torch.Tensor:
         """What a radar's disc of free ground weighs on each env's map, float32 [E, 1]."""
         maps = self.env.simulation.map_tensors
-        area = torch.tensor([one.free_area for one in self.env.maps], device=self.env.device)
+        area = torch.tensor([world.free_area for world in self.env.maps], device=self.env.device)
         return (maps["total_weight"] / area * torch.pi * self.reach**2)[self.sim["map_id"].long()].view(-1, 1)
 
     def _relay(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -258,7 +258,7 @@ class TargetTracker:
 
     def drive(self, nav: Navigation, speed: torch.Tensor) -> torch.Tensor:
         """How far robots get in a macro step [m], from their speeds [m/s]."""
-        accel, limit = (nav.pick(self.env.simulation.robot_tensors[one]) for one in ("max_accel", "max_speed"))
+        accel, limit = (nav.pick(self.env.simulation.robot_tensors[name]) for name in ("max_accel", "max_speed"))
         return drive_until_next(torch, speed, accel, limit, self.seconds)
 
     def speed(self, nav: Navigation) -> torch.Tensor:
@@ -308,7 +308,7 @@ class TargetTracker:
         left, kept = torch.zeros(len(way), dtype=torch.int32, device=way.device), torch.empty_like(way)
         values = (
             nav.values()
-            | {name: view(one) for name, one in s.items() if name != "stood"}
+            | {name: view(value) for name, value in s.items() if name != "stood"}
             | {
                 "stood": view(s["stood"], wp.vec2),
                 "block": view(block),

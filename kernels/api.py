@@ -212,8 +212,10 @@ def received_power(
     """
     if free.dim() != 2 or not free.numel():
         raise ValueError(f"free has shape {tuple(free.shape)}: give a grid [H, W] with cells")
-    ends = [torch.as_tensor(one, dtype=torch.float32, device=free.device).contiguous() for one in (senders, receivers)]
-    if any(one.dim() != 2 or one.shape[1] != 2 for one in ends) or len(ends[0]) != len(ends[1]):
+    ends = [
+        torch.as_tensor(places, dtype=torch.float32, device=free.device).contiguous() for places in (senders, receivers)
+    ]
+    if any(end.dim() != 2 or end.shape[1] != 2 for end in ends) or len(ends[0]) != len(ends[1]):
         raise ValueError(f"senders {tuple(ends[0].shape)} and receivers {tuple(ends[1].shape)} must both be [K, 2]")
     if not all(bool(end.isfinite().all()) for end in ends):
         raise ValueError("senders and receivers must be finite numbers of metres")

@@ -43,13 +43,13 @@ class Field:
 def make_arrays(fields: Mapping[str, Field], sizes: Mapping[str, int], device: wp.Device | str) -> dict[str, wp.array]:
     """Warp arrays for the rows of a table."""
 
-    def make(one: Field) -> wp.array:
-        given = {"shape": one.lengths(sizes), "dtype": one.kind, "device": device}
-        return wp.full(value=one.fill, **given) if one.fill else wp.zeros(**given)
+    def make(field: Field) -> wp.array:
+        given = {"shape": field.lengths(sizes), "dtype": field.kind, "device": device}
+        return wp.full(value=field.fill, **given) if field.fill else wp.zeros(**given)
 
-    return {name: make(one) for name, one in fields.items()}
+    return {name: make(field) for name, field in fields.items()}
 
 
 def count_bytes(fields: Mapping[str, Field], sizes: Mapping[str, int]) -> dict[str, int]:
     """Bytes of each."""
-    return {name: math.prod(one.shape(sizes)) * one.dtype.itemsize for name, one in fields.items()}
+    return {name: math.prod(field.shape(sizes)) * field.dtype.itemsize for name, field in fields.items()}

@@ -68,7 +68,7 @@ def finish_filling(device: wp.Device | torch.device | str) -> None:
 @cache
 def arguments_struct(types: tuple[type, ...]) -> type[ctypes.Structure]:
     """The C struct in which a CPU kernel takes arguments of these types."""
-    fields = [(f"argument_{k}", one) for k, one in enumerate(types)]
+    fields = [(f"argument_{k}", kind) for k, kind in enumerate(types)]
     return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
 
 
@@ -84,7 +84,7 @@ class RecordedLaunch:
         self.call: Any = None
         if KNOWN and device.is_cpu and self.command.block_dim == 1:
             bounds, *arguments = self.command.params
-            packed = arguments_struct(tuple(type(one) for one in arguments))(*arguments)
+            packed = arguments_struct(tuple(type(argument) for argument in arguments))(*arguments)
             self.call = partial(self.command.hooks.forward, ctypes.byref(bounds), ctypes.byref(packed))
 
     def launch(self, stream: wp.Stream | None = None) -> None:
@@ -104,5 +104,5 @@ def record(stage: Callable[[Launch], None], device: wp.Device) -> list[RecordedL
 def replay(launches: list[RecordedLaunch]) -> None:
     """Launch again, one after the other, in order with what torch does there."""
     stream = current_stream(launches[0].device) if launches else None
-    for one in launches:
-        one.launch(stream)
+    for launch in launches:
+        launch.launch(stream)

@@ -291,8 +291,8 @@ def place_teams(launch: Launch, shard: Shard) -> None:
     if shard.settings.false_alarms:
         flags.append(s.false_walls)
     lanes = lanes_on(shard.device, 1024)
-    for one in flags:
-        shard.call(launch, _clear_flags, (*one.shape[:2], lanes), flags=one, lanes=lanes)
+    for flag in flags:
+        shard.call(launch, _clear_flags, (*flag.shape[:2], lanes), flags=flag, lanes=lanes)
     forget_returns(launch, shard)
     forget_messages(launch, shard)
     shard.call(launch, _clear_env, shard.shape[0])

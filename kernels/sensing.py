@@ -219,6 +219,6 @@ def forget_returns(launch: Launch, shard: Shard) -> None:
     """Clear the returns of the envs of ``mask``, if any are counted."""
     if shard.values["sensing"] is not None:
         lanes = lanes_on(shard.device, 1024)
-        for one in (shard.view.evidence_free, shard.view.evidence_boundary):
-            dim = (*one.shape[:2], lanes)
-            shard.call(launch, _forget_returns, dim, evidence=one, lanes=lanes)
+        for evidence in (shard.view.evidence_free, shard.view.evidence_boundary):
+            dim = (*evidence.shape[:2], lanes)
+            shard.call(launch, _forget_returns, dim, evidence=evidence, lanes=lanes)

@@ -94,7 +94,9 @@ class Shard:
         self.settings, self.view, self.robots = settings, view, robots
         self.shape, self.radios = (last - first, sizes["N"]), (last - first, sizes["U"])
         self.lanes = lanes_on(device, 32)
-        numbers = {name: int(one) if isinstance(one, bool) else one for name, one in vars(settings).items()}
+        numbers = {
+            name: int(setting) if isinstance(setting, bool) else setting for name, setting in vars(settings).items()
+        }
         self.values = numbers | vars(view) | {"robots": robots, "lanes": self.lanes} | more
         self._make_wavefront = make_wavefront
         self._recorded: dict[Stage, list[RecordedLaunch]] = {}

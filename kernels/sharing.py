@@ -181,7 +181,7 @@ def share_targets(
     Returns:
         int64 [E, N], the target of each robot; -1: none is left for it, or it gets to none.
     """
-    preference, way, point, body = (one.float().contiguous() for one in (preference, way, point, body))
+    preference, way, point, body = (tensor.float().contiguous() for tensor in (preference, way, point, body))
     hears = hears.bool().contiguous()
     taken = torch.empty(preference.shape[:2], dtype=torch.int64, device=preference.device)
     wish, waiting = torch.empty_like(taken, dtype=torch.int32), torch.empty_like(taken, dtype=torch.bool)

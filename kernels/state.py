@@ -227,7 +227,7 @@ def axis_sizes(
 
 def allocate(fields: dict[str, Field], sizes: dict[str, int], device: torch.device) -> dict[str, torch.Tensor]:
     """Zeroed tensors for ``fields`` (`STATE` or `SCRATCH`)."""
-    return {name: torch.zeros(one.shape(sizes), dtype=one.dtype, device=device) for name, one in fields.items()}
+    return {name: torch.zeros(field.shape(sizes), dtype=field.dtype, device=device) for name, field in fields.items()}
 
 
 def memory_per_env(sizes: dict[str, int]) -> dict[str, int]:

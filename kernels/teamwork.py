@@ -116,7 +116,7 @@ def choose_in_turn(
     Returns:
         score float32 [E, N, M], taken int64 [E, N], claimed float32 [E, N, M].
     """
-    gain, value, point = (one.float().contiguous() for one in (gain, value, point))
+    gain, value, point = (tensor.float().contiguous() for tensor in (gain, value, point))
     hears = hears.bool().contiguous()
     score, claimed, left = torch.empty((3, *gain.shape), device=gain.device)
     taken = torch.empty(gain.shape[:2], dtype=torch.int64, device=gain.device)
@@ -129,7 +129,7 @@ def choose_in_turn(
             view(value),
             view(point, wp.vec2),
             view(hears),
-            *(view(one) for one in (left, waiting, best, taken, score, claimed)),
+            *(view(tensor) for tensor in (left, waiting, best, taken, score, claimed)),
         ],
     )
     return score, taken, claimed
@@ -210,7 +210,7 @@ def compare_with_others(
         tuple(best.shape[:2]),
         [
             points(point),
-            *(wp.from_torch(one.contiguous()) for one in (best, ways, hears)),
+            *(wp.from_torch(tensor.contiguous()) for tensor in (best, ways, hears)),
             points(plans[0]),
             wp.from_torch(plans[1].contiguous()),
             points(last[0]),

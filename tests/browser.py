@@ -86,7 +86,7 @@ def open_tab(program: str, address: str, folder: Path) -> Iterator[Tab]:
         port, path = note.read_text().split()
         with connect(f"ws://127.0.0.1:{port}{path}", max_size=None) as socket:
             tab = Tab(socket)
-            pages = [one for one in tab.call("Target.getTargets")["targetInfos"] if one["type"] == "page"]
+            pages = [info for info in tab.call("Target.getTargets")["targetInfos"] if info["type"] == "page"]
             target = pages[0]["targetId"]
         with connect(f"ws://127.0.0.1:{port}/devtools/page/{target}", max_size=None) as socket:
             tab = Tab(socket)

@@ -52,7 +52,7 @@ class Scene:
 
     def _radar_launches(self) -> list[wp.Launch]:
         wanted = ("_collect_occluders", "_scan_free")
-        return [one for one in self.env.simulation.shards[0].record(local_step) if one.kernel.key in wanted]
+        return [launch for launch in self.env.simulation.shards[0].record(local_step) if launch.kernel.key in wanted]
 
 
 def measure_ratio() -> float:

@@ -71,7 +71,7 @@ def arguments(kernel: wp.Kernel) -> list[Argument]:
     for argument in definition.args.args:
         heading, line = headings[argument.lineno]
         shape = SHAPE.search(line)
-        axes = tuple(one.strip() for one in shape[1].split(",")) if shape else None
+        axes = tuple(part.strip() for part in shape[1].split(",")) if shape else None
         found.append(Argument(argument.arg, heading, dimensions(argument), axes))
     return found
 
@@ -91,7 +91,7 @@ def parse(function) -> ast.FunctionDef:
 def uses(function) -> Use:
     """How a kernel's or a function's Python source uses its arguments."""
     definition = parse(function)
-    arrays = {one.arg: dimensions(one) for one in definition.args.args}
+    arrays = {argument.arg: dimensions(argument) for argument in definition.args.args}
     finder = Finder(arrays, function.__globals__)
     for statement in definition.body:
         finder.visit(statement)

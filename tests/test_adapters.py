@@ -94,16 +94,16 @@ def test_networks_think_of_it_as_of_none(world):
     features[::2, 0] = 0.0
     none = td[TARGETS_MASK].clone()
     none[::2, 0] = False
-    one = first_if_none(none)
-    assert one.any(-1).all() and not none.any(-1).all()
+    shown = first_if_none(none)
+    assert shown.any(-1).all() and not none.any(-1).all()
     torch.manual_seed(0)
     config = ModelConfig(action="targets", critic_encoder="shared")
     chooser, reader = TargetChooser(config), TargetReader(config, team=True)
     torch.nn.init.normal_(chooser.head.weight)
     extra = (td["agents", "observation", "time_left"], td["agents", "observation", "alive"], td["info", "coverage"])
-    for before, now in zip(chooser.look(features, none, comm), chooser.look(features, one, comm), strict=True):
+    for before, now in zip(chooser.look(features, none, comm), chooser.look(features, shown, comm), strict=True):
         assert torch.equal(before, now)
-    assert torch.equal(reader(features, none, comm, *extra), reader(features, one, comm, *extra))
+    assert torch.equal(reader(features, none, comm, *extra), reader(features, shown, comm, *extra))
 
 
 def test_classical_planners_write_goals_all_the_same(world):
@@ -152,8 +152,8 @@ def test_the_env_says_what_agents_take(world, interfaces):
     """Where nothing is said of the action it is the env's own."""
     direct = PlannerConfig(name="direct")
     spaces = [
-        parallel_env(world, 2, **SHORT, **one).action_space("robot_0")
-        for one in (
+        parallel_env(world, 2, **SHORT, **settings).action_space("robot_0")
+        for settings in (
             {},
             {"observation": SHOWN},
             {"planner": direct},
@@ -162,7 +162,7 @@ def test_the_env_says_what_agents_take(world, interfaces):
             {"action": "goal", "observation": SHOWN},
         )
     ]
-    assert [getattr(one, "n", one.shape) for one in spaces] == [None, 8, (2,), 24, 8, (2,)]
+    assert [getattr(space, "n", space.shape) for space in spaces] == [None, 8, (2,), 24, 8, (2,)]
     kept = parallel_env(world, 2, action="targets", observation=ObservationConfig(targets=4), **SHORT)
     assert kept.reset()[0]["robot_1"]["map"].any() and kept.state().shape == (3, 125, 125)
     other = parallel_env(world, 2, action="goal", observation=SHOWN, **SHORT)
@@ -186,7 +186,7 @@ def test_a_batch_tells_its_masks(world, interfaces):
         assert batch.observation_space.contains(seen) and "team_map" not in seen
         mask = info["action_mask"]
         assert mask.shape == (3, 2, 24) and np.array_equal(mask, seen["action_mask"]) and mask.any(-1).all()
-        actions = np.stack([batch.single_action_space.sample(mask=tuple(one)) for one in mask])
+        actions = np.stack([batch.single_action_space.sample(mask=tuple(row)) for row in mask])
         assert np.take_along_axis(mask, actions[..., None], -1).all()
         seen, reward, _, _, info = batch.step(actions)
         assert np.allclose(reward, info["robot_reward"].sum(1))
@@ -204,9 +204,9 @@ def test_one_team_is_the_batchs_first(world, interfaces, action):
     env.reset(seed=3)
     batch.reset(seed=3)
     for _ in range(SHORT["macro_steps"]):
-        one = env.action_space.sample()
-        many = {name: value[None] for name, value in one.items()} if isinstance(one, dict) else one[None]
-        seen, reward, ended, cut, info = env.step(one)
+        sampled = env.action_space.sample()
+        many = {name: value[None] for name, value in sampled.items()} if isinstance(sampled, dict) else sampled[None]
+        seen, reward, ended, cut, info = env.step(sampled)
         expected = batch.step(many)
         assert env.observation_space.contains(seen) and type(reward) is float
         assert all(np.array_equal(value, expected[0][name][0]) for name, value in seen.items())

@@ -210,8 +210,8 @@ def test_teams_that_end_at_different_times(world):
     """Only those that were done start anew; the others' step counts."""
     batch = vector_env(world, 4, 2, success_coverage=0.25, **SHORT | {"macro_steps": 9})
     steps = play(batch, 30)
-    ended = np.stack([one[2] | one[3] for one in steps])
-    after = np.stack([one[4]["local_steps"] for one in steps])[1:]
+    ended = np.stack([step[2] | step[3] for step in steps])
+    after = np.stack([step[4]["local_steps"] for step in steps])[1:]
     assert 1 < len({*np.argmax(ended, axis=0)}) and ended.any(0).all()
     assert np.array_equal(after == 0, ended[:-1])
 

@@ -101,7 +101,7 @@ def test_a_branch_of_the_same_choice_goes_as_the_original():
     env = explored([room(29, 22), room(21, 31, "rotated")])
     branches = Branches(env, 3, 2)
     policy, td = POLICIES["nearest_frontier"](env), env.observe()
-    before = {name: one.clone() for name, one in env.simulation.tensors.items() if name in STATE}
+    before = {name: tensor.clone() for name, tensor in env.simulation.tensors.items() if name in STATE}
     td = policy(td)
     branches.look(torch.arange(3))
     branches.branch(0, torch.ones(3, 2, dtype=torch.bool))
@@ -110,7 +110,7 @@ def test_a_branch_of_the_same_choice_goes_as_the_original():
     ours["wanted"].copy_(from_regions(env.simulation, action["region"], action["offset"]).repeat_interleave(2, 0))
     branches.env.simulation.set_goals()
     branches.env.simulation.step(0, env.local_steps)
-    assert all(torch.equal(env.simulation.tensors[name], one) for name, one in before.items())
+    assert all(torch.equal(env.simulation.tensors[name], tensor) for name, tensor in before.items())
     env.step(td)
     for name in names:
         assert torch.equal(ours[name], env.simulation.tensors[name].repeat_interleave(2, 0)), name

@@ -35,7 +35,7 @@ def test_settings_with_several_values_become_every_combination():
     prepared = move_sweeps(words)
     cfg = compose_config("bench", prepared)
     points = sweep_points(cfg, prepared, [2])
-    found = [(one.num_envs, one.scenario.name, one.num_robots) for one in points]
+    found = [(point.num_envs, point.scenario.name, point.num_robots) for point in points]
     assert found == [(e, s, n) for e in (2, 4) for s in ("maze", "maze_small") for n in (3, 5)]
 
 
@@ -71,7 +71,7 @@ def test_kernels_are_timed_and_compared(capsys):
     for row in first["rows"]:
         assert 0 < row["in_place_us"]["p10"] <= row["in_place_us"]["median"] <= row["in_place_us"]["p90"]
         assert row["alone_us"]["median"] > 0
-    assert all(one > 0 for one in first["ceilings"].values())
+    assert all(ceiling > 0 for ceiling in first["ceilings"].values())
     # an earlier run in which one kernel was ten times as fast, all beyond doubt
     for row in first["rows"]:
         factor = 0.1 if row["kernel"] == "scan_free" else 1.0
@@ -97,7 +97,7 @@ def test_training_is_split_into_its_parts_for_every_network(capsys):
         assert row["macro_steps"] == 4 and row["iterations"] >= 3
         assert row["robot_macro_steps_per_second"] == pytest.approx(4 * 2 / whole)
     rates = [row["robot_macro_steps_per_second"] for row in (small, paper)]  # which is slower, a busy machine decides
-    assert [row["times_the_slowest"] for row in (small, paper)] == pytest.approx([one / min(rates) for one in rates])
+    assert [row["times_the_slowest"] for row in (small, paper)] == pytest.approx([rate / min(rates) for rate in rates])
     assert "robot-steps/s" in capsys.readouterr().out
 
 
@@ -109,7 +109,7 @@ def test_scale_goes_along_its_axes(capsys):
     assert [row["num_robots"] for row in axes["robots"]["rows"]] == [2, 4, 8]
     assert all(row["num_envs"] == 2 for row in axes["robots"]["rows"])  # what was set stays
     small, large = axes["envs"]["rows"]
-    costs = [one["seconds_per_local_step"] for one in (small, large)]
+    costs = [point["seconds_per_local_step"] for point in (small, large)]
     assert axes["envs"]["worst_over_linear"] == pytest.approx(costs[1] / costs[0] / 8)
     assert axes["envs"]["worst_from"] == 1 and axes["robots"]["worst_from"] in (2, 4)
     assert 0 < costs[0] * small["robot_local_steps_per_second"] < 4  # the rate counts waits, the cost does not

@@ -26,7 +26,7 @@ def test_the_ratio_to_the_dense_filter_holds():
         ratios.append(measure_ratio())
         if RECORDED_RATIO / 2 < ratios[-1] < RECORDED_RATIO * 2:
             return
-    found = ", ".join(f"{one:.0f}" for one in ratios)
+    found = ", ".join(f"{ratio:.0f}" for ratio in ratios)
     raise AssertionError(
         f"the dense filter takes {found} times as long as the kernels, recorded is {RECORDED_RATIO}: the radar became "
         "slower, or so much faster that the record is out of date (see RECORDED_RATIO)"

@@ -33,15 +33,15 @@ pytestmark = pytest.mark.slow  # trainings
 
 def test_seeds_are_outermost_and_classical_policies_first():
     assert list_cells(settings(*TINY)) == CELLS
-    two = [f"{one.seed} {one.scenario}" for one in list_cells(settings(*TINY, "scenarios=maze,outdoor"))]
+    two = [f"{cell.seed} {cell.scenario}" for cell in list_cells(settings(*TINY, "scenarios=maze,outdoor"))]
     assert list(dict.fromkeys(two)) == ["0 maze", "0 outdoor", "1 maze", "1 outdoor"]
 
 
 def test_the_papers_preset_has_its_288_runs():
     cfg = settings("preset=paper")
-    trained = [one for one in list_cells(cfg) if one.trains]
+    trained = [cell for cell in list_cells(cfg) if cell.trains]
     assert len(trained) == 6 * 16 * 3
-    maps = {(one.scenario, one.map) for one in trained}
+    maps = {(cell.scenario, cell.map) for cell in trained}
     assert sorted(name for name, _ in maps).count("outdoor") == 3 and len(maps) == 16
     run, words = cell_config(cfg, Cell("maze", "itrpo", 2, map=3))
     assert (run.scenario.name, run.algorithm.name, run.seed, list(run.scenario.maps)) == ("maze", "itrpo", 2, [3])
@@ -67,7 +67,7 @@ def test_every_setting_reaches_every_cell():
         "robot.team=[{kind: differential, radar: {range: 3}}]",
         "algorithm.lr=0.5",
     )
-    assert [one.name for one in list_cells(cfg)] == ["maze/mappo/seed_3", "indoor_small/mappo/seed_3"]
+    assert [cell.name for cell in list_cells(cfg)] == ["maze/mappo/seed_3", "indoor_small/mappo/seed_3"]
     run, _ = cell_config(cfg, list_cells(cfg)[1])
     assert (run.planner.name, run.radar.range, run.algorithm.lr, run.seed) == ("dwa", 7.0, 0.5, 3)
     assert list(run.scenario.maps) == [0, 1] and run.scenario.held_out_count == 1
@@ -106,7 +106,7 @@ def test_files_and_summaries(whole_run):
     assert set(flat) == {"voronoi", "random", "mappo", "difference", "run"}
     assert summary["maze_small"]["mappo"] == flat["mappo"]
     pooled = np.concatenate(
-        [read_result(whole_run, one, "held_out").episodes["exploration_ratio"] for one in CELLS[2::3]]
+        [read_result(whole_run, cell, "held_out").episodes["exploration_ratio"] for cell in CELLS[2::3]]
     )
     coverage = flat["mappo"]["exploration_ratio"]
     assert coverage["n"] == 6 == len(pooled)
@@ -132,8 +132,8 @@ def test_a_planners_cell_says_the_episodes_of_its_result(tmp_path, monkeypatch):
 def test_every_policy_meets_the_same_maps_and_starts(whole_run):
     """The first point of a coverage curve is the scan at the start, before anyone has moved."""
     for seed in (0, 1):
-        starts = [read_result(whole_run, one, "held_out").coverage[:, 0] for one in CELLS if one.seed == seed]
-        assert all((one == starts[0]).all() for one in starts)
+        starts = [read_result(whole_run, cell, "held_out").coverage[:, 0] for cell in CELLS if cell.seed == seed]
+        assert all((start == starts[0]).all() for start in starts)
         assert len(set(starts[0])) == 3
     assert (read_result(whole_run, CELLS[0], "held_out").coverage[:, 0] != starts[0]).any()
 
@@ -220,7 +220,7 @@ def test_longer_than_a_day_needs_a_yes(capsys, tmp_path, monkeypatch):
 def test_planners_play_validation_maps_and_the_report_says_who_is_best(whole_run):
     voronoi, random = CELLS[0], CELLS[1]
     assert {voronoi.policy, random.policy} == {"voronoi", "random"}
-    voronoi, random = sorted((voronoi, random), key=lambda one: one.policy != "voronoi")
+    voronoi, random = sorted((voronoi, random), key=lambda result: result.policy != "voronoi")
     assert set(read_result(whole_run, voronoi, "validation").maps) <= {f"maze_small_{k}" for k in range(51, 64)}
     assert not (cell_folder(whole_run, random) / "validation.json").exists()
     flat = json.loads((whole_run / "summaries" / "maze_small.json").read_text())

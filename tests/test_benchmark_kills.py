@@ -32,20 +32,20 @@ def wait_for(path: Path, process: subprocess.Popen, lines: int = 1) -> None:
 
 def workers_of(process: subprocess.Popen) -> list[int]:
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    return [int(one) for one in children if "benchmark.worker" in Path(f"/proc/{one}/cmdline").read_text()]
+    return [int(child) for child in children if "benchmark.worker" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
 @contextlib.contextmanager
 def held(workers: list[int]):
     """Processes stand still until each has been sent SIGTERM."""
-    for one in workers:
-        os.kill(one, signal.SIGSTOP)
+    for worker in workers:
+        os.kill(worker, signal.SIGSTOP)
     yield
     end = time.monotonic() + 60
-    while not all(asked_to_end(one) for one in workers) and time.monotonic() < end:
+    while not all(asked_to_end(worker) for worker in workers) and time.monotonic() < end:
         time.sleep(0.02)
-    for one in workers:
-        os.kill(one, signal.SIGCONT)
+    for worker in workers:
+        os.kill(worker, signal.SIGCONT)
     assert time.monotonic() < end, "the workers were not told to stop"
 
 
@@ -57,11 +57,11 @@ def asked_to_end(process: int) -> bool:
 
 def assert_same_cells(first: Path, second: Path) -> None:
     for cell in CELLS:
-        one, other = (read_result(folder, cell, "held_out") for folder in (first, second))
-        assert one.episodes.keys() == other.episodes.keys()
-        for name, values in one.episodes.items():
-            np.testing.assert_array_equal(values, other.episodes[name], err_msg=f"{cell.name} {name}")
-        np.testing.assert_array_equal(one.coverage, other.coverage)
+        ours, theirs = (read_result(folder, cell, "held_out") for folder in (first, second))
+        assert ours.episodes.keys() == theirs.episodes.keys()
+        for name, values in ours.episodes.items():
+            np.testing.assert_array_equal(values, theirs.episodes[name], err_msg=f"{cell.name} {name}")
+        np.testing.assert_array_equal(ours.coverage, theirs.coverage)
     assert (first / "table.csv").read_text() == (second / "table.csv").read_text()
 
 

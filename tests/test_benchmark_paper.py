@@ -38,7 +38,7 @@ def printed_table() -> tuple[dict, dict]:
         assert len(cells) == 18
         for k, cell in enumerate(cells):
             key = SCENARIOS[k // 3], name, COLUMNS[3 * block + k % 3]
-            numbers = [float(one) for one in re.findall(r"\d+(?:\.\d+)?", cell.replace("textbf", ""))]
+            numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", cell.replace("textbf", ""))]
             values[key] = tuple(numbers) if numbers else None
             bold[key] = "textbf" in cell
     return values, bold
@@ -49,7 +49,7 @@ def test_the_papers_numbers_are_the_papers():
     ours = {}
     for scenario, rows in PAPER.items():
         for name, row in rows.items():
-            ours |= {(scenario, name, metric): one for metric, one in zip(COLUMNS, row, strict=True)}
+            ours |= {(scenario, name, metric): value for metric, value in zip(COLUMNS, row, strict=True)}
     assert len(ours) == 6 * 6 * 6 and ours == values
 
 

@@ -59,9 +59,9 @@ def test_csv_has_a_row_for_every_scenario_policy_and_metric(tables):
     rows = list(csv.DictReader(StringIO(table_csv(tables))))
     assert len(rows) == 4 * (len(ROWS) + 1)
     found = {(row["scenario"], row["policy"], row["metric"]): row for row in rows}
-    one = found["maze", "ippo", "coverage_step_95"]
-    assert (float(one["mean"]), one["reached"], one["episodes"], one["best"]) == (400, "3", "6", "1")
-    assert float(one["paper_mean"]) == 441
+    row = found["maze", "ippo", "coverage_step_95"]
+    assert (float(row["mean"]), row["reached"], row["episodes"], row["best"]) == (400, "3", "6", "1")
+    assert float(row["paper_mean"]) == 441
     assert found["maze", "random", "coverage_step_95"]["mean"] == ""
     assert float(found["maze", "ippo", "exploration_ratio"]["paper_mean"]) == pytest.approx(0.9317)
     ties = [found["maze_small", name, "exploration_ratio"]["best"] for name in ("random", "voronoi")]
@@ -145,8 +145,11 @@ def test_copies_of_an_episode_are_told_and_give_no_interval():
 
 
 def test_the_best_planner_is_the_one_that_saw_most_over_time_on_validation_maps():
-    one, other = [played("voronoi", [0.5, 0.7])], [played("hungarian", [0.9, 0.1]), played("hungarian", [0.9, 0.4], 1)]
-    found = {"voronoi": one, "hungarian": other, "rrt_frontiers": []}
+    voronoi, hungarian = (
+        [played("voronoi", [0.5, 0.7])],
+        [played("hungarian", [0.9, 0.1]), played("hungarian", [0.9, 0.4], 1)],
+    )
+    found = {"voronoi": voronoi, "hungarian": hungarian, "rrt_frontiers": []}
     found = {name: [result for _, result in cells] for name, cells in found.items()}
     assert find_best(found) == "voronoi" and find_best({}) is None
 

@@ -38,21 +38,21 @@ WORDS = [
 
 def test_cells_of_all_scenarios_share_one_training():
     cfg = settings(*WORDS)
-    trained = [one for one in list_cells(cfg) if one.trains]
-    assert [one.scenario for one in trained] == ["maze_small", "random_obstacles"]
-    assert {training_cell(cfg, one) for one in trained} == {Cell("together", "mappo", 0)}
+    trained = [cell for cell in list_cells(cfg) if cell.trains]
+    assert [cell.scenario for cell in trained] == ["maze_small", "random_obstacles"]
+    assert {training_cell(cfg, cell) for cell in trained} == {Cell("together", "mappo", 0)}
     words = cell_overrides(cfg, Cell("together", "mappo", 0))
     assert "scenario=maze_small" in words and "scenario.also=['random_obstacles']" in words
     assert not any(word.startswith("scenario.also") for word in cell_overrides(cfg, trained[0]))
     apart = settings(*[word for word in WORDS if word != "together=true"])
-    assert [training_cell(apart, one) for one in trained] == trained
+    assert [training_cell(apart, cell) for cell in trained] == trained
 
 
 def test_it_trains_once_and_plays_everywhere(tmp_path, capsys):
     folder = tmp_path / "bench"
     assert main(["benchmark", *WORDS, f"hydra.run.dir={folder}"]) == 0
     runs = sorted(path.parent.relative_to(folder / "cells") for path in folder.glob("cells/**/checkpoints"))
-    assert [str(one) for one in runs] == ["together/mappo/seed_0"]
+    assert [str(run) for run in runs] == ["together/mappo/seed_0"]
     summary = json.loads((folder / "summary.json").read_text())
     for scenario in ("maze_small", "random_obstacles"):
         assert summary[scenario]["mappo"]["coverage_auc"]["n"] == 2
@@ -67,7 +67,9 @@ def test_it_trains_once_and_plays_everywhere(tmp_path, capsys):
     assert run_cell(settings(*WORDS), folder, cell, EnvShelf(), ["held_out"]) and finished(folder, cell, "held_out")
     assert (folder / "cells" / cell.name / "held_out.npz").read_bytes() == played, "with the same policy"
     after = find_checkpoint(folder / "cells/together/mappo/seed_0")[1]
-    assert all(torch.equal(after["policy"][name], one) for name, one in before["policy"].items()), "not trained again"
+    assert all(torch.equal(after["policy"][name], tensor) for name, tensor in before["policy"].items()), (
+        "not trained again"
+    )
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,7 @@ def test_a_candidate_is_worth_what_comes_of_it():
         points = env.target_view.state["point"].clone()
         state = env.simulation.tensors
         total = env.simulation.map_tensors["total_weight"][state["map_id"].long()]
-        area = torch.tensor([one.free_area for one in env.maps])[state["map_id"].long()]
+        area = torch.tensor([world.free_area for world in env.maps])[state["map_id"].long()]
         disc = total / area * torch.pi * env.radar_configs[0].range ** 2
         for robot in range(2):
             for k in range(3):
@@ -93,12 +93,14 @@ def test_the_files_and_that_those_there_are_kept(tmp_path, monkeypatch, capsys):
     assert first.read_bytes() == before
     assert (tmp_path / "b" / "costs.csv").read_text().count("\n") == 3  # the head, and each file once
     for turn in range(2):
-        one, two = (dict(np.load(tmp_path / k / f"branches_maze_small_{turn}.npz")) for k in "ab")
-        assert all(np.array_equal(one[name], two[name], equal_nan=one[name].dtype.kind == "f") for name in one)
-    there = one["index"] >= 0
-    assert np.array_equal(np.isfinite(one["advantage"]), there) and (one["advantage"][..., 0][there[..., 0]] == 0).all()
-    assert np.take_along_axis(one["mask"], np.maximum(one["index"], 0).astype(int), 2)[there].all()
-    assert len({*map(tuple, one["features"][:, 0, 0].tolist())}) > 1
+        ours, theirs = (dict(np.load(tmp_path / k / f"branches_maze_small_{turn}.npz")) for k in "ab")
+        assert all(np.array_equal(ours[name], theirs[name], equal_nan=ours[name].dtype.kind == "f") for name in ours)
+    there = ours["index"] >= 0
+    assert (
+        np.array_equal(np.isfinite(ours["advantage"]), there) and (ours["advantage"][..., 0][there[..., 0]] == 0).all()
+    )
+    assert np.take_along_axis(ours["mask"], np.maximum(ours["index"], 0).astype(int), 2)[there].all()
+    assert len({*map(tuple, ours["features"][:, 0, 0].tolist())}) > 1
 
 
 @pytest.mark.parametrize(

@@ -117,8 +117,8 @@ def test_points_farther_apart_than_the_radar_reaches_are_an_error():
     maze = make_map("maze_small", 3)
     huge = PointCloudMap(maze.free * 16_000.0, maze.obstacles * 16_000.0, maze.resolution * 16_000.0)
     report = check_map(huge)
-    assert not report.ok and any("check the units" in one for one in report.errors)
-    assert not any("check the units" in one for one in check_map(maze).errors)
+    assert not report.ok and any("check the units" in error for error in report.errors)
+    assert not any("check the units" in error for error in check_map(maze).errors)
     with pytest.raises(MapError, match="check the units"):
         repair_map(huge)
 

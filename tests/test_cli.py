@@ -237,7 +237,7 @@ def test_maps_import_of_a_real_floor(capsys, data_dir, tmp_path):
 
 def test_evaluate_writes_results_for_every_team_size(capsys, tmp_path):
     words = ["policy=random,nearest_frontier", "num_robots=1,2", "episodes=5", f"hydra.run.dir={tmp_path}/e"]
-    assert main(["evaluate", *[one for one in TINY if "collector" not in one], *words]) == 0
+    assert main(["evaluate", *[word for word in TINY if "collector" not in word], *words]) == 0
     results = json.loads((tmp_path / "e" / "results.json").read_text())
     assert set(results) == {"random N=1", "random N=2", "nearest_frontier N=1", "nearest_frontier N=2", "run"}
     coverage = results["random N=2"]["exploration_ratio"]

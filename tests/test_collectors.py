@@ -56,8 +56,8 @@ def play(first: int, count: int) -> list[torch.Tensor]:
 
 def test_two_envs_of_four_teams_play_what_one_of_eight_plays():
     whole, halves = play(0, 8), (play(0, 4), play(4, 4))
-    for one, *parts in zip(whole, *halves, strict=True):
-        assert torch.equal(one, torch.cat(parts))
+    for tensor, *parts in zip(whole, *halves, strict=True):
+        assert torch.equal(tensor, torch.cat(parts))
     assert not torch.equal(halves[0][1], halves[1][1]), "the halves must not repeat each other"
     with pytest.raises(ValueError, match="first_env=-1"):
         play(-1, 4)
@@ -67,13 +67,13 @@ def test_teams_are_shared_among_sizes_and_workers():
     assert divide_teams(8, [3]) == [Teams(3, 8, 0)]
     for count, sizes, workers in ((32, [2, 3, 4], 1), (32, [2, 3, 4], 2), (9, [1, 5], 3), (6, [4, 1, 2], 2)):
         teams = divide_teams(count, sizes, workers)
-        numbers = [one.first_env + k for one in teams for k in range(one.num_envs)]
+        numbers = [team.first_env + k for team in teams for k in range(team.num_envs)]
         assert numbers == list(range(count)), "every team once"
-        assert [one.num_robots for one in teams] == sizes
-        counts = [one.num_envs for one in teams]
-        assert max(counts) - min(counts) <= workers and all(one % workers == 0 for one in counts)
+        assert [team.num_robots for team in teams] == sizes
+        counts = [team.num_envs for team in teams]
+        assert max(counts) - min(counts) <= workers and all(number % workers == 0 for number in counts)
         shares = teams[-1].split(workers)
-        assert len({one.num_envs for one in shares}) == 1 and shares[-1].first_env + shares[-1].num_envs == count
+        assert len({share.num_envs for share in shares}) == 1 and shares[-1].first_env + shares[-1].num_envs == count
     with pytest.raises(UserError, match="num_envs=7 cannot be shared evenly by collector.workers=2"):
         divide_teams(7, [3], 2)
     with pytest.raises(UserError, match="num_envs=4 is too few for 3 team sizes .* choose 6 or more"):
@@ -90,10 +90,10 @@ def test_statistics_of_several_sizes_are_those_of_all_robots_and_episodes():
     alive = batches[1]["agents", "observation", "alive"]
     alive[0, 2:, 0] = False  # as if one robot had collided: it earns without deciding
     found = batch_statistics(*batches)
-    robots = [one for b in batches for one in b["next", "agents", "reward"].flatten().tolist()]
+    robots = [reward for b in batches for reward in b["next", "agents", "reward"].flatten().tolist()]
     assert len(robots) == 3 * 4 * 1 + 2 * 4 * 3
     assert found["reward"] == pytest.approx(sum(robots) / (len(robots) - 2), rel=1e-5)
-    times = [one for b in batches for one in b["next", "info", "reward_time"].flatten().tolist()]
+    times = [term for b in batches for term in b["next", "info", "reward_time"].flatten().tolist()]
     assert found["reward_time"] == pytest.approx(sum(times) / (len(robots) - 2), rel=1e-5)
     ends = [b["next"][e, t] for b in batches for e, t in grid(*b.shape) if bool(b["next", "done"][e, t])]
     assert found["episodes"] == len(ends) == 3 * 2 + 2 * 1
@@ -155,8 +155,8 @@ def make_experience():
         return learner, experience
 
     yield make
-    for one in made:
-        one.shutdown()
+    for experience in made:
+        experience.shutdown()
 
 
 def differing(first, second) -> set[str]:
@@ -193,13 +193,13 @@ def test_two_workers_gather_what_their_teams_see_and_a_killed_one_is_named(make_
     learner, experience = make_experience("collector=processes")
     assert 0 < max(handed_over) < 2**16, "more would wait for ever on a worker that ends as it starts"
     _, alone = make_experience()
-    begins = [one.next()[0][:, 0] for one in (experience, alone)]
+    begins = [gatherer.next()[0][:, 0] for gatherer in (experience, alone)]
     for key in (("agents", "observation", "map"), ("agents", "observation", "pose"), ("info", "coverage")):
-        assert torch.equal(*(one[key] for one in begins)), "team i is team i, whoever simulates it"
+        assert torch.equal(*(batch[key] for batch in begins)), "team i is team i, whoever simulates it"
 
     state = experience.state_dict()
-    first = [one.clone() for one in experience.next()]
-    second = [one.clone() for one in experience.next()]
+    first = [batch.clone() for batch in experience.next()]
+    second = [batch.clone() for batch in experience.next()]
     experience.load_state_dict(state)
     assert not differing(experience.next(), first)
     assert not differing(experience.next(), second)
@@ -233,12 +233,12 @@ def test_one_batch_ahead_the_policy_is_one_batch_old(make_experience):
     state = experience.state_dict()
     change(learner.policy)
     experience.update_policy_weights_()
-    old, new = ([one.clone() for one in experience.next()] for _ in range(2))
-    assert [one["agents", "params"].shape[2] for one in new] == [1, 2]
+    old, new = ([batch.clone() for batch in experience.next()] for _ in range(2))
+    assert [batch["agents", "params"].shape[2] for batch in new] == [1, 2]
 
     def acting(batches) -> list:
         with torch.no_grad():
-            return [learner.policy.get_dist_params(one.clone())["agents", "params"] for one in batches]
+            return [learner.policy.get_dist_params(batch.clone())["agents", "params"] for batch in batches]
 
     for batch, params in zip(new, acting(new), strict=True):
         torch.testing.assert_close(params["region"], batch["agents", "params", "region"])
@@ -254,11 +254,11 @@ def test_ray_workers_go_on_where_they_were_and_a_killed_one_is_named(make_experi
     pytest.importorskip("ray", reason="RAY ABSENT: pip install -c constraints.txt 'maexp[ray]' to test collector=ray")
     learner, experience = make_experience("collector=ray")
     _, alone = make_experience()
-    begins = [one.next()[0][:, 0] for one in (experience, alone)]
-    assert torch.equal(*(one["agents", "observation", "map"] for one in begins))
+    begins = [gatherer.next()[0][:, 0] for gatherer in (experience, alone)]
+    assert torch.equal(*(batch["agents", "observation", "map"] for batch in begins))
     assert begins[0].shape == (4,)
     state = experience.state_dict()
-    first = [one.clone() for one in experience.next()]
+    first = [batch.clone() for batch in experience.next()]
     experience.load_state_dict(state)
     assert not differing(experience.next(), first)
     change(learner.policy)
@@ -306,8 +306,8 @@ def descendants(pid: int) -> list[int]:
     """Processes below this one that run our code (not multiprocessing's own helper)."""
     found, waiting = [], [pid]
     while waiting:
-        one = waiting.pop()
-        for task in Path(f"/proc/{one}/task").glob("*/children"):
+        parent = waiting.pop()
+        for task in Path(f"/proc/{parent}/task").glob("*/children"):
             children = [int(word) for word in task.read_text().split()]
             waiting += children
             found += [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
@@ -434,6 +434,6 @@ def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeyp
     if "wandb" in present:
         runs = sorted(Path("run/wandb").glob("offline-run-*"))
         identity = Path("run/wandb/identity").read_text()
-        assert len(runs) == 2 and all(one.name.endswith(identity) for one in runs), "resumed is the same run"
+        assert len(runs) == 2 and all(run.name.endswith(identity) for run in runs), "resumed is the same run"
     if absent:
         pytest.skip(f"{absent[0].upper()} ABSENT: the rest passed; pip install -c constraints.txt 'maexp[{absent[0]}]'")

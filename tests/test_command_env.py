@@ -28,7 +28,7 @@ WORDS = [
 def same(first, second) -> None:
     """Two envs: the same settings, maps and episodes."""
     assert first.settings == second.settings
-    assert [one.name for one in first.maps] == [one.name for one in second.maps]
+    assert [world.name for world in first.maps] == [world.name for world in second.maps]
     for env in (first, second):
         env.simulation.tensors["episode"].fill_(-1)  # a collector has begun an episode already
     batches = [
@@ -55,7 +55,9 @@ def test_the_env_is_that_of_maexp_train(tmp_path):
 def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [*WORDS, "scenario.held_out=[70]", "scenario.validation=[9]"]
-    names = [[one.name for one in make_env(*words, split=split).maps] for split in ("train", "validation", "held_out")]
+    names = [
+        [world.name for world in make_env(*words, split=split).maps] for split in ("train", "validation", "held_out")
+    ]
     assert names == [["maze_small_0", "maze_small_3"], ["maze_small_9"], ["maze_small_70"]]
     assert make_env(*words, verb="evaluate").maps[0].name == "maze_small_70"
     assert main(["train", *words, "total_frames=6", "episodes=0", "evaluate_every=0", "hydra.run.dir=run"]) == 0

@@ -46,7 +46,7 @@ REGIONS = ["action=regions"]  # action=targets brings settings of its own
 
 
 def values(node, kind: type) -> dict:
-    return {one.name: node[one.name] for one in fields(kind)}
+    return {field.name: node[field.name] for field in fields(kind)}
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -146,11 +146,11 @@ def test_settings_reach_the_env_and_the_networks():
     words += ["reward.collision=5"]
     cfg = compose_config("train", words)
     maps = load_maps(cfg.scenario)
-    assert [one.name for one in maps.train] == ["maze_small_3"]
+    assert [world.name for world in maps.train] == ["maze_small_3"]
     env = make_env(cfg, maps.train, 2)
     assert (env.num_envs, env.num_robots, env.macro_steps) == (2, 2, 4)
-    assert {one.range for one in env.radar_configs} == {7.0}
-    assert {one.max_speed for one in env.robot_configs} == {3.0}
+    assert {radar.range for radar in env.radar_configs} == {7.0}
+    assert {robot.max_speed for robot in env.robot_configs} == {3.0}
     assert (env.planner_config.name, env.settings.reward.collision, env.comm_config.range) == ("dwa", 5.0, 9.0)
     assert model_settings(cfg).channels == 8
     assert make_learner(cfg, env).updater.settings.lr == 0.5
@@ -160,8 +160,8 @@ def test_a_team_of_different_robots():
     team = "robot.team=[{kind: differential, radar: {range: 3}},{max_speed: 1}]"
     cfg = compose_config("train", ["scenario=maze_small", team])
     robots, radars = team_configs(cfg, 3)
-    assert [one.kind for one in robots] == ["differential", "ackermann", "differential"]
-    assert [one.range for one in radars] == [3, 10.0, 3]
+    assert [robot.kind for robot in robots] == ["differential", "ackermann", "differential"]
+    assert [radar.range for radar in radars] == [3, 10.0, 3]
     with pytest.raises(UserError, match="robot.team has no setting wings"):
         team_configs(compose_config("train", ["robot.team=[{wings: 2}]"]), 3)
 
@@ -185,9 +185,9 @@ def test_no_validation_maps_as_before_there_were_any():
     """The maps trained on choose, as with maps of one's own."""
     assert indices("scenario.validation=[]") == ([*range(64)], [], [*range(64, 80)])
     suite = load_maps(compose_config("train", ["scenario.validation=[]", "scenario.maps=[1,0]"]).scenario)
-    assert [one.name for one in suite.validation] == ["indoor_medium_1", "indoor_medium_0"]
+    assert [world.name for world in suite.validation] == ["indoor_medium_1", "indoor_medium_0"]
     suite = load_maps(compose_config("train", ["scenario.validation=[7]", "scenario.maps=[1,0]"]).scenario)
-    assert [one.name for one in suite.validation] == ["indoor_medium_7"]
+    assert [world.name for world in suite.validation] == ["indoor_medium_7"]
 
 
 def test_more_held_out_maps_than_the_table_has():

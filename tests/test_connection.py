@@ -110,16 +110,18 @@ def test_it_chooses_as_its_class_does_inside(monkeypatch):
 def test_a_fault_costs_its_episode_and_nothing_else(kind, reason):
     with listening(f"hostile:{kind}") as (word, _):
         final, reasons, bad, _ = play_hosted(word, 60.0, 3.0 if "no answer" in reason else 60.0)
-    assert 0 < sum(bad) < ENVS and [bool(one) for one in reasons] == bad
-    assert all(one.startswith(reason) for one in reasons if one), reasons
-    steps = [20 * ((kind != "BadReset") if one else STEPS) for one in bad]
+    assert 0 < sum(bad) < ENVS and [bool(said) for said in reasons] == bad
+    assert all(said.startswith(reason) for said in reasons if said), reasons
+    steps = [20 * ((kind != "BadReset") if lost else STEPS) for lost in bad]
     assert final["local_steps"][:, 0].tolist() == steps
 
 
 def test_an_answer_too_many_is_no_answer_to_the_next_question():
     with listening("hostile:Twice") as (word, _):
         _, reasons, bad, _ = play_hosted(word)
-    assert [bool(one) for one in reasons] == bad and {one for one in reasons if one} == {"it spoke without being asked"}
+    assert [bool(reason) for reason in reasons] == bad and {reason for reason in reasons if reason} == {
+        "it spoke without being asked"
+    }
 
 
 def test_who_is_gone_loses_its_episodes_and_the_run_goes_on():
@@ -256,7 +258,7 @@ def test_the_table_of_decision_times(monkeypatch, capsys):
     monkeypatch.setattr(decision_times, "EPISODES", 2)
     decision_times.main("cost_utility", "inside", "process", "socket")
     rows = [line.split("|") for line in capsys.readouterr().out.splitlines()[-3:]]
-    inside, process, there = ([one.strip() for one in row[1:-1]] for row in rows)
+    inside, process, there = ([cell.strip() for cell in row[1:-1]] for row in rows)
     assert inside[2] == there[2] == "-" and float(process[2]) > 0
     for row in (process, there):
         assert row[-1].startswith("yes, to") and float(row[3]) > 0

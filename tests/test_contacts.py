@@ -122,7 +122,7 @@ def test_the_signal_is_that_of_the_known_map():
         m = int(nav.state["map_id"][e])
         width, height, edge = int(nav.width[m]), int(nav.height[m]), float(nav.cell_size[m])
         free = (nav.known[e, i, : width * height] == FREE).view(height, width).numpy()
-        a, b = ((one - nav.origin[m]).double().numpy() for one in (base[e], view.state["point"][e, i, k]))
+        a, b = ((place - nav.origin[m]).double().numpy() for place in (base[e], view.state["point"][e, i, k]))
         received, sure = radio.power(free, edge, a, b, 0.3, comm.power)
         margin = (received - comm.threshold) / 10.0
         if sure:
@@ -191,8 +191,8 @@ def test_a_policy_that_was_trained_without_it_plays_the_same():
     for env in envs:
         env.set_seed(3)
     plain, told = ([td["info"] for td in play(env, make_policy("universal", env), 5)] for env in envs)
-    for one, two in zip(plain, told, strict=True):
-        assert all(torch.equal(one[name], two[name]) for name in one.keys())
+    for first, second in zip(plain, told, strict=True):
+        assert all(torch.equal(first[name], second[name]) for name in first.keys())
 
 
 def chooser_of(policy) -> TargetChooser:
@@ -209,8 +209,8 @@ def test_weights_are_taken_by_a_policy_that_is_told():
     policy.load_state_dict(widened(universal.state_dict(), policy.state_dict()))
     assert chooser_of(policy).radio and not chooser_of(universal).radio
     with torch.no_grad():
-        one, two = (each(td.clone())["agents", "action", "preference"] for each in (policy, universal))
-    torch.testing.assert_close(one[..., :COUNT], two[..., :COUNT], atol=1e-4, rtol=1e-5)
+        first, second = (each(td.clone())["agents", "action", "preference"] for each in (policy, universal))
+    torch.testing.assert_close(first[..., :COUNT], second[..., :COUNT], atol=1e-4, rtol=1e-5)
     assert not td[TARGETS_MASK][..., TELL].any()
 
 

@@ -26,7 +26,7 @@ CASES = {
     "fixed starts": {"starts": "fixed"},
     "given starts": {"starts": [[7.0, 8.0, 0.0], [9.0, 12.0, 1.0], [11.0, 8.0, 2.0]]},
 }
-WAYS = {"pickle": lambda one: pickle.loads(pickle.dumps(one)), "deepcopy": copy.deepcopy, "copy": copy.copy}
+WAYS = {"pickle": lambda original: pickle.loads(pickle.dumps(original)), "deepcopy": copy.deepcopy, "copy": copy.copy}
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,10 @@ def play(env: ExplorationEnv, td: TensorDictBase, steps: int = 6) -> list[Tensor
 
 def assert_same(ours: list, theirs: list) -> None:
     assert len(ours) == len(theirs)
-    for one, other in zip(ours, theirs, strict=True):
-        assert set(one.keys(True, True)) == set(other.keys(True, True))
-        for key in one.keys(True, True):
-            assert torch.equal(one[key], other[key]), key
+    for first, second in zip(ours, theirs, strict=True):
+        assert set(first.keys(True, True)) == set(second.keys(True, True))
+        for key in first.keys(True, True):
+            assert torch.equal(first[key], second[key]), key
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -104,13 +104,13 @@ def test_transformed_envs_are_sent_too(maps):
     assert_same(play(env, td.clone()), play(other, td.clone()))
 
 
-def same(one, other) -> bool:
+def same(first, second) -> bool:
     """Whether nested results hold the same numbers."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
-    if isinstance(one, tuple | list):
-        return len(one) == len(other) and all(map(same, one, other))
-    return np.array_equal(one, other)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(first[name], second[name]) for name in first)
+    if isinstance(first, tuple | list):
+        return len(first) == len(second) and all(map(same, first, second))
+    return np.array_equal(first, second)
 
 
 @pytest.mark.parametrize("action", ["targets", "region_offset"])

@@ -49,7 +49,7 @@ def test_episodes_agree(device, planner):
     for key in (("agents", "observation", "pose"), ("agents", "reward"), ("info", "coverage")):
         torch.testing.assert_close(there[key], here[key], rtol=1e-3, atol=2e-3)
     assert here["info", "coverage"].max() > 0.2 and torch.equal(there["done"], here["done"])
-    pictures = [one["agents", "observation", "map"].int() for one in (here, there)]
+    pictures = [played["agents", "observation", "map"].int() for played in (here, there)]
     assert ((pictures[0] - pictures[1]).abs() > 2).float().mean() < 1e-3
 
 
@@ -57,12 +57,12 @@ def test_episodes_agree(device, planner):
 def test_radios_agree(device):
     """Who hears whom, what the base station knows, and fading, which is drawn from the same keys."""
     comm = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, base_station=True)
-    here, there = (play(one, "wavefront", comm=comm, done="base")["info"] for one in ("cpu", device))
+    here, there = (play(processor, "wavefront", comm=comm, done="base")["info"] for processor in ("cpu", device))
     for name in ("base_coverage", "worst_coverage", "base_coverage_auc", "counted_coverage", "connected"):
         torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
     assert 0.05 < here["connected"].mean() < 0.95 and here["base_coverage"].max() > 0.1
     free, points = torch.rand(9, 12) < 0.8, 8.0 * torch.rand(2, 50, 2)
-    found = [mk.received_power(free.to(one), *points, edge=0.9).cpu() for one in ("cpu", device)]
+    found = [mk.received_power(free.to(processor), *points, edge=0.9).cpu() for processor in ("cpu", device)]
     torch.testing.assert_close(*found, rtol=1e-4, atol=1e-3)
 
 
@@ -70,7 +70,7 @@ def test_radios_agree(device):
 def test_messages_agree(device):
     """What waits and what is under way: sums of points, the same on both."""
     comm = CommConfig(range=12.0, bandwidth=1000.0, delay=0.3, base_station=True)
-    here, there = (play(one, "wavefront", comm=comm)["info"] for one in ("cpu", device))
+    here, there = (play(processor, "wavefront", comm=comm)["info"] for processor in ("cpu", device))
     for name in ("base_coverage", "worst_coverage_auc", "bytes_sent"):
         torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
     assert 0 < here["bytes_sent"][-1].min() and here["bytes_sent"].max() <= 31 * 4 * 100  # steps, radios, bytes
@@ -80,7 +80,7 @@ def test_messages_agree(device):
 def test_failures_agree(device):
     """Who fails when is drawn from the same keys."""
     faults = FaultsConfig(probability=0.7, duration=0.8)
-    here, there = (play(one, "wavefront", faults=faults, macro_steps=6)["info"] for one in ("cpu", device))
+    here, there = (play(processor, "wavefront", faults=faults, macro_steps=6)["info"] for processor in ("cpu", device))
     assert torch.equal(there["failed"], here["failed"]) and 0.02 < here["failed"].float().mean() < 0.7
 
 
@@ -88,7 +88,7 @@ def test_failures_agree(device):
 def test_missed_returns_agree(device):
     """Which returns come is drawn from the same keys."""
     radar = RadarConfig(missed=0.4, noise=0.4, evidence=2, false_alarm=0.1)
-    here, there = (play(one, "wavefront", radar=radar)["info"] for one in ("cpu", device))
+    here, there = (play(processor, "wavefront", radar=radar)["info"] for processor in ("cpu", device))
     torch.testing.assert_close(there["coverage"], here["coverage"], rtol=1e-3, atol=2e-3)
     first = play("cpu", "wavefront")["info", "coverage"][0]
     assert here["coverage"].max() > 0.2 and (here["coverage"][0] < first).all()
@@ -98,7 +98,7 @@ def test_missed_returns_agree(device):
 def test_odometry_agrees(device):
     """How it drifts is drawn from the same keys."""
     odometry = OdometryConfig(drift=0.1, turn=0.05, jump=0.5, jump_rate=0.5)
-    here, there = (play(one, "wavefront", odometry=odometry) for one in ("cpu", device))
+    here, there = (play(processor, "wavefront", odometry=odometry) for processor in ("cpu", device))
     for key in (("agents", "observation", "pose"), ("info", "odometry_error"), ("info", "coverage")):
         torch.testing.assert_close(there[key], here[key], rtol=1e-3, atol=2e-3)
     assert 0.1 < here["info", "odometry_error"][-1].mean() < 2.0
@@ -107,11 +107,11 @@ def test_odometry_agrees(device):
 @pytest.mark.parametrize("device", DEVICES)
 def test_the_radar_agrees(device):
     world = room(30, 22, "jittered")
-    free, obstacles = (torch.as_tensor(one) for one in (world.free, world.obstacles))
+    free, obstacles = (torch.as_tensor(points) for points in (world.free, world.obstacles))
     for origin in free[:: len(free) // 7]:
         arguments = dict(radar_range=9.0, obstacle_radius=0.7)
         here = mk.visible_points(free, obstacles, origin, **arguments)
-        there = mk.visible_points(*(one.to(device) for one in (free, obstacles, origin)), **arguments)
+        there = mk.visible_points(*(tensor.to(device) for tensor in (free, obstacles, origin)), **arguments)
         assert there.device.type == device and 0 < here.sum() < len(free)
         assert (there.cpu() != here).sum() <= 1  # a point within 1e-6 of a threshold may fall either way
 

@@ -38,7 +38,7 @@ def make_env(num_envs=4, num_robots=3, shown=24, **settings) -> ExplorationEnv:
     first = room[0]
     starts = [first]
     for place in room[(room - first).norm(dim=-1).argsort()]:
-        if len(starts) < num_robots and min(float((place - one).norm()) for one in starts) >= 2.0:
+        if len(starts) < num_robots and min(float((place - start).norm()) for start in starts) >= 2.0:
             starts.append(place)
     env.set_starts(torch.cat([torch.stack(starts), torch.zeros(num_robots, 1)], -1))
     return env

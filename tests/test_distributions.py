@@ -67,9 +67,9 @@ def test_joint_log_probability_entropy_and_divergence_by_hand():
     log_prob, entropy, divergence = [], [], []
     for (p, loc, scale), (q, old_loc, old_scale), r, x in zip(*each, strict=True):
         log_prob.append([p[r], normal_log_density(x, loc[r], scale[r])])
-        normals = [sum(math.log(s) + 0.5 * math.log(2 * math.pi * math.e) for s in one) for one in scale]
+        normals = [sum(math.log(s) + 0.5 * math.log(2 * math.pi * math.e) for s in row) for row in scale]
         entropy.append(sum(math.exp(a) * (h - a) for a, h in zip(p, normals, strict=True)))
-        within = [normal_divergence(*one) for one in zip(old_loc, old_scale, loc, scale, strict=True)]
+        within = [normal_divergence(*parameters) for parameters in zip(old_loc, old_scale, loc, scale, strict=True)]
         divergence.append(sum(math.exp(a) * (a - b + d) for a, b, d in zip(q, p, within, strict=True)))
     out = dist.log_prob(action)
     found = torch.stack((out[REGION_LOG_PROB], out[OFFSET_LOG_PROB]), -1).flatten(0, 1)
@@ -85,7 +85,7 @@ def test_samples_agree_with_entropy_and_divergence(kind):
     dist, other = (kind(parameters(seed, kind is RegionHeads), REGION_HEADS) for seed in (0, 1))
     draws = dist.sample((20_000,))
     assert draws.batch_size == (20_000, BATCH, ROBOTS)
-    own, others = (sum(one.log_prob(draws).values(True, True)) for one in (dist, other))
+    own, others = (sum(distribution.log_prob(draws).values(True, True)) for distribution in (dist, other))
     torch.testing.assert_close(-own.mean(0), dist.entropy(), atol=0.05, rtol=0)
     ratio = own - others
     error = (ratio.mean(0) - other.divergence_from(parameters(0, kind is RegionHeads))).abs()
@@ -161,7 +161,7 @@ def test_heads_without_regions_are_plain():
 def test_divergence_stays_finite_where_a_probability_vanishes():
     """KL from the logits by hand in float64; torch's own is infinite where float32 has no such small probability."""
     before, now = torch.tensor([[0.0, -95.0, -1e9]]), torch.tensor([[-120.0, 0.0, -1e9]])
-    p, q = (one.double().log_softmax(-1) for one in (before, now))
+    p, q = (logits.double().log_softmax(-1) for logits in (before, now))
     expected = (p.exp() * (p - q)).sum(-1)
     found = divergence(Categorical(logits=before), Categorical(logits=now))
     torch.testing.assert_close(found.double(), expected)

@@ -65,7 +65,7 @@ def test_recording_changes_nothing_and_ends_where_the_episodes_end(env):
 
 def test_pooled_curves_share_their_times():
     """A place with longer episodes and other moments: what is done keeps its coverage."""
-    one, other = (
+    first, second = (
         EvaluationResult(
             "random",
             1,
@@ -78,7 +78,7 @@ def test_pooled_curves_share_their_times():
         )
         for times, coverage in (([0.0, 2.0], [0.0, 0.5]), ([0.0, 1.0, 4.0], [0.1, 0.4, 1.0]))
     )
-    both = pool([one, other])
+    both = pool([first, second])
     assert both.times.tolist() == [0, 1, 2, 4] and both.seconds == 2 and both.shares.shape == (2, 1)
     np.testing.assert_allclose(both.coverage, [[0, 0.25, 0.5, 0.5], [0.1, 0.4, 0.6, 1.0]])
 
@@ -136,10 +136,10 @@ def test_marks_beyond_the_end_of_an_episode_are_not_shown(goal, shown, capsys):
     assert in_reach("coverage_step_95", goal) and in_reach("coverage_auc", goal)
     assert not in_reach("mutual_overlap_95", 0.9)
     value = {name: np.ones(2) for name in COLUMNS}
-    one = EvaluationResult("random", 3, value, 1.0, np.array(["a", "b"]), success_coverage=goal)
-    print_results([one], "maze")
+    played = EvaluationResult("random", 3, value, 1.0, np.array(["a", "b"]), success_coverage=goal)
+    print_results([played], "maze")
     assert ("99 % at step" in capsys.readouterr().out) == shown
-    teams = [replace(one, policy="trained", learned=True), replace(one, policy="voronoi")]
+    teams = [replace(played, policy="trained", learned=True), replace(played, policy="voronoi")]
     assert ("+0 steps to 99 %" in describe_differences(teams, {3: "voronoi"})[0]) == shown
 
 
@@ -254,10 +254,10 @@ def test_copies_say_no_more_than_one():
 
 
 def test_copies_are_alike_on_one_map_in_all_metrics_of_all_policies():
-    one = {"coverage_auc": np.array([0.5, 0.5, 0.5, 0.5]), "steps": np.array([np.nan, np.nan, 7.0, np.nan])}
-    assert label_copies(np.array(list("aaab")), one).tolist() == [0, 0, 1, 2]
+    metrics = {"coverage_auc": np.array([0.5, 0.5, 0.5, 0.5]), "steps": np.array([np.nan, np.nan, 7.0, np.nan])}
+    assert label_copies(np.array(list("aaab")), metrics).tolist() == [0, 0, 1, 2]
     drawn = {"coverage_auc": np.array([0.1, 0.2, 0.1, 0.1])}
-    assert label_copies(np.array(list("aaab")), one, drawn).tolist() == [0, 1, 2, 3]
+    assert label_copies(np.array(list("aaab")), metrics, drawn).tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -357,11 +357,11 @@ def test_what_the_training_was_worth_is_a_sentence():
 
 
 def test_the_typical_episode_is_the_closest_to_the_mean():
-    one, other = result("trained", [0.5, 0.5], [1.0, 1.0]), result("voronoi", [0.5, 0.5], [1.0, 1.0])
-    one.episodes["coverage_auc"] = other.episodes["coverage_auc"] + np.array([0.4, 0.0, 0.1, 0.3, 0.2])
-    assert find_typical(one, other, 5) == (4, pytest.approx(0.2), pytest.approx(0.2))
-    assert find_typical(one, other, 3) == (2, pytest.approx(0.1), pytest.approx(0.2))
-    assert find_typical(other, None, 5)[0] == 2
+    trained, planner = result("trained", [0.5, 0.5], [1.0, 1.0]), result("voronoi", [0.5, 0.5], [1.0, 1.0])
+    trained.episodes["coverage_auc"] = planner.episodes["coverage_auc"] + np.array([0.4, 0.0, 0.1, 0.3, 0.2])
+    assert find_typical(trained, planner, 5) == (4, pytest.approx(0.2), pytest.approx(0.2))
+    assert find_typical(trained, planner, 3) == (2, pytest.approx(0.1), pytest.approx(0.2))
+    assert find_typical(planner, None, 5)[0] == 2
 
 
 def test_differences_pair_what_was_played_in_the_same_place_by_as_many():
@@ -372,7 +372,7 @@ def test_differences_pair_what_was_played_in_the_same_place_by_as_many():
         for policy in ("trained", "random")
     ]
     found = paired_differences(teams)
-    assert {one: list(others) for one, others in found.items()} == {
+    assert {name: list(others) for name, others in found.items()} == {
         "trained N=1": ["random N=1"],
         "trained on floor N=1": ["random on floor N=1"],
         "trained N=2": ["random N=2"],
@@ -398,9 +398,9 @@ def test_a_comma_in_a_files_name_and_two_maps_of_one_name(tmp_path):
     (tmp_path / "far").mkdir()
     for path in ("a,b.npz", "a.npz", "far/a.npz"):
         make_map("maze_small", 70).save(tmp_path / path)
-    one = compose_config("evaluate", make_overrides("evaluate", [f"scenario.path={tmp_path}/a,b.npz", *POINTCLOUD]))
-    assert [m.name for m in import_files(one.scenario)] == ["maze_small_70"]
+    comma = compose_config("evaluate", make_overrides("evaluate", [f"scenario.path={tmp_path}/a,b.npz", *POINTCLOUD]))
+    assert [m.name for m in import_files(comma.scenario)] == ["maze_small_70"]
     words = [f"scenario.path={tmp_path}/a.npz,{tmp_path}/far/a.npz", *POINTCLOUD]
-    two = compose_config("evaluate", make_overrides("evaluate", words))
+    namesakes = compose_config("evaluate", make_overrides("evaluate", words))
     with pytest.raises(UserError, match="two maps called"):
-        import_files(two.scenario)
+        import_files(namesakes.scenario)

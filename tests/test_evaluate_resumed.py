@@ -135,10 +135,10 @@ def test_ctrl_c_in_the_evaluation_after_a_training(tmp_path, monkeypatch, capsys
     assert "The training is done, its evaluation was stopped. Finish it with: maexp train 'resume=my run'" in told
     left = len(list(Path("my run").rglob("*.npz")))
     assert left == 2 and main(shlex.split(told.partition("Finish it with: ")[2])[1:]) == 0
-    ours, theirs = (json.loads((Path(one) / "summary.json").read_text()) for one in ("my run", "whole"))
-    for one in (ours, theirs):
+    ours, theirs = (json.loads((Path(folder) / "summary.json").read_text()) for folder in ("my run", "whole"))
+    for summary in (ours, theirs):
         for name in ("seconds", "training_seconds"):
-            del one["run"][name]
+            del summary["run"][name]
     assert ours == theirs and not Path("my run", FOLDER).exists()
 
 
@@ -153,7 +153,7 @@ def test_damaged_batches_are_played_again(tmp_path):
     kept = Kept(tmp_path, {})
     evaluate_recorded(POLICIES["random"](env), env, 6, kept=kept, **play)
     files = sorted(tmp_path.rglob("*.npz"))
-    assert [one.name for one in files] == ["000000.npz", "000002.npz", "000004.npz"]
+    assert [file.name for file in files] == ["000000.npz", "000002.npz", "000004.npz"]
     files[1].write_bytes(files[1].read_bytes()[:100])
     files[2].write_bytes(b"")
     before = torch.get_rng_state()
@@ -180,7 +180,7 @@ def test_batches_are_of_what_their_bits_follow_from(tmp_path):
         identify(cfg, env, 6, policy, "random", "changed"),
         identify(settings("radar.range=5"), env, 6, policy, "random"),
     ]
-    assert all(one != base for one in others)
+    assert all(other != base for other in others)
     Kept(tmp_path / "random", base).write(0, {"a": np.zeros(1)})
     assert Kept(tmp_path / "random", base).read(0) is not None and Kept(tmp_path / "random", base).read(6) is None
     with pytest.warns(UserWarning, match="what random was played with has changed since"):

@@ -73,7 +73,7 @@ def test_it_learns_what_branches_say():
     torch.manual_seed(0)
     policy, updater, _ = build(make_env(), lr=0.01, epochs=8, minibatch_size=32)
     told = [updater.update(batch(140, seed=k)) for k in range(6)]
-    assert [one["branched"] for one in told] == [120 * (k + 1) for k in range(6)]
+    assert [row["branched"] for row in told] == [120 * (k + 1) for k in range(6)]
     assert told[-1]["advantage_error"] < 0.3 * told[0]["advantage_error"]
     fresh = batch(100, seed=9)[:, 0]
     with torch.no_grad():
@@ -86,7 +86,7 @@ def test_memory_and_headroom():
     policy, updater, _ = build(make_env(), memory=50)
     told = updater.update(batch(40), batch(80, robots=3))
     assert told["branched"] == 34 + 50
-    best = torch.cat([one[ADVANTAGE][..., 1].flatten() for one in (batch(40), batch(80, robots=3))])
+    best = torch.cat([found[ADVANTAGE][..., 1].flatten() for found in (batch(40), batch(80, robots=3))])
     assert told["headroom"] == pytest.approx(best[best.isfinite()].clamp_min(0).mean().item(), abs=1e-6)
     nothing = updater.update(batch(1))  # its one decision was not branched at
     assert nothing["branched"] == 84 and "advantage_error" not in nothing
@@ -169,7 +169,7 @@ def test_begins_from_another_run(capsys):
     words = (*WORDS, "scenario=indoor_small", f"algorithm.begin_from={first}", "algorithm.final_lr_share=1")
     whole = run("whole", 2, *words)
     start = load_checkpoint(whole / "checkpoints" / START)
-    assert all(torch.equal(start["policy"][name], one) for name, one in known["policy"].items())
+    assert all(torch.equal(start["policy"][name], tensor) for name, tensor in known["policy"].items())
     mine, theirs = start["updater"]["memory"], known["updater"]["memory"]
     assert mine.keys() == theirs.keys()
     assert all(torch.equal(mine[n]["features"], theirs[n]["features"]) for n in theirs)

@@ -71,7 +71,7 @@ def test_features_are_those_of_the_env(num_robots):
         number = targets.block[ours.target] @ (1, across)
         for robot, some in enumerate(ours.mask):  # targets of the same value may stand in another order
             both = ((ours.features, number), (there, block))
-            a, b = (one[robot, some][np.argsort(key[robot, some])] for one, key in both)
+            a, b = (columns[robot, some][np.argsort(key[robot, some])] for columns, key in both)
             assert np.array_equal(np.sort(number[robot, some]), np.sort(block[robot, some]))
             np.testing.assert_allclose((a[:, planned] * a[:, 0]).sum(), (b[:, planned] * b[:, 0]).sum(), atol=1e-5)
             edge = np.abs(a[:, FEATURES.index("gain")] - LEAST_GAIN) < 1e-4  # there rounding says what is worth a way
@@ -131,7 +131,7 @@ def test_logits_are_those_of_torch_on_recorded_observations(policy, folder, num_
         assert np.array_equal(given.argmax(-1), wanted.argmax(-1))
     several = [torch.cat(parts) for parts in zip(*batch, strict=True)]
     names = ("features", "mask", "comm")
-    given = learned.session.run(["logits"], dict(zip(names, [one.numpy() for one in several], strict=True)))[0]
+    given = learned.session.run(["logits"], dict(zip(names, [tensor.numpy() for tensor in several], strict=True)))[0]
     with torch.no_grad():
         assert np.array_equal(given.argmax(-1), network(*several)[0].argmax(-1).numpy())
 

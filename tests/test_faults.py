@@ -229,7 +229,7 @@ def test_a_full_disk_during_a_benchmark_names_the_cells(capfd):
     assert told.count("free some space") > 1 and "2 cells are not done" in told
     assert "maze_small/random/seed_0 failed: " in told and "maze_small/voronoi/seed_0 failed: " in told
     assert "resume=b" in told and "Traceback" not in told
-    files = [one.name for one in Path("b").rglob("*") if one.is_file()]
+    files = [path.name for path in Path("b").rglob("*") if path.is_file()]
     assert not [name for name in files if "held_out" in name or name.endswith(".part")]
     assert main(["benchmark", "resume=b", "estimate=false"]) == 0
     assert read_result(Path("b"), CELL, "held_out").coverage.shape[0] == 300
@@ -354,7 +354,7 @@ def test_a_map_with_a_hostile_name_stays_in_the_run_folder(tmp_path, capsys):
     path = world.save(tmp_path / "x.npz")
     for action in ("check", "show", "import"):
         assert main(["maps", action, str(path), f"hydra.run.dir={tmp_path / 'a' / 'b' / action}"]) == 0
-        assert any("escaped" in one.name for one in (tmp_path / "a" / "b" / action).iterdir())
+        assert any("escaped" in file.name for file in (tmp_path / "a" / "b" / action).iterdir())
     assert not list(tmp_path.glob("escaped*")) and not list(tmp_path.glob("a/escaped*"))
 
 

@@ -105,11 +105,11 @@ def test_an_episode_is_told_with_its_units_and_a_seed_of_its_own():
         "seed": told[0]["seed"],
     }
     env.reset()
-    seeds = {one["seed"] for one in told} | {sight.episode(team)["seed"] for team in range(3)}
-    assert len(seeds) == 6 and all(0 <= one < 2**31 for one in seeds)
+    seeds = {episode["seed"] for episode in told} | {sight.episode(team)["seed"] for team in range(3)}
+    assert len(seeds) == 6 and all(0 <= seed < 2**31 for seed in seeds)
     larger = make_env(5, num_robots=2)
     larger.reset()
-    assert [TeamSight(larger).episode(team)["seed"] for team in range(3)] == [one["seed"] for one in told]
+    assert [TeamSight(larger).episode(team)["seed"] for team in range(3)] == [episode["seed"] for episode in told]
 
 
 def test_goals_in_metres_are_where_the_robots_are_sent():
@@ -121,7 +121,7 @@ def test_goals_in_metres_are_where_the_robots_are_sent():
     td[REGION], td[OFFSET] = sight.to_action(goals)
     env.step(td)
     goals[0, 1] = own
-    low, high = (np.array(one) for one in env.maps[0].extent)
+    low, high = (np.array(corner) for corner in env.maps[0].extent)
     goals[1, 2] = (high[0], low[1])
     assert np.allclose(env.simulation.tensors["goal"].numpy(), goals, atol=1e-4)
 
@@ -154,12 +154,12 @@ def test_a_foreign_policy_plays_every_team_of_an_env_with_an_object_of_its_own()
     for _ in range(10):
         td = env.step(policy(td))["next"]
     coverage = td["info", "coverage"][:, 0]
-    assert coverage.mean() > 0.5 and len({id(one) for one in agents}) == 4
-    assert {one.episode["seed"] for one in agents} == {TeamSight(env).episode(e)["seed"] for e in range(4)}
-    before = [one.calls for one in agents]
+    assert coverage.mean() > 0.5 and len({id(agent) for agent in agents}) == 4
+    assert {agent.episode["seed"] for agent in agents} == {TeamSight(env).episode(e)["seed"] for e in range(4)}
+    before = [agent.calls for agent in agents]
     env.reset()
     policy(env.observe())
-    assert max(before) == 10 and [one.calls for one in agents] == [1] * 4
+    assert max(before) == 10 and [agent.calls for agent in agents] == [1] * 4
 
 
 class Bad:

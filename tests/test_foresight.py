@@ -56,7 +56,7 @@ def test_it_chooses_as_the_simulators_search(scenario, index):
         goals, plain = (team.plan(*where, **more).goals for team in teams)
         sent = search.goals()
         nav, chosen = search.tracker.nav, search.tracker.state["chosen"][0, :, 0]
-        place = [int((nav.block[0, 0] == one).nonzero()[0]) for one in chosen]
+        place = [int((nav.block[0, 0] == target).nonzero()[0]) for target in chosen]
         points = np.array([nav.point[0, robot, k].numpy() for robot, k in enumerate(place)])
         same += (np.linalg.norm(points - goals, axis=-1) < 1e-3).tolist()
         departs += (np.linalg.norm(plain - goals, axis=-1) > 1e-3).tolist()
@@ -67,9 +67,9 @@ def test_it_chooses_as_the_simulators_search(scenario, index):
 
 
 def test_plans_repeat_and_depart_from_the_base():
-    one, two = plan(planner()), plan(planner())
-    assert np.array_equal(one.goals, two.goals) and one.active.all() and not one.notes
-    assert not np.array_equal(one.goals, plan(planner("multi_criteria")).goals)
+    first, second = plan(planner()), plan(planner())
+    assert np.array_equal(first.goals, second.goals) and first.active.all() and not first.notes
+    assert not np.array_equal(first.goals, plan(planner("multi_criteria")).goals)
 
 
 def test_nobody_is_told_how_large_the_place_is():

@@ -102,8 +102,8 @@ def cases(draw) -> Case:
         obstacle_radius=st.just(radius),
     )
 
-    def team(one):
-        return st.lists(one, min_size=robots, max_size=robots) if robots <= 10 else one
+    def team(member):
+        return st.lists(member, min_size=robots, max_size=robots) if robots <= 10 else member
 
     planner = st.builds(
         PlannerConfig,
@@ -134,7 +134,7 @@ def cases(draw) -> Case:
 
 def build(case: Case, num_envs: int, threads: int) -> ExplorationEnv | None:
     """The env of a case, with fewer robots where its maps have no room; None where they have none at all."""
-    maps, robots = [get_map(*one) for one in case.maps], case.num_robots
+    maps, robots = [get_map(*wanted) for wanted in case.maps], case.num_robots
     while robots:
         chosen = dict(case.settings)
         for name in ("robot", "radar"):
@@ -242,8 +242,8 @@ def test_invariants(case):
         }
     )
     few = build(case, max(1, case.num_envs - 1), case.threads[1])
-    for one, other in zip(first, play(few, case, STEPS), strict=True):
-        assert one[: few.num_envs] == other, "the bits depend on the run, the number of envs or of threads"
+    for bits, others in zip(first, play(few, case, STEPS), strict=True):
+        assert bits[: few.num_envs] == others, "the bits depend on the run, the number of envs or of threads"
     assert_nan_is_refused(env)
 
 

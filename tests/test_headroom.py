@@ -18,7 +18,7 @@ def test_a_share_is_a_lead_by_that_of_the_search_that_cheats():
         result("mine", 0.52, 0.62, 0.72, 0.82, 0.12),
         result("worse", 0.4, 0.6, 0.7, 0.8, 0.075),
     ]
-    found = headroom_shares(results, [one.policy for one in results])
+    found = headroom_shares(results, [played.policy for played in results])
     assert set(found) == {"mine", "worse"}
     assert found["mine"]["mean"] == pytest.approx(0.2) and found["mine"]["ci95"] == pytest.approx([0.2, 0.2])
     assert found["worse"]["mean"] == pytest.approx(-0.25) and found["worse"]["n"] == 5
@@ -44,4 +44,4 @@ def test_copies_of_an_episode_are_no_headroom():
         EvaluationResult(name, 3, {"coverage_auc": np.full(5, auc)}, 0.0, np.repeat("a", 5))
         for name, auc in (("cost_utility", 0.5), ("clairvoyant", 0.6), ("mine", 0.55))
     ]
-    assert headroom_shares(results, [one.policy for one in results]) == {}
+    assert headroom_shares(results, [played.policy for played in results]) == {}

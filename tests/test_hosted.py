@@ -70,24 +70,26 @@ def test_a_fault_costs_its_episode_and_nothing_else(kind, tmp_path, monkeypatch)
     waits = {"Sleeps": 3.0}.get(kind, 60.0)
     final, reasons, bad, _ = play_hosted(f"hostile:{kind}", 1.0 if kind == "Spins" else 60.0, waits)
     assert time.monotonic() - begin < 120
-    assert [bool(one) for one in reasons] == bad
-    assert all(one.startswith(FAULTS[kind]) and "\n" not in one for one in reasons if one), reasons
+    assert [bool(reason) for reason in reasons] == bad
+    assert all(reason.startswith(FAULTS[kind]) and "\n" not in reason for reason in reasons if reason), reasons
     lost_after = 0 if kind == "BadReset" else 1
-    steps = [20 * (lost_after if one else STEPS) for one in bad]
+    steps = [20 * (lost_after if lost else STEPS) for lost in bad]
     assert final["local_steps"][:, 0].tolist() == steps
-    assert all(one.isprintable() and len(one) < 500 for one in reasons)
+    assert all(reason.isprintable() and len(reason) < 500 for reason in reasons)
     if kind in ("Forks", "Daemons"):
         children = [int(line) for line in (tmp_path / "children").read_text().split()]
         assert len(children) == 5 * sum(bad)
         end = time.monotonic() + 20
-        while [one for one in children if alive(one)]:  # killed, and on a busy machine not yet gone
+        while [child for child in children if alive(child)]:  # killed, and on a busy machine not yet gone
             assert time.monotonic() < end
             time.sleep(0.05)
 
 
 def test_a_policy_that_speaks_unasked_is_lost():
     _, reasons, bad, _ = play_hosted("hostile:Twice")
-    assert [bool(one) for one in reasons] == bad and {one for one in reasons if one} == {"it spoke without being asked"}
+    assert [bool(reason) for reason in reasons] == bad and {reason for reason in reasons if reason} == {
+        "it spoke without being asked"
+    }
 
 
 def test_the_next_episode_has_a_new_process():
@@ -99,7 +101,7 @@ def test_the_next_episode_has_a_new_process():
             ends.append((policy.sight.episode(0)["seed"] // 2 % 2 == 1, policy.reasons[0] != ""))
         processes = [guest.process for guest in policy.guests if guest is not None]
     assert all(bad == lost for bad, lost in ends) and {bad for bad, _ in ends} == {True, False}
-    assert all(one.returncode is not None for one in processes)
+    assert all(process.returncode is not None for process in processes)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +193,8 @@ def test_a_run_that_is_killed_outright_leaves_no_policy_behind(word, tmp_path):
         wait_for(lambda: not having(name, but=run.pid))
         print(f"gone after {time.monotonic() - begin:.1f} s")
     finally:
-        for one in having(name, but=0):
-            os.kill(one, signal.SIGKILL)
+        for path in having(name, but=0):
+            os.kill(path, signal.SIGKILL)
         run.wait()
         run.stdout.close()
 
@@ -200,10 +202,10 @@ def test_a_run_that_is_killed_outright_leaves_no_policy_behind(word, tmp_path):
 def having(variable: str, but: int) -> list[int]:
     """Processes that run with a variable in their environment, but one."""
     found = []
-    for one in Path("/proc").glob("[0-9]*"):
+    for path in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            if variable.encode() in (one / "environ").read_bytes().split(b"\0") and int(one.name) != but:
-                found.append(int(one.name))
+            if variable.encode() in (path / "environ").read_bytes().split(b"\0") and int(path.name) != but:
+                found.append(int(path.name))
     return found
 
 

@@ -151,7 +151,10 @@ def test_the_example_in_another_language_chooses_as_its_twin_in_python(tmp_path)
                     goal = points[np.hypot(*(points - own).T).argmin()]
                     wanted = policy.sight.to_action(np.broadcast_to(goal, (2, 3, 2)))
                     sent = [state[name][team, robot] for name in (REGION, OFFSET)]
-                    assert all(torch.equal(one[team, robot], two) for one, two in zip(wanted, sent, strict=True))
+                    assert all(
+                        torch.equal(choice[team, robot], choice_sent)
+                        for choice, choice_sent in zip(wanted, sent, strict=True)
+                    )
             state = env.step(state)["next"]
 
 

@@ -131,7 +131,7 @@ def test_a_resumed_run_does_not_imitate_again():
     parts = Path(shutil.copytree(whole, "parts"))
     (parts / "checkpoints" / "iteration_000004.pt").unlink()
     assert main(["train", f"resume={parts}"]) == 0
-    first, second = (find_checkpoint(one)[1] for one in (whole, parts))
+    first, second = (find_checkpoint(folder)[1] for folder in (whole, parts))
     assert first["iteration"] == second["iteration"] == 4
     for name in ("policy", "updater"):
         assert_same(first[name], second[name])

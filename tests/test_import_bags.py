@@ -40,7 +40,7 @@ def floor(tmp_path: Path) -> tuple[np.ndarray, float, tuple]:
 def grown(values: np.ndarray, cell: float, corner: tuple, **more) -> list:
     """A SLAM's messages: ever more of the map."""
     known = [np.where(np.arange(values.shape[1]) < share * values.shape[1], values, -1) for share in (0.3, 0.6, 1.0)]
-    return [("/map", t, grid(one, cell, corner, time=float(t), **more)) for t, one in enumerate(known)]
+    return [("/map", t, grid(cells, cell, corner, time=float(t), **more)) for t, cells in enumerate(known)]
 
 
 def assert_same(world, other) -> None:
@@ -56,7 +56,7 @@ def test_the_last_grid_is_the_map(tmp_path, storage):
     world, report = import_map_with_report(bag)
     assert_same(world, expected)
     assert world.name == "walk" and "the last of 3 grids on /map" in report.table()
-    (file,) = [one for one in bag.iterdir() if one.suffix in (".mcap", ".db3")]
+    (file,) = [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
     assert_same(import_map(file), expected)
 
 
@@ -114,7 +114,7 @@ def test_a_bag_without_maps(tmp_path):
 def scanned() -> tuple[np.ndarray, list]:
     """A room of 8 x 6 m with floor and walls [m], and a drive through it, scanned within 5 m."""
     side = np.arange(0, 8.01, 0.05)
-    x, y = (one.ravel() for one in np.meshgrid(side, side[side <= 6.01], indexing="ij"))
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side[side <= 6.01], indexing="ij"))
     edge = (x < 0.01) | (x > 7.99) | (y < 0.01) | (y > 5.99)
     layers = [(x, y, 0.0), *((x[edge], y[edge], z) for z in np.arange(0.05, 1.5, 0.05))]
     place = np.concatenate([np.column_stack([a, b, np.full(len(a), z)]) for a, b, z in layers])
@@ -173,15 +173,15 @@ def test_clouds_are_registered_by_tf(tmp_path):
 
 def test_clouds_without_their_transforms(tmp_path):
     _, messages = scanned()
-    late = [one for one in messages if one[0] != "/tf" or one[1] < 2.1]
+    late = [message for message in messages if message[0] != "/tf" or message[1] < 2.1]
     _, report = import_map_with_report(write_bag(tmp_path / "late", late), resolution=0.2)
     assert report.warnings[0] == "7 of 11 clouds had no transform at their time and were left out"
-    never = [one for one in messages if one[0] != "/tf"] + [
+    never = [message for message in messages if message[0] != "/tf"] + [
         ("/tf", 0.0, transforms([("odom", "base_link", t, (t, 0.0, 0.0), 0.0) for t in (90.0, 91.0)]))
     ]
     with pytest.raises(MapError, match="of 11 clouds on /points 11 had no transform"):
         import_map(write_bag(tmp_path / "never", never))
-    alone = [one for one in messages if one[0] == "/points"]
+    alone = [message for message in messages if message[0] == "/points"]
     _, report = import_map_with_report(write_bag(tmp_path / "alone", alone), resolution=0.2)
     assert "no transform in the bag moves lidar" in report.warnings[0]
 
@@ -229,7 +229,7 @@ def test_clouds_that_are_none(tmp_path):
 def test_damaged_files_are_sentences(tmp_path, storage):
     """Cut off anywhere, with bytes turned over, or text: one sentence or a map, in seconds and little memory."""
     bag = write_bag(tmp_path / "bag", grown(*floor(tmp_path)), storage)
-    (file,) = [one for one in bag.iterdir() if one.suffix in (".mcap", ".db3")]
+    (file,) = [path for path in bag.iterdir() if path.suffix in (".mcap", ".db3")]
     whole, rng, importer = file.read_bytes(), np.random.default_rng(0), Importer()
     cases = [whole[: int(share * len(whole))] for share in (0.001, 0.3, 0.9, 0.999)] + [b"no bag at all"]
     for _ in range(4):

@@ -39,7 +39,7 @@ def test_the_protocol_counts_in_pixels(plan):
     assert world.scenario == "ir2" and world.free_area == pytest.approx(204.0, rel=0.05), "grey walls, grey ground"
     env = make_env(cfg, [world], cfg.num_robots, 2)
     assert (env.num_robots, env.local_steps, env.macro_steps) == (4, 40, 196)
-    assert {one.range for one in env.radar_configs} == {80 * 0.2}
+    assert {radar.range for radar in env.radar_configs} == {80 * 0.2}
     assert env.comm_config.signal and env.comm_config.cell == "auto"  # an 80th of the radar range: a pixel
     settings = env.settings
     assert (settings.done, settings.success_coverage) == ("everyone", 0.99)

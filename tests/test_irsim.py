@@ -102,7 +102,7 @@ def test_odometry_without_errors_is_the_truth_and_drifts_with_the_way():
         heading = 0.02 * k
         moved = poses + [[0.05 * k, math.sin(heading), heading], [0.0, 0.0, 0.0]]
         assert np.allclose(exact.update(moved), moved)
-        beliefs = [one.update(moved) for one in drifting]
+        beliefs = [odometry.update(moved) for odometry in drifting]
         if k in (50, 200):
             errors.append(np.sqrt(np.mean([np.sum((b[0, :2] - moved[0, :2]) ** 2) for b in beliefs])))
         assert all(np.allclose(b[1], moved[1]) for b in beliefs)  # who stands does not drift
@@ -274,7 +274,9 @@ def test_a_foreign_policy_plays_here_too(world, tmp_path, monkeypatch, capsys):
     episode, seen = sys.modules["walkers"].seen[0]
     assert (episode["num_robots"], episode["seconds"], episode["decision_seconds"]) == (2, 6.0, 2.0)
     assert seen["grid"].dtype == np.int8 and set(np.unique(seen["grid"])) == {-1, 0, 100}
-    ours_first = next(one for _, one in sys.modules["walkers"].seen if one["resolution"] == world.resolution)
+    ours_first = next(
+        observation for _, observation in sys.modules["walkers"].seen if observation["resolution"] == world.resolution
+    )
     assert set(ours_first) == set(seen)
     assert all(np.shape(seen[key])[:1] == np.shape(ours_first[key])[:1] for key in seen)
     assert np.allclose(seen["poses"], ours_first["poses"], atol=1e-4), "both begin in one place"

@@ -36,7 +36,7 @@ def test_a_block_of_millions_of_frontier_cells_has_its_target_in_the_middle():
     grids, row = one_grid(side, side), ints([0])
     known = np.full((side, side), FREE, np.uint8)
     known[::2] = UNKNOWN  # every other line: its neighbours are frontier cells
-    known, frontier = (wp.array(one.reshape(1, -1), dtype=wp.uint8, device="cpu") for one in (known, 0 * known))
+    known, frontier = (wp.array(cells.reshape(1, -1), dtype=wp.uint8, device="cpu") for cells in (known, 0 * known))
     size, target, kept = (wp.full((1, 1), value, dtype=wp.int32, device="cpu") for value in (0, 0, -1))
     sums = wp.zeros((1, 1, 2), dtype=wp.int64, device="cpu")
     changed = ints(np.full((1, wall_words_of(side) * side), -1))

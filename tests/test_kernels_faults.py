@@ -50,7 +50,7 @@ def test_a_failed_robot_stands_sees_and_says_nothing_and_comes_back():
 
     def look():
         own = (s["seen_free"] & 1).sum(), (s["known_free"] & 1).sum(), (s["known_free"] >> 1 & 1).sum()
-        return s["pose"][:, 0, [0, 1, 3]].clone(), [int(one) for one in own]
+        return s["pose"][:, 0, [0, 1, 3]].clone(), [int(number) for number in own]
 
     first = drive(env, 3)[-1]
     (before, (seen, known, mate)), heard = look(), first["agents", "observation", "comm"]

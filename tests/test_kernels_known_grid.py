@@ -96,12 +96,12 @@ def test_false_walls_come_and_go(rows_per_env):
     growing.false = wp.zeros(flags.shape, dtype=wp.int32, device="cpu")
     growing.known = growing.grids()
     growing.masks = growing.masks_of(growing.known)
-    walls = [np.zeros_like(one) for one in growing.scene.free]
+    walls = [np.zeros_like(row) for row in growing.scene.free]
     growing.check()
     for gone in (0.0, 0.0, 0.5, 0.0, 1.0):
         growing.show(rng, 0.05, keep=True)
-        some = [rng.random(one.shape) < 0.03 for one in walls]
-        walls = [(one & (rng.random(one.shape) >= gone)) | more for one, more in zip(walls, some, strict=True)]
+        some = [rng.random(wall.shape) < 0.03 for wall in walls]
+        walls = [(wall & (rng.random(wall.shape) >= gone)) | more for wall, more in zip(walls, some, strict=True)]
         growing.false.assign(flag_words(walls, 1, flags.shape[2]))
         growing.check()
         assert (growing.known.news_count.numpy() < 0).any() == (gone > 0.0)

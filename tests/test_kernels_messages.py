@@ -25,7 +25,7 @@ def points(env: ExplorationEnv, what: str, e: int, radios: int) -> list[list[int
         unpack_flags(s[f"{what}_{kind}"][e : e + 1, :, :count], radios)[0]
         for kind, count in zip(("free", "boundary"), counts, strict=True)
     ]
-    return [one.nonzero().ravel().tolist() for one in torch.cat(flags, 1)]
+    return [flag.nonzero().ravel().tolist() for flag in torch.cat(flags, 1)]
 
 
 def play(env: ExplorationEnv, steps: int, each) -> None:
@@ -49,9 +49,9 @@ def test_what_arrives_is_that_of_the_definition(robots, bandwidth, delay):
         s = env.simulation.tensors
         for e, (team, hears) in enumerate(zip(teams, links(env), strict=True)):
             team.step(hears, points(env, "seen", e, robots + 1))
-            assert points(env, "known", e, robots + 1) == [sorted(one) for one in team.known]
-            assert s["learned_count"][e].tolist() == [len(one) for one in team.known]
-            assert [s["learned"][e, i, : len(one)].tolist() for i, one in enumerate(team.known)] == team.known
+            assert points(env, "known", e, robots + 1) == [sorted(known) for known in team.known]
+            assert s["learned_count"][e].tolist() == [len(known) for known in team.known]
+            assert [s["learned"][e, i, : len(known)].tolist() for i, known in enumerate(team.known)] == team.known
             assert int(s["cells_sent"][e]) == team.sent
             lagging.append(len(team.under_way))
 
@@ -65,10 +65,10 @@ def test_without_limits_it_is_what_all_hear():
     names, kept = ("known_free", "known_boundary", "known_weight", "cells_sent", "pose", "told_step"), []
     for comm in (CommConfig(**NEAR), CommConfig(**NEAR, bandwidth=1e9)):
         env, found = make(6, comm=comm), []
-        play(env, 4, lambda env, found=found: found.append([env.simulation.tensors[one].clone() for one in names]))
+        play(env, 4, lambda env, found=found: found.append([env.simulation.tensors[name].clone() for name in names]))
         kept.append(found)
     for before, now in zip(*kept, strict=True):
-        assert all(torch.equal(one, other) for one, other in zip(before, now, strict=True))
+        assert all(torch.equal(tensor, other) for tensor, other in zip(before, now, strict=True))
     assert (kept[0][-1][3] > 100).all()
 
 
@@ -87,9 +87,9 @@ def test_an_episode_begins_without_messages():
     env, fresh = make(comm=comm), make(comm=comm)
     play(env, 3, lambda env: None)
     assert env.simulation.tensors["underway"].any()
-    for one in (env, fresh):
-        one.set_episodes(torch.arange(3))
-        one.reset()
+    for either in (env, fresh):
+        either.set_episodes(torch.arange(3))
+        either.reset()
     for name in ("known_free", "known_weight", "learned_count", "offered", "underway", "cells_sent"):
         assert torch.equal(env.simulation.tensors[name], fresh.simulation.tensors[name]), name
 

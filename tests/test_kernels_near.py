@@ -43,10 +43,10 @@ def crowd(robots: int) -> ExplorationEnv:
     pose = rng.uniform(0.0, 1.0, (2, robots, 4)) * SIDE + 20.0
     pose[..., 3] = rng.uniform(-math.pi, math.pi, (2, robots))
     stopped = rng.random((2, robots)) < 0.2
-    top = np.array([one.max_speed for one in env.robot_configs])
+    top = np.array([robot.max_speed for robot in env.robot_configs])
     share = rng.uniform(-1.0, 1.0, (2, robots)) * ~stopped
     pose[..., 2] = share * top
-    slides = np.array([one.kind == "omnidirectional" for one in env.robot_configs])
+    slides = np.array([robot.kind == "omnidirectional" for robot in env.robot_configs])
     slip = np.sqrt(1.0 - share**2) * top * rng.choice([-1.0, 1.0], (2, robots)) * slides * ~stopped
     s["pose"].copy_(torch.from_numpy(pose))
     s["slip"].copy_(torch.from_numpy(slip))
@@ -82,11 +82,11 @@ def bound(env: ExplorationEnv, before: dict[str, np.ndarray], i: int, j: int) ->
     """How far apart listed robots may be: what each may take up or drive through, and the reach of robot i [m]."""
 
     def room_of(k: int) -> float:
-        one, way = env.robot_configs[k], 0.1 * (abs(before["pose"][k, 2]) + abs(before["slip"][k]))
+        robot, way = env.robot_configs[k], 0.1 * (abs(before["pose"][k, 2]) + abs(before["slip"][k]))
         swing = 0.0
-        if one.kind == "ackermann":  # its centre lies half a length ahead of what it turns about
-            swing = 0.5 * one.length * min(2.0, 1.001 * way * math.tan(one.max_steer) / one.wheelbase)
-        return way + swing + 0.501 * (one.length + one.width)
+        if robot.kind == "ackermann":  # its centre lies half a length ahead of what it turns about
+            swing = 0.5 * robot.length * min(2.0, 1.001 * way * math.tan(robot.max_steer) / robot.wheelbase)
+        return way + swing + 0.501 * (robot.length + robot.width)
 
     return max(env.radar_configs[i].range, env.robot_configs[i].collision_threshold) + room_of(i) + room_of(j)
 

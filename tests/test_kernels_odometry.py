@@ -66,7 +66,7 @@ def test_errors_are_those_of_the_definition(planner):
     last = drive(env, 12)[-1]
     off = (s["center_estimate"] - s["center"]).norm(dim=-1)
     torch.testing.assert_close(last["info", "odometry_error"], off)
-    assert len(steps) == 49 and off.max() > 0.3 and sum(one.jumps for one in walkers.values()) > 3
+    assert len(steps) == 49 and off.max() > 0.3 and sum(walker.jumps for walker in walkers.values()) > 3
 
 
 def test_the_error_grows_with_the_root_of_the_way():
@@ -126,11 +126,11 @@ def test_robots_aim_from_where_they_are(planner):
                 if int(s["local_step"][e]) > 1 and not s["collided"][e, i]:
                     true, believed = poses[e, i]
                     goal, waypoint = (
-                        odometry.seen_from(true, believed, s[one][e, i].tolist()) for one in ("goal", "waypoint")
+                        odometry.seen_from(true, believed, s[kind][e, i].tolist()) for kind in ("goal", "waypoint")
                     )
                     assert s["goal_aim"][e, i].tolist() == pytest.approx(goal, abs=5e-3)
                     aim = s["waypoint_aim"][e, i]
-                    way, full = (one - torch.tensor(true[:2]) for one in (aim, torch.tensor(waypoint)))
+                    way, full = (point - torch.tensor(true[:2]) for point in (aim, torch.tensor(waypoint)))
                     share = 1.0 if planner == "dwa" else float(way.norm() / full.norm())
                     assert share <= 1.001
                     torch.testing.assert_close(way, share * full, atol=5e-3, rtol=1e-3)
@@ -188,7 +188,7 @@ def test_who_believes_to_be_off_the_map_is_held_at_its_edge(name, comm):
     """Whatever plans goes on, with errors larger than the map."""
     env = make(OdometryConfig(drift=60.0, turn=3.0), comm=comm, observation=ObservationConfig(targets=6))
     policy, td = POLICIES[name](env), env.reset()
-    low, high = (env.simulation.map_tensors[one][0] for one in ("lower", "upper"))
+    low, high = (env.simulation.map_tensors[corner][0] for corner in ("lower", "upper"))
     for _ in range(5):
         _, td = env.step_and_maybe_reset(policy(td))
         at = env.simulation.tensors["center_estimate"][..., :2]

@@ -157,7 +157,7 @@ def test_differential_drives_can_stop_on_the_way_that_they_drive():
         kept = world.clearance * rng.uniform(0.3, 1.0, (3, ROBOTS))
         robots = world.robots()
         robots.kind, robots.max_turn = array(kind, wp.int32), array(rate, wp.float32)
-        robots.max_speed, robots.radar_range = (array(one * world.cell, wp.float32) for one in (top, radar))
+        robots.max_speed, robots.radar_range = (array(values * world.cell, wp.float32) for values in (top, radar))
         pose = np.zeros((3, ROBOTS, 4))
         pose[..., 2], pose[..., 3] = world.speed * world.cell, world.heading
         active, collided, center = world.state()

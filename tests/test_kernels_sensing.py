@@ -21,7 +21,7 @@ RADARS = [
     RadarConfig(range=7.0, missed=0.6, false_alarm=0.2),
     RadarConfig(range=5.0, evidence=3, false_alarm=0.3),
 ]
-PERFECT = [RadarConfig(range=one.range) for one in RADARS]
+PERFECT = [RadarConfig(range=radar.range) for radar in RADARS]
 
 
 def make(radars, envs: int = 2, **settings) -> ExplorationEnv:
@@ -85,13 +85,13 @@ def test_what_is_seen_is_that_of_the_definition():
                 int(true[0]["episode"][e]),
                 i,
                 points,
-                sensing.chance(one.missed, one.noise, spacing),
-                one.evidence,
-                one.false_alarm,
+                sensing.chance(radar.missed, radar.noise, spacing),
+                radar.evidence,
+                radar.false_alarm,
                 len(free),
                 len(RADARS),
             )
-            for i, one in enumerate(RADARS)
+            for i, radar in enumerate(RADARS)
         ]
         for step, (before, now) in enumerate(zip(true, found, strict=True)):
             assert torch.equal(before["center"], now["center"]), "robots drive alike"
@@ -111,9 +111,9 @@ def test_what_is_seen_is_that_of_the_definition():
                 known = {j - len(free) for j in looker.known if j >= len(free)}
                 assert bits(now["seen_boundary"][e], i, len(boundary)) == known
                 dropped += len(view) - len(listed)
-                waited += sum(one > 0 and j not in looker.known for j, one in enumerate(looker.returns))
+                waited += sum(count > 0 and j not in looker.known for j, count in enumerate(looker.returns))
                 seen.append(set(listed))
-            known = [sum(j in one.known for one in lookers) for j in range(points)]
+            known = [sum(j in looker.known for looker in lookers) for j in range(points)]
             for i, looker in enumerate(lookers):
                 walls = {j for j in looker.walls if not known[j]}
                 assert bits(now["false_walls"][e], i, len(free)) == walls
@@ -123,7 +123,7 @@ def test_what_is_seen_is_that_of_the_definition():
             assert int(now["covered"][e]) == sum(map(bool, known[: len(free)]))
             if step:
                 for i, mine in enumerate(seen):
-                    others = set().union(*(one for k, one in enumerate(seen) if k != i))
+                    others = set().union(*(points for k, points in enumerate(seen) if k != i))
                     assert int(now["overlap"][e, i]) == len(mine & others)
     assert dropped > 1000 and waited > 100 and walled > 30
 
@@ -135,7 +135,7 @@ def test_the_share_of_returns():
     _, *true = scans([RadarConfig(range=6.0)] * 3)
     _, *found = scans(radars)
     e = int((true[0]["map_id"] == 0).nonzero()[0])
-    counts = [sum(int(one["visible_count"][e].sum()) for one in each) for each in (true, found)]
+    counts = [sum(int(step["visible_count"][e].sum()) for step in each) for each in (true, found)]
     assert counts[1] / counts[0] == pytest.approx(1 / 3, abs=0.02)
 
 

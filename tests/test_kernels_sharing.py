@@ -45,12 +45,12 @@ def run(team: dict[str, np.ndarray]) -> list[list[int]]:
 def test_targets_are_shared_out_as_they_should(robots, targets, side):
     team, settled = teams(robots + targets, robots, targets, side), 0
     for e, got in enumerate(run(team)):
-        one = {name: value[e].astype(float).tolist() for name, value in team.items()}
-        assert got == [-1 if k is None else k for k in share(one)], e
+        case = {name: value[e].astype(float).tolist() for name, value in team.items()}
+        assert got == [-1 if k is None else k for k in share(case)], e
         for i, j in combinations([i for i in range(robots) if got[i] >= 0], 2):
             if team["hears"][e, i, j] or team["hears"][e, j, i]:
-                gap = math.dist(one["point"][i][got[i]], one["point"][j][got[j]])
-                assert gap > one["body"][i] + one["body"][j] - 1e-5
+                gap = math.dist(case["point"][i][got[i]], case["point"][j][got[j]])
+                assert gap > case["body"][i] + case["body"][j] - 1e-5
                 settled += 1
     assert settled > 10 or robots == 1
 

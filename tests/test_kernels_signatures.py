@@ -18,27 +18,35 @@ OUT = ("State out", "Scratch out", "Out")
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_every_array_says_its_axes(name):
-    for one in arguments(KERNELS[name]):
-        if one.dims:
-            assert one.shape is not None and len(one.shape) == one.dims, f"{name}: {one.name} {one.shape}"
+    for argument in arguments(KERNELS[name]):
+        if argument.dims:
+            assert argument.shape is not None and len(argument.shape) == argument.dims, (
+                f"{name}: {argument.name} {argument.shape}"
+            )
 
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_headings_are_true(name):
     """An array stands under a heading that says whether the kernel reads it, writes it, or both."""
     found = uses(KERNELS[name].func)
-    for one in arguments(KERNELS[name]):
-        if one.dims == 0:
-            assert one.heading in ("Map", "Robots", "Settings"), f"{name}: {one.name} under {one.heading!r}"
+    for argument in arguments(KERNELS[name]):
+        if argument.dims == 0:
+            assert argument.heading in ("Map", "Robots", "Settings"), (
+                f"{name}: {argument.name} under {argument.heading!r}"
+            )
             continue
-        assert one.heading in IN + BOTH + OUT, f"{name}: {one.name} under {one.heading!r}"
-        assert (one.name in found.written) == (one.heading not in IN), f"{name}: {one.name} under {one.heading!r}"
-        assert one.name in found.read or one.heading in OUT, f"{name}: {one.name} under {one.heading!r} is never read"
+        assert argument.heading in IN + BOTH + OUT, f"{name}: {argument.name} under {argument.heading!r}"
+        assert (argument.name in found.written) == (argument.heading not in IN), (
+            f"{name}: {argument.name} under {argument.heading!r}"
+        )
+        assert argument.name in found.read or argument.heading in OUT, (
+            f"{name}: {argument.name} under {argument.heading!r} is never read"
+        )
 
 
 def test_what_is_written_stands_last():
     for name, kernel in KERNELS.items():
-        headings = [one.heading for one in arguments(kernel)]
+        headings = [argument.heading for argument in arguments(kernel)]
         written = [heading in BOTH + OUT for heading in headings]
         assert written == sorted(written), f"{name}: {headings}"
 
@@ -46,7 +54,7 @@ def test_what_is_written_stands_last():
 def test_no_argument_is_there_for_nothing():
     assert len(KERNELS) > 40 and len(FUNCTIONS) > 40
     for name, function in {**KERNELS, **FUNCTIONS}.items():
-        taken = [one.arg for one in parse(function.func).args.args]
+        taken = [argument.arg for argument in parse(function.func).args.args]
         in_cpp = set(re.findall(r"\w+", getattr(function, "native_snippet", None) or ""))
         assert not set(taken) - uses(function.func).named - in_cpp, name
 

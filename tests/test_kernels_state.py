@@ -49,7 +49,7 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
         fields = {id(array): name for name, array in vars(shard.view).items()}
 
         def launch(kernel, dim, given, fields=fields):
-            found.append((kernel, [fields.get(id(one)) for one in given]))
+            found.append((kernel, [fields.get(id(array)) for array in given]))
 
         pictures = [torch.zeros(shape, dtype=torch.uint8) for shape in picture_shapes(e, n)]
         for stage in (set_goals, find_paths, pick_waypoints, step.local_step, step.reset):
@@ -62,7 +62,7 @@ def launches_of(env: ExplorationEnv) -> list[tuple]:
 def met() -> list[tuple]:
     """The launches of every planner, with perfect and with limited communication, messages late or not."""
     envs = [make(planner, limited) for planner in PLANNERS for limited in (False, True)]
-    return [one for env in (*envs, make("dwa", True, delay=0.0)) for one in launches_of(env)]
+    return [launch for env in (*envs, make("dwa", True, delay=0.0)) for launch in launches_of(env)]
 
 
 @pytest.mark.parametrize("robots, limited, envs", [(1, False, 5), (3, True, 4), (35, True, 2), (34, False, 3)])

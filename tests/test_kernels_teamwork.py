@@ -44,7 +44,7 @@ def team(request) -> dict[str, np.ndarray]:
 
 def tensors(team: dict[str, np.ndarray], *names: str) -> list[torch.Tensor]:
     found = [torch.from_numpy(team[name]) for name in names]
-    return [one.float() if one.is_floating_point() else one for one in found]
+    return [tensor.float() if tensor.is_floating_point() else tensor for tensor in found]
 
 
 def test_choices_in_turn(team):
@@ -86,8 +86,8 @@ def test_ways_plans_and_last_targets_of_those_that_are_heard(team):
             nearest("last", [i]),
             nearest("last", mates),
         )
-        np.testing.assert_allclose([float(one[e, i, k]) for one in found], want, rtol=1e-5)
-    assert all(one.isinf().any() and one.isfinite().any() for one in found)
+        np.testing.assert_allclose([float(tensor[e, i, k]) for tensor in found], want, rtol=1e-5)
+    assert all(tensor.isinf().any() and tensor.isfinite().any() for tensor in found)
 
 
 def test_gain_around_candidates(team):

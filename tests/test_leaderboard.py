@@ -54,9 +54,9 @@ def test_a_row_says_what_its_run_says(runs, board):
         assert row["reference"]["difference"]["ci95"] == pytest.approx(
             results["reference"]["difference"]["coverage_auc"]["ci95"], abs=1e-6
         )
-        for part, one in row["parts"].items():
-            assert one["episodes"] == pytest.approx(results["episodes"][part]["coverage_auc"], abs=1e-6)
-            assert len(np.unique(one["copies"])) == 4
+        for part, figures in row["parts"].items():
+            assert figures["episodes"] == pytest.approx(results["episodes"][part]["coverage_auc"], abs=1e-6)
+            assert len(np.unique(figures["copies"])) == 4
 
 
 def test_a_film_shows_the_first_episode(runs, board):
@@ -89,8 +89,8 @@ def test_pairs_are_compared_with_copies_counted_once(board):
     (none, better), (worse, also_none) = suite["better"]
     assert none is also_none is None and better["mean"] + worse["mean"] == pytest.approx(1)
     copied = read_all(board)
-    for one in copied[0]["parts"].values():
-        one["copies"] = [0] * len(one["copies"])
+    for part in copied[0]["parts"].values():
+        part["copies"] = [0] * len(part["copies"])
     assert np.isnan(site.describe_suite(copied)["better"][0][1]["ci95"]).all(), "two distinct episodes are no evidence"
 
 
@@ -98,7 +98,7 @@ def test_a_note_stands_on_the_page_and_in_the_tables(board, tmp_path, capsys):
     out, row = tmp_path / "site", board / "small" / "random.json"
     assert main(["leaderboard", str(board), f"out={out}"]) == 0
     assert main(["leaderboard", str(row), f"out={out}", "note=one | dice\n</script> a robot"]) == 0
-    assert [one.get("note") for one in read_all(out)] == [None, "one | dice </script> a robot"]
+    assert [row.get("note") for row in read_all(out)] == [None, "one | dice </script> a robot"]
     assert "- `random`: one \\| dice &lt;/script&gt; a robot\n" in (out / "README.md").read_text()
     assert "one | dice \\u003c/script>" in (out / "index.html").read_text()
     content = json.loads(row.read_text())
@@ -125,11 +125,11 @@ def test_who_is_replaced_is_told_and_another_policy_is_not(board, tmp_path, caps
 def test_rows_stay_and_join(small_suite, runs, board, tmp_path, capsys):
     out = tmp_path / "site"
     assert main(["leaderboard", str(runs[1]), f"out={out}", f"suite={small_suite}", "verify=false"]) == 0
-    assert [one["verified"] for one in read_all(out)] == [False]
+    assert [row["verified"] for row in read_all(out)] == [False]
     assert main(["leaderboard", str(board / "small" / "nearest_frontier.json"), f"out={out}"]) == 0
-    assert [one["policy"] for one in read_all(out)] == list(PLAYED)
+    assert [row["policy"] for row in read_all(out)] == list(PLAYED)
     assert main(["leaderboard", str(board), f"out={out}"]) == 0
-    assert [one["verified"] for one in read_all(out)] == [True, True], "a row of the same name is replaced"
+    assert [row["verified"] for row in read_all(out)] == [True, True], "a row of the same name is replaced"
     for name in (site.PAGE, site.TABLES):
         assert (out / name).read_text() == (board / name).read_text()
         (out / name).unlink()
@@ -244,8 +244,8 @@ def tab(board, tmp_path_factory):
     out = Path(shutil.copytree(board, tmp_path_factory.mktemp("look") / "site"))
     row = json.loads((out / "small" / "random.json").read_text())
     row["policy"] = HOSTILE
-    for one in (row["score"], row["reference"]["difference"], row["reference"]["improvement"]):
-        one["ci95"] = [None, None]
+    for figure in (row["score"], row["reference"]["difference"], row["reference"]["improvement"]):
+        figure["ci95"] = [None, None]
     rows.write_row(out, row)
     site.write_site(out, read_all(out))
     with open_tab(program, f"file://{out / site.PAGE}", tmp_path_factory.mktemp("profile")) as tab:
@@ -292,7 +292,7 @@ def test_two_films_run_together(tab):
     end = tab.run(told)
     tab.run("document.getElementById('time').value = 0, document.getElementById('time').oninput()")
     start = tab.run(told)
-    assert all(one.endswith("after 0 s") for one in start) and start != end
+    assert all(text.endswith("after 0 s") for text in start) and start != end
     tab.press("Play")
     assert tab.run("document.getElementById('play').innerText") == "Pause"
     tab.wait_for(end[0])

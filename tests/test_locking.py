@@ -69,10 +69,10 @@ def test_who_waits_comes_next(tmp_path):
             inside.pop()
 
     threads = [threading.Thread(target=work) for _ in range(4)]
-    for one in threads:
-        one.start()
-    for one in threads:
-        one.join()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
     assert most == [1, 1, 1, 1]
 
 
@@ -93,9 +93,9 @@ def test_a_second_training_in_a_folder_changes_nothing(tmp_path, monkeypatch, ca
     told = "Next: maexp evaluate 'checkpoint=my run' num_robots=1,2,6,8, or maexp view 'my run'"
     assert told in capsys.readouterr().out
     with lock(tmp_path / "my run", "maexp train"):
-        before = {one: one.read_bytes() for one in tmp_path.rglob("*") if one.is_file()}
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
         assert main(["train", "resume=my run", "total_frames=8"]) == 2
-        assert before == {one: one.read_bytes() for one in tmp_path.rglob("*") if one.is_file()}
+        assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     assert re.match(r"maexp: my run is in use by maexp train, process \d+ on .*stop it.$", capsys.readouterr().err)
     assert main(["train", "resume=my run", "total_frames=8"]) == 0
 

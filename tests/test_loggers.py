@@ -62,10 +62,10 @@ def test_what_came_of_a_run_goes_to_its_loggers(tmp_path, monkeypatch):
     log_results(tmp_path, LoggerSettings(backends=["tensorboard", "wandb"]), 128, {"seed": 1})
 
     events = accumulator.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    values = {one: [(e.step, e.value) for e in events.Scalars(one)] for one in events.Tags()["scalars"]}
+    values = {name: [(e.step, e.value) for e in events.Scalars(name)] for name in events.Tags()["scalars"]}
     assert values["comparison/coverage_auc/trained"] == [(128, 0.75)]
     assert values["comparison/coverage_auc/cost_utility"] == [(128, 0.5)]
-    assert not [one for one in values if "coverage_step_99/" in one], "nobody got there"
+    assert not [name for name in values if "coverage_step_99/" in name], "nobody got there"
     assert events.Tags()["images"] == ["coverage", "rollout"]
     film = events.Images("rollout")[0]
     assert Image.open(io.BytesIO(film.encoded_image_string)).n_frames == 3 and (film.width, film.height) == (20, 10)

@@ -62,15 +62,15 @@ def test_nothing_true_leaks(config):
     starts = torch.tensor([[4.0, 4.0, 0.3], [4.0, 8.0, 0.0]])
     starts[:, :2] += torch.tensor(world.extent[0])
     found = []
-    for one in (world, other):
-        env = ExplorationEnv(one, num_envs=1, num_robots=2, seed=0)
-        free = torch.from_numpy(one.free[:, :2])
+    for floor in (world, other):
+        env = ExplorationEnv(floor, num_envs=1, num_robots=2, seed=0)
+        free = torch.from_numpy(floor.free[:, :2])
         place = [free[(free - at[:2]).norm(dim=1).argmin()] for at in starts]
         env.set_starts(torch.cat([torch.stack(place), starts[:, 2:]], 1))
         found.append(actions(env, LookaheadConfig(**config), 1))
-        known = env.simulation.tensors["viewers_free"][0, 0, : len(one.free)] != 0
+        known = env.simulation.tensors["viewers_free"][0, 0, : len(floor.free)] != 0
         order = env.bank.order_free[0]
-        assert np.linalg.norm(one.free[order][known.numpy()][:, :2] - (30.0, 30.0), axis=1).min() > 5.0
+        assert np.linalg.norm(floor.free[order][known.numpy()][:, :2] - (30.0, 30.0), axis=1).min() > 5.0
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
@@ -82,8 +82,8 @@ def test_choices_depend_on_neither_batch_nor_repetition():
         return actions(ExplorationEnv(worlds, num_envs=count, num_robots=3, seed=4), config, 3)
 
     few, again, many = play(2), play(2), play(5)
-    for one, two, three in zip(few, again, many, strict=True):
-        assert torch.equal(one, two) and torch.equal(one, three[:2])
+    for first, second, third in zip(few, again, many, strict=True):
+        assert torch.equal(first, second) and torch.equal(first, third[:2])
 
 
 @pytest.mark.parametrize("lost", [0, 1])
@@ -163,7 +163,7 @@ def test_a_trained_policy_is_a_base_too(comm):
 def test_plays_every_kind_of_team(settings, true_world):
     env = ExplorationEnv(make_map("maze_small", 2), num_envs=2, seed=0, macro_steps=3, **settings)
     found = actions(env, LookaheadConfig(horizon=2, candidates=3), 3, true_world)
-    assert all(torch.isfinite(one.float()).all() for one in found)
+    assert all(torch.isfinite(tensor.float()).all() for tensor in found)
     assert float(env.simulation.tensors["covered"].min()) > 0
 
 
@@ -216,7 +216,7 @@ def test_robots_go_to_different_targets():
         chosen, waits = planner.choose(scene)
         assert not (waits & (scene.travel.isfinite().sum(-1) > 4)).any()
         for team, robots in enumerate(chosen.tolist()):
-            named = [one for one in robots if one >= 0]
+            named = [robot for robot in robots if robot >= 0]
             assert len(set(named)) == len(named), (team, robots)
         td["agents", "action", "goal"] = planner.goals()
         td = env.step(td)["next"].exclude("agents", "reward")

@@ -286,10 +286,12 @@ def test_the_weight_of_the_critics_loss(name):
     losses, moved = [], []
     for weight in (0.7, 1.4, 0.0):
         _, critic, loss, batch = setup(name, critic_coeff=weight)
-        before = [one.detach().clone() for one in critic.parameters()]
+        before = [parameter.detach().clone() for parameter in critic.parameters()]
         losses.append(loss(batch)["loss_critic"].item())
         ALGORITHMS[name].make_updater(loss, ALGORITHMS[name].configure(critic_coeff=weight)).update(batch)
-        moved.append(any(not torch.equal(one, old) for one, old in zip(critic.parameters(), before, strict=True)))
+        moved.append(
+            any(not torch.equal(parameter, old) for parameter, old in zip(critic.parameters(), before, strict=True))
+        )
     assert losses[1] == pytest.approx(2 * losses[0]) and losses[0] > 0 == losses[2]
     assert moved == [True, True, False]
 

@@ -66,7 +66,7 @@ def test_any_grid_and_batch(shape):
     known = torch.randint(0, 3, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     chance = predict(known)
     assert chance.shape == shape
-    alone = torch.cat([predict(one[None]) for one in known])
+    alone = torch.cat([predict(grid[None]) for grid in known])
     assert torch.allclose(chance, alone, atol=1e-5)
 
 
@@ -83,9 +83,9 @@ def test_unknown_ground_looks_the_same_however_far_it_goes_on():
     net = MapPredictor(8).requires_grad_(False)
     sizes = [(32, 32), (48, 80)]
     logits = [net(torch.zeros((1, *size), dtype=torch.uint8)) for size in sizes]
-    for one in logits:
-        patch = one[0, :2, :2].repeat(one.shape[1] // 2, one.shape[2] // 2)
-        assert torch.equal(one[0], patch) and patch.abs().max() > 0
+    for logit in logits:
+        patch = logit[0, :2, :2].repeat(logit.shape[1] // 2, logit.shape[2] // 2)
+        assert torch.equal(logit[0], patch) and patch.abs().max() > 0
 
 
 def test_more_unknown_ground_around_hardly_changes_a_guess():
@@ -95,15 +95,15 @@ def test_more_unknown_ground_around_hardly_changes_a_guess():
         around = torch.nn.functional.pad(known, (far, far, far, far))
         guesses.append(predict(around)[0, far : far + 48, far : far + 64])
     near = torch.from_numpy(ndimage.distance_transform_edt(known[0].numpy() != FREE) <= 12)
-    change = [(one - guesses[-1])[near].abs() for one in guesses[:2]]
+    change = [(guess - guesses[-1])[near].abs() for guess in guesses[:2]]
     assert change[0].mean() < 0.03 and change[1].max() < 0.01, (change[0].mean(), change[1].max())
 
 
 def test_distance_to_free_ground():
     known = torch.stack([some_room()[0], some_room()[0].flip(0), torch.zeros(48, 64, dtype=torch.uint8)])
     found = distance_to_free(known, 20)
-    for one, ours in zip(known[:2].numpy(), found.numpy(), strict=False):
-        truth = np.minimum(ndimage.distance_transform_edt(one != FREE), 20)
+    for grid, ours in zip(known[:2].numpy(), found.numpy(), strict=False):
+        truth = np.minimum(ndimage.distance_transform_edt(grid != FREE), 20)
         np.testing.assert_allclose(ours, truth, atol=1e-5)
     assert (found[2] == 20).all()
 
@@ -119,8 +119,8 @@ def test_samples_have_the_probabilities_and_hang_together():
         agree.append((worlds[..., 1:] == worlds[..., :-1]).float().mean((1, 2, 3)))
         alone = sample_worlds(chance[1:], 200, seed=3, length=length)
         assert torch.equal(alone, worlds[1:])
-    for one in share:
-        assert torch.allclose(one, torch.tensor([0.3, 0.6]), atol=0.02)
+    for frequencies in share:
+        assert torch.allclose(frequencies, torch.tensor([0.3, 0.6]), atol=0.02)
     assert torch.allclose(agree[0], torch.tensor([0.58, 0.52]), atol=0.02)  # p^2 + (1 - p)^2
     assert (agree[1] > 0.85).all()
 
@@ -134,10 +134,10 @@ def test_samples_keep_what_is_known():
 @pytest.mark.parametrize("name", predictor_names())
 def test_a_predictor_that_ships_is_whole(name):
     folder, contract = find_predictor(name), contract_of(name)
-    assert {one.name for one in folder.iterdir()} == {CARD, CONTRACT, NETWORK, WEIGHTS}
+    assert {path.name for path in folder.iterdir()} == {CARD, CONTRACT, NETWORK, WEIGHTS}
     for file, digest in contract["sha256"].items():
         assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest
-    assert sum(one.numel() for one in load_predictor(name).parameters()) < 1_000_000
+    assert sum(parameter.numel() for parameter in load_predictor(name).parameters()) < 1_000_000
 
 
 @pytest.mark.parametrize("name", predictor_names())
@@ -169,25 +169,25 @@ def played() -> list[BeliefEpisode]:
 
 
 def test_beliefs_grow_and_are_true(played):
-    for one in played:
-        earlier = np.zeros_like(one.known(0))
-        for decision in range(one.decisions):
-            known = one.known(decision)
+    for episode in played:
+        earlier = np.zeros_like(episode.known(0))
+        for decision in range(episode.decisions):
+            known = episode.known(decision)
             assert (known[earlier == OBSTACLE] == OBSTACLE).all() and (known[earlier == FREE] != UNKNOWN).all()
-            assert one.truth[known == FREE].all() and not one.truth[known == OBSTACLE].any()
+            assert episode.truth[known == FREE].all() and not episode.truth[known == OBSTACLE].any()
             earlier = known
-        assert (one.known(0) == FREE).sum() < (earlier == FREE).sum()
-        assert one.reach == 10.0
+        assert (episode.known(0) == FREE).sum() < (earlier == FREE).sum()
+        assert episode.reach == 10.0
     truths = [open_cells(build_nav_grid(make_map("maze_small", index))) for index in (51, 52)]
-    assert all(any(np.array_equal(one.truth.ravel(), truth) for truth in truths) for one in played)
+    assert all(any(np.array_equal(episode.truth.ravel(), truth) for truth in truths) for episode in played)
 
 
 def test_episodes_are_files(played, tmp_path):
     beliefs.save_episodes(tmp_path / "maze_small-00000-0.npz", played)
     loaded = beliefs.load_groups(tmp_path)["maze_small"]
-    for one, again in zip(played, loaded, strict=True):
-        assert np.array_equal(one.free_at, again.free_at) and np.array_equal(one.truth, again.truth)
-        assert again.decisions <= one.decisions and again.reach == one.reach
+    for episode, again in zip(played, loaded, strict=True):
+        assert np.array_equal(episode.free_at, again.free_at) and np.array_equal(episode.truth, again.truth)
+        assert again.decisions <= episode.decisions and again.reach == episode.reach
         share = (again.known(again.decisions - 1) == FREE)[again.truth].mean()
         assert share < beliefs.COVERED or again.decisions == 1
 
@@ -205,7 +205,7 @@ def test_the_last_fifth_of_plans_is_held_out(tmp_path):
         (tmp_path / group).mkdir()
         for k in range(25):
             (tmp_path / group / f"{k:02d}.yaml").touch()
-    names = {part: [one.stem for one in beliefs.plan_files(str(tmp_path), part)] for part in ("train", "validation")}
+    names = {part: [file.stem for file in beliefs.plan_files(str(tmp_path), part)] for part in ("train", "validation")}
     assert names["train"] == 2 * [f"{k:02d}" for k in range(16)]
     assert names["validation"] == 2 * [f"{k:02d}" for k in range(16, 20)]
 
@@ -241,8 +241,8 @@ def test_a_cut_goes_beyond_the_grid():
 def test_the_eight_turns_differ_and_turn_together():
     grid = np.arange(9).reshape(3, 3)
     turned = [train.turn((grid, grid + 1), k) for k in range(8)]
-    assert len({one.tobytes() for one, _ in turned}) == 8
-    assert all(np.array_equal(one + 1, other) for one, other in turned)
+    assert len({cells.tobytes() for cells, _ in turned}) == 8
+    assert all(np.array_equal(cells + 1, other) for cells, other in turned)
 
 
 def toy_config(folder, **others) -> PredictorConfig:
@@ -272,7 +272,9 @@ def test_training_learns_and_goes_on_bit_for_bit(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         train.train_predictor(parts, report=stop)
     again = train.train_predictor(parts, report=lambda line: None)
-    assert all(torch.equal(one, other) for one, other in zip(whole.parameters(), again.parameters(), strict=True))
+    assert all(
+        torch.equal(parameter, other) for parameter, other in zip(whole.parameters(), again.parameters(), strict=True)
+    )
     assert (tmp_path / "parts" / "metrics.csv").read_text().splitlines() == rows
     with pytest.raises(UserError, match="holds a training with width=4, not 8"):
         train.train_predictor(toy_config(tmp_path, width=8), report=lambda line: None)
@@ -295,7 +297,7 @@ def test_figures_of_a_guess():
     assert found["log_loss"] == pytest.approx(sum(losses) / 4)
     assert found["accuracy"] == 0.75
     assert found["calibration_error"] == pytest.approx((0.1 + 0.6 + 0.4) / 4)
-    assert [found[f"accuracy_{one:g}"] for one in (0.25, 0.5, 1, 2)] == [1, 0, 1, 1]
+    assert [found[f"accuracy_{distance:g}"] for distance in (0.25, 0.5, 1, 2)] == [1, 0, 1, 1]
 
 
 def test_histograms_are_the_shares_of_free_cells():
@@ -308,7 +310,7 @@ def test_histograms_are_the_shares_of_free_cells():
 
 def test_the_predictor_beats_distance_where_nobody_trained(played):
     """On two validation maps; the guesses are those of docs/log."""
-    episodes, loss = [beliefs.until_covered(one) for one in played], {}
+    episodes, loss = [beliefs.until_covered(episode) for episode in played], {}
     for guess in (predict, predict_by_distance):
         cells = score.look_at(episodes, 3, lambda known, guess=guess: guess(as_batch(known))[0].numpy())
         loss[guess] = score.judge(cells.free, cells.guess, cells.ranges)["log_loss"]
@@ -329,4 +331,4 @@ def test_the_commands_end_with_a_sentence(tmp_path, capsys, monkeypatch):
 def test_contract_tells_what_goes_in_and_out():
     contract = json.loads((find_predictor("general") / CONTRACT).read_text())
     assert contract["inputs"]["known"]["type"] == "uint8" and contract["outputs"]["free"]["type"] == "float32"
-    assert all(0 < one < 1 for one in contract["by_distance"][1:])
+    assert all(0 < chance < 1 for chance in contract["by_distance"][1:])

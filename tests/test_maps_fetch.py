@@ -38,13 +38,13 @@ def server(tmp_path, monkeypatch):
         for row in rows:
             body = files[row[2]]
             writer.writerow([*row, len(body), hashlib.sha256(body).hexdigest(), "MIT"])
-    one = Server(files)
-    (sets / "tiny.yaml").write_text(f"about: rooms\naddress: {one.address}\n")
+    made = Server(files)
+    (sets / "tiny.yaml").write_text(f"about: rooms\naddress: {made.address}\n")
     monkeypatch.setattr(map_sets, "SETS", sets)
     monkeypatch.setattr(download, "PAUSES", (0.0, 0.0))
     monkeypatch.setattr(download, "PATIENCE", 2.0)
-    with one.serving():
-        yield one
+    with made.serving():
+        yield made
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def fetch(tmp_path, capsys):
 
 def content(folder: Path) -> dict[str, bytes]:
     """Path -> bytes of the files that are there, hidden ones included."""
-    return {str(one.relative_to(folder)): one.read_bytes() for one in sorted(folder.rglob("*")) if one.is_file()}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_a_set_is_fetched_with_its_licence_split_and_imported(server, fetch, tmp_path):
@@ -115,7 +115,7 @@ def test_a_server_that_is_busy_once_is_asked_again(server, fetch):
 
 
 def change(server, name: str, body: bytes | None) -> None:
-    server.files = {key: one for key, one in server.files.items() if not key.endswith(name)}
+    server.files = {key: content for key, content in server.files.items() if not key.endswith(name)}
     if body is not None:
         server.files[f"some/where/{name}"] = body
 
@@ -193,16 +193,21 @@ def test_the_cache_is_where_such_things_are_kept(monkeypatch, tmp_path):
 @pytest.mark.parametrize("name", map_sets.set_names())
 def test_a_set_is_pinned_split_by_building_and_has_its_licences(name):
     found = map_sets.load_set(name)
-    assert len({one.sha256 for one in found.maps}) == len({one.place for one in found.maps}) == len(found.maps) > 10
-    assert len({Path(one.file).stem for one in found.maps}) == len(found.maps), "a yaml each"
-    for one in found.entries:
-        assert len(one.sha256) == 64 and 0 < one.bytes < 10**7 and one.split in (*map_sets.SPLITS, "licences")
-        commit = one.address.split("/")[2]
+    assert (
+        len({entry.sha256 for entry in found.maps})
+        == len({entry.place for entry in found.maps})
+        == len(found.maps)
+        > 10
+    )
+    assert len({Path(entry.file).stem for entry in found.maps}) == len(found.maps), "a yaml each"
+    for entry in found.entries:
+        assert len(entry.sha256) == 64 and 0 < entry.bytes < 10**7 and entry.split in (*map_sets.SPLITS, "licences")
+        commit = entry.address.split("/")[2]
         assert len(commit) == 40 and not set(commit) - set("0123456789abcdef"), "an address that does not move"
     splits = {}
-    for one in found.maps:
-        assert np.isfinite([one.resolution, one.free_thresh]).all()
-        assert splits.setdefault(one.building, one.split) == one.split
+    for entry in found.maps:
+        assert np.isfinite([entry.resolution, entry.free_thresh]).all()
+        assert splits.setdefault(entry.building, entry.split) == entry.split
     assert set(splits.values()) == set(map_sets.SPLITS)
-    licensed = {one.source for one in found.entries if one.split == "licences"}
+    licensed = {entry.source for entry in found.entries if entry.split == "licences"}
     assert set(found.sources()) == licensed and all(found.sources().values())

@@ -45,8 +45,8 @@ def test_what_a_policy_keeps_is_counted_before_it_is_taken(reach):
     )
     tracker = TargetTracker(env)
     nav = tracker.nav
-    taken = sum(one.capacity for one in arrays_of(nav.known_grids, nav.passable, nav.paths, nav.blocks))
-    taken += sum(one.nbytes for one in tracker.state.values())
+    taken = sum(array.capacity for array in arrays_of(nav.known_grids, nav.passable, nav.paths, nav.blocks))
+    taken += sum(value.nbytes for value in tracker.state.values())
     assert navigation_bytes(env.settings, env.bank) * 40 == pytest.approx(taken, rel=0.02)
 
 
@@ -75,8 +75,10 @@ def arrays_of(*owners) -> list[wp.array]:
         for value in vars(owner).values():
             if isinstance(value, KnownGrids | PassableGrids | PathSearch | DistanceSearch) and id(value) not in done:
                 queue.append(value)
-            entries = [one for pair in value for one in pair] if name_of_rings(value) else [value]
-            found |= {one.ptr: one for one in entries if isinstance(one, wp.array) and one.deleter is not None}
+            entries = [array for pair in value for array in pair] if name_of_rings(value) else [value]
+            found |= {
+                entry.ptr: entry for entry in entries if isinstance(entry, wp.array) and entry.deleter is not None
+            }
     return list(found.values())
 
 

@@ -255,16 +255,16 @@ def test_compact_pictures_serve_in_place_of_pictures(env, share):
     networks = [make_policy(env).module[0], *(build_critic(kind, env) for kind in ("team", "local"))]
     for network, head in zip(networks, heads, strict=True):
         awake(network)
-        plain, found = (network(one.clone())[head] for one in (td, pooled))
+        plain, found = (network(batch.clone())[head] for batch in (td, pooled))
         torch.testing.assert_close(found, plain, rtol=5e-6, atol=1e-5)  # sums of hundreds, in another order
         slopes = [
             torch.autograd.grad(value.square().mean(), [*network.parameters()], allow_unused=True)
             for value in (plain, found)
         ]
-        for one, other in zip(*slopes, strict=True):
-            assert (one is None) == (other is None)
-            if one is not None:
-                torch.testing.assert_close(other, one, rtol=1e-3, atol=1e-5 * float(one.abs().max()))
+        for slope, other in zip(*slopes, strict=True):
+            assert (slope is None) == (other is None)
+            if slope is not None:
+                torch.testing.assert_close(other, slope, rtol=1e-3, atol=1e-5 * float(slope.abs().max()))
 
 
 def test_a_policy_hands_on_what_it_pooled(env):

@@ -16,7 +16,7 @@ NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 def cells(kind: str) -> list[str]:
     """The sources of the cells of one kind, in order."""
     found = json.loads(NOTEBOOK.read_text())["cells"]
-    return ["".join(one["source"]) for one in found if one["cell_type"] == kind]
+    return ["".join(cell["source"]) for cell in found if cell["cell_type"] == kind]
 
 
 def as_script() -> str:
@@ -44,5 +44,5 @@ def test_the_notebook_runs(tmp_path):
 
 def test_the_notebook_holds_no_outputs():
     """They would make every run of it a change of the repository."""
-    assert all(one.get("outputs", []) == [] for one in json.loads(NOTEBOOK.read_text())["cells"])
+    assert all(cell.get("outputs", []) == [] for cell in json.loads(NOTEBOOK.read_text())["cells"])
     assert len(cells("markdown")) >= 5

@@ -100,7 +100,7 @@ def module(tmp_path, monkeypatch):
     yield tmp_path
     for name in ("my_robots", "broken_robots", "raising_robots"):
         sys.modules.pop(name, None)
-    sys.path[:] = [one for one in sys.path if one != str(tmp_path)]
+    sys.path[:] = [folder for folder in sys.path if folder != str(tmp_path)]
 
 
 def evaluated(folder: str, *words: str) -> dict:
@@ -180,7 +180,7 @@ def test_a_plug_in_is_found_by_its_name(monkeypatch, capsys):
         metadata.EntryPoint(name, value, own.GROUP)
         for name, value in (("swarm", "my_robots:Stay"), ("bent", "my_robots"), ("voronoi", "my_robots:Corner"))
     ]
-    monkeypatch.setattr(own.metadata, "entry_points", lambda group: [one for one in points if one.group == group])
+    monkeypatch.setattr(own.metadata, "entry_points", lambda group: [point for point in points if point.group == group])
     found = find_player("swarm")
     assert (found.name, found.kind, found.pictures) == ("swarm", "own", False)
     assert find_player("voronoi").kind == "classical", "names of ours come first"

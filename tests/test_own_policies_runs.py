@@ -98,7 +98,7 @@ def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
     assert [name for name in summary["maze_small"] if name != "difference"] == names
     assert set(summary["maze_small"]["difference"]) == set(names[1:])
     assert Path("table/table.md").read_text().count("teachers.First") >= 2
-    cells = {one.parent.parent.name for one in Path("table/cells").glob("*/*/*/held_out.json")}
+    cells = {path.parent.parent.name for path in Path("table/cells").glob("*/*/*/held_out.json")}
     assert cells == set(names)
     capsys.readouterr()
     assert main(["benchmark", "resume=table"]) == 0
@@ -186,7 +186,7 @@ def test_a_suite_takes_what_policy_takes_elsewhere(tmp_path, monkeypatch, capsys
         assert main(["suite", "verify", str(where), f"suite={suite}"]) == 0, word
         found[word] = json.loads((where / "results.json").read_text())
     assert found["teachers:regions"]["episodes"] == found["swarm_voronoi"]["episodes"] == found["voronoi"]["episodes"]
-    means = {word: one["score"]["mean"] for word, one in found.items()}
+    means = {word: results["score"]["mean"] for word, results in found.items()}
     assert means["swarm_stay"] == min(means.values()) and len(set(means.values())) == 4
     assert Player("swarm_stay").hosted and not Player("swarm_voronoi").hosted
 

@@ -111,7 +111,7 @@ def test_a_radius_in_settings():
     with pytest.raises(ValueError, match=r"robot\.radius=0\.35 makes robot\.width 0\.7 m, and 0\.5 is given"):
         resolve(compose_config("train", [*words, "robot.width=0.5"]))
     mixed = compose_config("train", ["scenario=maze", "robot.team=[{radius: 0.35}, {}]"])
-    small, car = (one.completed(SCENARIOS["maze"]) for one in team_configs(mixed, 2)[0])
+    small, car = (config.completed(SCENARIOS["maze"]) for config in team_configs(mixed, 2)[0])
     assert (small.width, small.collision_threshold) == (0.7, 0.35) and (car.width, car.radius) == (1.0, None)
     assert "radius" not in resolve(mixed)["robot"]["team"][1] and describe_radius(mixed) is None
     own = compose_config("train", ["scenario=pointcloud", "scenario.path=x.yaml", "robot.radius=0.35"])

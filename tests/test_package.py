@@ -57,7 +57,7 @@ def test_rooms_of_agents_import_only_those_before_them():
 def test_torchrl_is_bounded_by_what_is_tested(name):
     """Losses, collectors and estimators build on it; the next minor version is tried before it is allowed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = next(one for one in map(Requirement, project["dependencies"]) if one.name == name)
+    wanted = next(dependency for dependency in map(Requirement, project["dependencies"]) if dependency.name == name)
     pinned = re.search(rf"^{name}==(\S+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)[1]
     major, minor, _ = map(int, pinned.split("."))
     assert pinned in wanted.specifier and f"{major}.{minor + 1}.0" not in wanted.specifier
@@ -76,7 +76,9 @@ def test_constraints_name_exact_versions():
     assert lines and all("==" in line and "+" not in line for line in lines)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in lines}
-    wanted = {one.partition(">=")[0].partition("[")[0].lower() for one in project["dependencies"]} - {"open3d"}
+    wanted = {dependency.partition(">=")[0].partition("[")[0].lower() for dependency in project["dependencies"]} - {
+        "open3d"
+    }
     assert wanted <= pinned
 
 

@@ -29,7 +29,7 @@ def episodes() -> list:
 
 @pytest.fixture()
 def page(episodes):
-    page = Page([Stage(one.map) for one in episodes], episodes)
+    page = Page([Stage(episode.map) for episode in episodes], episodes)
     yield page
     page.stop()
 
@@ -97,7 +97,7 @@ def test_a_map_alone_has_no_controls():
 
 
 def test_a_taken_port_is_passed_over(page, episodes):
-    other = Page([Stage(one.map) for one in episodes], episodes, port=page.server.get_port())
+    other = Page([Stage(episode.map) for episode in episodes], episodes, port=page.server.get_port())
     assert other.address != page.address and other.address.startswith("http://127.0.0.1:")
     other.stop()
 
@@ -128,7 +128,7 @@ def test_the_page_as_a_file(episodes, tmp_path, capsys, monkeypatch):
     text = (tmp_path / "page.html").read_text()
     assert "__VISER_EMBED_DATA__" in text and "page.html" in capsys.readouterr().out
     assert len(text) > len(write_page(Stage(episodes[0].map), None, tmp_path / "map.html").read_text())
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["e.npz", "map.html", "page.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["e.npz", "map.html", "page.html"]
 
 
 def share_of(pixels: np.ndarray, colour) -> float:

@@ -38,8 +38,8 @@ def test_without_pictures_all_else_is_the_same():
 def test_classical_planners_need_none_and_networks_say_so():
     env = make(False)
     regions = []
-    for one in (env, make()):
-        policy, td = POLICIES["cost_utility"](one), one.reset()
+    for either in (env, make()):
+        policy, td = POLICIES["cost_utility"](either), either.reset()
         regions.append(policy(td)["agents", "action", "region"])
     assert torch.equal(*regions)
     with pytest.raises(ValueError, match="observation.pictures=true"):

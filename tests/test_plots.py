@@ -203,10 +203,10 @@ def test_summary_has_bars_with_intervals(tmp_path, figures):
 @pytest.mark.parametrize("goal", [0.95, 0.99])
 def test_evaluations_show_no_mark_beyond_the_end_of_their_episodes(goal, tmp_path, figures):
     values = {"exploration_ratio": np.full(3, 0.95), "coverage_step_99_censored": np.full(3, 300.0)}
-    one = EvaluationResult("random", 3, values, 1.0, np.array([*"abc"]), success_coverage=goal)
-    one.times, one.coverage = np.arange(4.0), np.tile(np.linspace(0.0, 0.95, 4), (3, 1))
-    one.shares = np.ones((3, 3)) / 3
-    draw_results([one], tmp_path)
+    result = EvaluationResult("random", 3, values, 1.0, np.array([*"abc"]), success_coverage=goal)
+    result.times, result.coverage = np.arange(4.0), np.tile(np.linspace(0.0, 0.95, 4), (3, 1))
+    result.shares = np.ones((3, 3)) / 3
+    draw_results([result], tmp_path)
     assert ("Time to 99 % or the limit" in panels(figures[1])) == (goal == 0.99)
 
 

@@ -92,7 +92,7 @@ class Arrays:
         gain = np.broadcast_to(gain, value.shape)
         points = np.broadcast_to(self.points / REACH, (*value.shape, 2))
         everyone = torch.ones(1, len(value), len(value), dtype=torch.bool)
-        as_team = [torch.tensor(np.ascontiguousarray(one)).unsqueeze(0).float() for one in (gain, value, points)]
+        as_team = [torch.tensor(np.ascontiguousarray(array)).unsqueeze(0).float() for array in (gain, value, points)]
         return plan_in_turn(*as_team, everyone)[0][0].numpy()
 
     def heard(self, values, blank):
@@ -115,7 +115,8 @@ def test_all_terms_together_are_those_of_plain_loops(seed):
     np.testing.assert_allclose(rank_by_criteria(scene), expected, atol=1e-6)
     tensors = scene_of([travel.tolist()], [[points.tolist()] * 4], nav=Places([at.tolist()]))
     shown = {
-        name: torch.tensor(one).float().expand(1, 4, *one.shape) for name, one in (("gain", gain), ("middle", middle))
+        name: torch.tensor(array).float().expand(1, 4, *array.shape)
+        for name, array in (("gain", gain), ("middle", middle))
     }
     np.testing.assert_allclose(rank_by_criteria(replace(tensors, **shown))[0].numpy(), expected, atol=1e-5)
 

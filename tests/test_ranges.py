@@ -98,16 +98,16 @@ def test_every_setting_of_an_algorithm_has_its_range(name):
     row = ALGORITHMS[name]
     for tuning in ("default", "reference"):
         row.configure(tuning)
-    for one in (field.name for field in fields(row.settings)):
-        for value in GOOD[one]:
-            assert getattr(row.configure(**{one: value}), one) == value
-        for value in BAD[one] + EVERYWHERE:
-            with pytest.raises(ValueError, match=rf"algorithm\.{one}=") as caught:
-                row.configure(**{one: value})
+    for setting in (field.name for field in fields(row.settings)):
+        for value in GOOD[setting]:
+            assert getattr(row.configure(**{setting: value}), setting) == value
+        for value in BAD[setting] + EVERYWHERE:
+            with pytest.raises(ValueError, match=rf"algorithm\.{setting}=") as caught:
+                row.configure(**{setting: value})
             assert repr(value) in str(caught.value) and "must be" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", [one.name for one in fields(ModelConfig)])
+@pytest.mark.parametrize("name", [field.name for field in fields(ModelConfig)])
 def test_every_size_of_a_network_has_its_range(name):
     kind = type(getattr(SIZES["small"], name))
     bad = {str: ["fft"], bool: [1], int: [0, -1, 2.0, 10**6, True], float: [-1e-9]}[kind]
@@ -147,13 +147,13 @@ def test_what_may_be_infinite_or_left_open_passes():
 def test_every_setting_has_a_line_of_help(verb):
     """But names of choices and what only the command line fills in."""
     settings = schema(verb)
-    missing = {one.name for one in fields(settings) if not one.metadata.get("help")}
-    groups = {one for one in missing if is_dataclass(kinds(settings)[one][0])}
+    missing = {field.name for field in fields(settings) if not field.metadata.get("help")}
+    groups = {name for name in missing if is_dataclass(kinds(settings)[name][0])}
     allowed = {"preset", "action", "tuning", "task", "sweep", "checkpoint", *(["seed"] if verb == "benchmark" else [])}
     assert missing - groups <= allowed
     for group in groups:
         kind = kinds(settings)[group][0]
-        bare = {one.name for one in fields(kind) if not one.metadata.get("help")}
+        bare = {field.name for field in fields(kind) if not field.metadata.get("help")}
         assert bare <= {"name", "team", "importing"}, (group, bare)
 
 

@@ -113,8 +113,8 @@ def test_gains_pay_at_once_what_time_would_have_cost(unfinished):
             td = drive(env, td, control)
             total += env.simulation.tensors["terms"][:, :, time]
         earned[kind], ends[kind] = total, (td["info", "coverage"], td["info", "collided"], td["info", "local_steps"])
-    for one, other in zip(ends["uncovered"], ends["gained"], strict=True):
-        assert torch.equal(one, other)
+    for uncovered, gained in zip(ends["uncovered"], ends["gained"], strict=True):
+        assert torch.equal(uncovered, gained)
     coverage, collided, steps = ends["gained"]
     assert (coverage >= 0.3).any() and (coverage < 0.3).any() and (steps < 90).any(), "some are done early, some never"
     constant = V * 90 * (1.0 - starts["gained"] + unfinished)

@@ -69,7 +69,7 @@ def floor() -> np.ndarray:
 def conversion(monkeypatch):
     monkeypatch.syspath_prepend(str(PACKAGE))
     yield importlib.import_module("maexp_ros.conversion")
-    for name in [one for one in sys.modules if one.startswith("maexp_ros")]:
+    for name in [name for name in sys.modules if name.startswith("maexp_ros")]:
         del sys.modules[name]
 
 
@@ -119,7 +119,7 @@ def test_grids_of_several_robots_are_merged():
     walls = frames.OccupancyGrid(np.full((2, 2), 100, np.int8), 0.1, (1.0, 1.0, 0.0))
     over = frames.merge_grids([frames.OccupancyGrid(values, 0.1, (0.0, 0.0, 0.0)), walls]).values
     assert (over[10:12, 10:12] == 100).all() and (over == 100).sum() == (values == 100).sum() + 4
-    alike = frames.merge_grids([frames.OccupancyGrid(one, 0.07, (0.03, 0.01, 0.0)) for one in (left, right)])
+    alike = frames.merge_grids([frames.OccupancyGrid(cells, 0.07, (0.03, 0.01, 0.0)) for cells in (left, right)])
     assert np.array_equal(alike.values, values) and alike.origin == (0.03, 0.01, 0.0)
 
 
@@ -130,7 +130,7 @@ def test_grids_that_go_to_and_fro_do_not_grow(cell):
     own = [frames.OccupancyGrid(floor(), cell, (low, high, 0.0)), frames.OccupancyGrid(floor(), cell, (high, low, 0.0))]
     told, sizes = list(own), set()
     for _ in range(30):
-        told = [frames.merge_grids([one, other]) for one, other in zip(own, told[::-1], strict=True)]
+        told = [frames.merge_grids([grid, other]) for grid, other in zip(own, told[::-1], strict=True)]
         sizes.add(told[0].values.shape)
     assert len(sizes) == 1 and (told[0].values >= 0).sum() > (floor() >= 0).sum()
 
@@ -302,7 +302,7 @@ def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypa
         ros.parameters["offsets"] = [0.0] * 6
         for module, stand_in in ros.modules().items():
             monkeypatch.setitem(sys.modules, module, stand_in)
-        for module in [one for one in sys.modules if one.startswith("maexp_ros.")]:
+        for module in [name for name in sys.modules if name.startswith("maexp_ros.")]:
             del sys.modules[module]
         seen[name] = importlib.import_module("maexp_ros.team_node").TeamNode(), ros
     (node, ros), (other, others) = seen["a"], seen["b"]
@@ -333,10 +333,10 @@ def test_what_is_missing_is_said(team):
     ros.place("a", 1.0, 1.5)
     node.decide()
     assert [name for name, _ in ros.sent] == ["/a/navigate_to_pose"]
-    assert any("b: tf does not say where b/base_link is in map" in one for one in ros.told)
+    assert any("b: tf does not say where b/base_link is in map" in sentence for sentence in ros.told)
     ros.now += 10.0
     node.decide()
-    assert any("a: its pose is too old" in one for one in ros.told)
+    assert any("a: its pose is too old" in sentence for sentence in ros.told)
     assert ros.cancelled == ["/a/navigate_to_pose"], "nobody knows where it drives"
     ros.place("a", 1.0, 1.5)
     ros.ready = False
@@ -371,13 +371,13 @@ def test_done_is_said_once(team):
     ros.place("a", 1.0, 1.5)
     ros.place("b", 1.0, 4.0)
     node.decide(), node.decide()
-    assert not ros.sent and sum("done: nothing" in one for one in ros.told) == 1
+    assert not ros.sent and sum("done: nothing" in sentence for sentence in ros.told) == 1
 
 
 def test_the_package_is_whole():
     described = xml.parse(PACKAGE / "package.xml").getroot()
     assert described.find("name").text == "maexp_ros" and described.find("license").text == "MIT"
-    wanted = {one.text for one in described.findall("exec_depend")}
+    wanted = {element.text for element in described.findall("exec_depend")}
     setup = (PACKAGE / "setup.py").read_text()
     calls = [node for node in ast.walk(ast.parse(setup)) if isinstance(node, ast.Constant)]
     for part in ("launch/team.launch.py", "config/team.yaml", "rviz/team.rviz"):

@@ -53,14 +53,14 @@ class Navigator:
     def told(self) -> dict[int, tuple[int, str]]:
         """By the number of the goal: how it has ended, and why."""
         time.sleep(0.1)
-        return {one.seq: (one.status, one.result.error_msg) for one in self.results.take()}
+        return {result.seq: (result.status, result.result.error_msg) for result in self.results.take()}
 
     def statuses(self) -> list[int]:
         """Of all goals, as was told last."""
         time.sleep(0.1)
         last = list(self.status.take())[-1].status_list
-        assert [one.goal_info.goal_id.uuid for one in last] == self.mine
-        return [one.status for one in last]
+        assert [status.goal_info.goal_id.uuid for status in last] == self.mine
+        return [status.status for status in last]
 
 
 @pytest.fixture
@@ -187,4 +187,4 @@ def test_a_goal_that_has_ended_cannot_be_cancelled(navigated):
     time.sleep(0.1)
     policy._wait(policy._now(), [])
     time.sleep(0.1)
-    assert [one.return_code for one in other.client.cancels.take()] == [2, 0, 3]
+    assert [answer.return_code for answer in other.client.cancels.take()] == [2, 0, 3]

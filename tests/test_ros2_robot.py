@@ -156,8 +156,8 @@ def step_until(made: list[Ros2Robot], done, places: Places, seconds: float = 120
         if now > last + 0.5:
             places.publish()
             last = now
-        for one in made:
-            one.step()
+        for member in made:
+            member.step()
 
 
 @pytest.mark.slow
@@ -165,13 +165,15 @@ def test_robots_merge_what_they_hear_and_keep_it_when_they_part(alone):
     places, both = Places(), [robot("a", memory=2.0), robot("b", memory=2.0)]
     places.publish()
 
-    def columns(one: Ros2Robot) -> int:
-        known = one.driver.known([])
+    def columns(member: Ros2Robot) -> int:
+        known = member.driver.known([])
         return 0 if known is None else int((known.values >= 0).any(0).sum())
 
-    step_until(both, lambda: [columns(one) for one in both] == [45, 45], places)
+    step_until(both, lambda: [columns(member) for member in both] == [45, 45], places)
     step_until(
-        both, lambda: all(one.driver.planner.heard for one in both) and all(one.driver.goals for one in both), places
+        both,
+        lambda: all(member.driver.planner.heard for member in both) and all(member.driver.goals for member in both),
+        places,
     )
     first = both[0]
     assert first.driver.planner.heard["b"].pose[:2] == pytest.approx((4.5, 1.5))
@@ -193,7 +195,7 @@ def test_robots_merge_what_they_hear_and_keep_it_when_they_part(alone):
 
 @pytest.mark.slow
 def test_what_is_told_is_read_and_nonsense_is_noted(alone):
-    places, one = Places(), robot("a")
+    places, member = Places(), robot("a")
     other = Wire()
     said, shown = other.reader("/a/maexp/word"), other.reader("/a/maexp/map")
     words, maps = other.writer("/b/maexp/word"), other.writer("/b/maexp/map")
@@ -205,7 +207,7 @@ def test_what_is_told_is_read_and_nonsense_is_noted(alone):
         odd = time.monotonic() % 1.0 < 0.5  # one after the other: only the last is kept
         words.write(words.make(data="\x1b[2J" if odd else write_word(replace(WORD, name="c"))))
         maps.write(maps.make())
-        return bool(got["word"] and got["map"]) and all(any(part in note for note in one.notes) for part in notes)
+        return bool(got["word"] and got["map"]) and all(any(part in note for note in member.notes) for part in notes)
 
     notes = (
         "/b/maexp/word: what came is no word of a robot",
@@ -214,19 +216,19 @@ def test_what_is_told_is_read_and_nonsense_is_noted(alone):
     )
 
     places.publish()
-    step_until([one], heard, places)
+    step_until([member], heard, places)
     word = read_word(got["word"][-1].data)
     assert (word.name, word.pose) == ("a", (1.5, 1.5, 0.0)) and abs(word.time - time.time()) < 120.0
     assert got["map"][-1].header.frame_id == "map" and read_map(got["map"][-1]).values.shape == (60, 60)
-    assert not one.driver.told and not one.driver.words
+    assert not member.driver.told and not member.driver.words
 
 
 @pytest.mark.slow
 def test_a_map_that_is_not_aligned_is_refused(alone):
-    places, one = Places(), robot("a", offsets=())
+    places, member = Places(), robot("a", offsets=())
     places.publish()
     with pytest.raises(UserError, match="/a/map is in a frame called map.*give offsets="):
-        step_until([one], lambda: False, places)
+        step_until([member], lambda: False, places)
 
 
 PROGRAM = "import sys; from maexp.agents.cli import main; sys.exit(main())"
@@ -283,12 +285,12 @@ def test_robots_that_drive_themselves_play_a_suite(tmp_path):
     assert main(["suite", "run", str(suite), "policy=cost_utility", "num_envs=1", f"hydra.run.dir={inside}"]) == 0
     for code, text in said:
         assert code == 0 and "8 episodes of an arena" in text, text
-    files = sorted(one.name for one in (over / "actions").iterdir())
-    assert len(files) == 8 and files == sorted(one.name for one in (inside / "actions").iterdir())
+    files = sorted(path.name for path in (over / "actions").iterdir())
+    assert len(files) == 8 and files == sorted(path.name for path in (inside / "actions").iterdir())
     same = []
     for name in files:
-        with np.load(over / "actions" / name) as one, np.load(inside / "actions" / name) as other:
-            assert not any(one["reasons"])
-            alike = one["goal"].shape == other["goal"].shape
-            same.append(alike and bool(np.abs(one["goal"] - other["goal"]).max() < 1e-4))
+        with np.load(over / "actions" / name) as ours, np.load(inside / "actions" / name) as theirs:
+            assert not any(ours["reasons"])
+            alike = ours["goal"].shape == theirs["goal"].shape
+            same.append(alike and bool(np.abs(ours["goal"] - theirs["goal"]).max() < 1e-4))
     assert sum(same) >= 5 and not all(same), same

@@ -27,7 +27,7 @@ class Robots:
     def __init__(self, *names: str):
         self.wire = Wire()
         self.topics = ["/clock", "/tf", "/tf_static", EPISODE]
-        self.topics += [f"/{name}/{one}" for name in names for one in ("map", "odom", "scan", "tf", "tf_static")]
+        self.topics += [f"/{name}/{topic}" for name in names for topic in ("map", "odom", "scan", "tf", "tf_static")]
         self.readers = {topic: self.wire.reader(topic) for topic in self.topics}
         self.goals = {name: self.wire.writer(f"/{name}/goal_pose") for name in names}
         self.heard = {topic: [] for topic in self.topics}
@@ -76,11 +76,13 @@ def test_what_a_robot_tells(served):
         read = read_map(heard["/robot2/map"][-1])
         assert np.array_equal(read.values, seen["grid"][1]) and read.resolution == pytest.approx(seen["resolution"])
         assert heard["/robot2/map"][-1].header.frame_id == "robot2/map" and read.origin[:2] == seen["origin"]
-        still = {one.child_frame_id: one.header.frame_id for one in heard["/tf_static"][-1].transforms}
+        still = {
+            transform.child_frame_id: transform.header.frame_id for transform in heard["/tf_static"][-1].transforms
+        }
         assert still["robot1/map"] == "map" and still["robot2/odom"] == "robot2/map"
         assert still["robot1/base_scan"] == "robot1/base_link"
         first = heard["/tf"][0].transforms
-        assert [one.child_frame_id for one in first] == ["robot1/base_link", "robot2/base_link"]
+        assert [transform.child_frame_id for transform in first] == ["robot1/base_link", "robot2/base_link"]
         place = first[1].transform.translation
         assert (place.x, place.y) == pytest.approx(tuple(seen["poses"][0, 1, :2]))
         told = json.loads(heard[EPISODE][-1].data)
@@ -127,13 +129,15 @@ def test_robots_drive_while_the_clock_runs(served):
         state = env.step(policy(state))
     assert not policy.reasons[0]
     heard = robots.listen()
-    times = [read_nanoseconds(one.clock) for one in heard["/clock"]]
+    times = [read_nanoseconds(message.clock) for message in heard["/clock"]]
     assert times == sorted(times) and times[-1] == env.local_steps * 10**8
-    stamps = [read_nanoseconds(one.header.stamp) for one in heard["/robot1/odom"]]
+    stamps = [read_nanoseconds(message.header.stamp) for message in heard["/robot1/odom"]]
     assert stamps[-1] == times[-1] and len(heard["/tf"]) == env.local_steps + 1
     moved = heard["/tf"][-1].transforms[0].transform.translation
     assert math.hypot(moved.x - at[0, 0], moved.y - at[0, 1]) > 0.1
-    fastest = max(math.hypot(one.twist.twist.linear.x, one.twist.twist.linear.y) for one in heard["/robot1/odom"])
+    fastest = max(
+        math.hypot(message.twist.twist.linear.x, message.twist.twist.linear.y) for message in heard["/robot1/odom"]
+    )
     assert 0.1 < fastest < 20.0
 
 
@@ -147,8 +151,8 @@ def test_goals_that_are_none_are_told(served):
         robots.send("robot2", math.nan, 1.0)
         policy._decide()
     assert policy.reasons[0]
-    assert any("/robot1/goal_pose: a goal in the frame camera is not known" in one for one in served.told)
-    assert any("/robot2/goal_pose: x=nan" in one for one in served.told)
+    assert any("/robot1/goal_pose: a goal in the frame camera is not known" in sentence for sentence in served.told)
+    assert any("/robot2/goal_pose: x=nan" in sentence for sentence in served.told)
 
 
 def test_who_sends_nonsense_without_end_is_told_for_a_while_and_cannot_paint_the_terminal(served):
@@ -161,8 +165,8 @@ def test_who_sends_nonsense_without_end_is_told_for_a_while_and_cannot_paint_the
             for k in range(10):
                 robots.send("robot1", 1.0, 1.0, frame=f"\x1b[2J{count}{k}" + "x" * 1000)
             policy.robots[0].listen(0, 0, policy._refuse)
-    told = [one for one in served.told if "a goal in the frame" in one]
-    assert 0 < len(told) < 30 and all(one.isprintable() and len(one) < 500 for one in told)
+    told = [sentence for sentence in served.told if "a goal in the frame" in sentence]
+    assert 0 < len(told) < 30 and all(sentence.isprintable() and len(sentence) < 500 for sentence in told)
 
 
 def test_a_clock_that_waits_runs_on_and_then_goes_on_with_what_there_is(served):
@@ -192,7 +196,7 @@ def test_a_robot_that_has_collided_is_silent_and_not_waited_for(served):
         goals = policy._decide()
     assert policy.idle == 0 and goals[0].tolist() == [1.0, 1.0] and np.isnan(goals[1]).all()
     heard = robots.listen()
-    assert [one.child_frame_id for one in heard["/tf"][-1].transforms] == ["robot1/base_link"]
+    assert [transform.child_frame_id for transform in heard["/tf"][-1].transforms] == ["robot1/base_link"]
     assert heard["/robot1/odom"] and not heard["/robot2/odom"]
 
 
@@ -223,8 +227,11 @@ def test_frames_of_each_robots_own(served):
     heard = robots.listen()
     assert not heard["/tf"] and not heard["/tf_static"]
     for name in ("a", "b"):
-        assert [one.child_frame_id for one in heard[f"/{name}/tf"][0].transforms] == ["base_link"]
-        still = [(one.header.frame_id, one.child_frame_id) for one in heard[f"/{name}/tf_static"][0].transforms]
+        assert [transform.child_frame_id for transform in heard[f"/{name}/tf"][0].transforms] == ["base_link"]
+        still = [
+            (transform.header.frame_id, transform.child_frame_id)
+            for transform in heard[f"/{name}/tf_static"][0].transforms
+        ]
         assert still == [("map", "odom"), ("base_link", "base_scan")]
         assert heard[f"/{name}/map"][0].header.frame_id == "map"
         assert heard[f"/{name}/odom"][0].header.frame_id == "odom"

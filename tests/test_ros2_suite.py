@@ -50,19 +50,19 @@ def play_served(suite: Path, where: Path, goals: str) -> tuple[int, str]:
 @pytest.mark.parametrize("goals", ["goal_pose", "navigate_to_pose"])
 def test_the_same_choices_as_inside(folders, goals):
     over, inside = folders[1] / goals, folders[1] / "inside"
-    files = sorted(one.name for one in (over / "actions").iterdir())
-    assert len(files) == 8 and files == sorted(one.name for one in (inside / "actions").iterdir())
+    files = sorted(path.name for path in (over / "actions").iterdir())
+    assert len(files) == 8 and files == sorted(path.name for path in (inside / "actions").iterdir())
     for name in files:
-        with np.load(over / "actions" / name) as one, np.load(inside / "actions" / name) as other:
-            assert np.abs(one["goal"] - other["goal"]).max() < 1e-4 and not any(one["reasons"])
-            assert np.array_equal(one["metrics"], other["metrics"], equal_nan=True)
-            assert (one["seconds"] > 0).all()
+        with np.load(over / "actions" / name) as ours, np.load(inside / "actions" / name) as theirs:
+            assert np.abs(ours["goal"] - theirs["goal"]).max() < 1e-4 and not any(ours["reasons"])
+            assert np.array_equal(ours["metrics"], theirs["metrics"], equal_nan=True)
+            assert (ours["seconds"] > 0).all()
 
 
 def test_the_action_has_the_bits_of_the_topic(folders):
-    one, other = (folders[1] / goals / "actions" for goals in ("goal_pose", "navigate_to_pose"))
-    for file in one.iterdir():
-        with np.load(file) as here, np.load(other / file.name) as there:
+    by_topic, by_action = (folders[1] / goals / "actions" for goals in ("goal_pose", "navigate_to_pose"))
+    for file in by_topic.iterdir():
+        with np.load(file) as here, np.load(by_action / file.name) as there:
             for name in ("goal", "metrics", "decisions"):
                 assert np.array_equal(here[name], there[name], equal_nan=True), name
 

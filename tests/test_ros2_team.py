@@ -121,7 +121,7 @@ def test_a_team_tells_that_nobody_navigates(own_domain):
     made = Ros2Team(TeamDriver(settings), Wire(), 5.0, told.append, "navigate_to_pose")
     robots.publish()
     step_until(made, lambda: len(told) >= 2)
-    assert any("a: nobody offers /a/navigate_to_pose yet" in one for one in told) and not made.driver.goals
+    assert any("a: nobody offers /a/navigate_to_pose yet" in sentence for sentence in told) and not made.driver.goals
 
 
 @pytest.mark.parametrize("text", ["garbage", "[1]", '{"robots": ["a"]}', '{"begins": 0, "robots": 3}'])

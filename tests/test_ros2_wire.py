@@ -142,7 +142,7 @@ def cut(message, name: str, older):
         elif kind == Nodetype.NAME and about in older.fielddefs:
             values[field] = cut(getattr(message, field), about, older)
         elif kind == Nodetype.SEQUENCE:
-            values[field] = [cut(one, about[0][1], older) for one in getattr(message, field)]
+            values[field] = [cut(item, about[0][1], older) for item in getattr(message, field)]
         else:
             values[field] = getattr(message, field)
     return older.types[name](**values)
@@ -208,11 +208,11 @@ SEND = "/a/navigate_to_pose/_action/send_goal"
 
 
 def test_a_service_answers_who_asks(own_domain):
-    here, one, other = Wire(), Wire(), Wire()
-    server, clients = here.server(SEND), [one.client(SEND), other.client(SEND)]
+    here, there, elsewhere = Wire(), Wire(), Wire()
+    server, clients = here.server(SEND), [there.client(SEND), elsewhere.client(SEND)]
     assert here.server(SEND) is server, "two would both answer"
     while not all(client.matched for client in clients):
-        one.wait(0.05)
+        there.wait(0.05)
     numbers = [client.ask() for client in (clients[0], *clients)]
     assert numbers == [1, 2, 1]
     asked = []
@@ -221,7 +221,7 @@ def test_a_service_answers_who_asks(own_domain):
         asked += server.take()
     for question in asked:
         server.answer(question, accepted=question.guid == clients[0].guid)
-    for wire, client, accepted, count in ((one, clients[0], True, 2), (other, clients[1], False, 1)):
+    for wire, client, accepted, count in ((there, clients[0], True, 2), (elsewhere, clients[1], False, 1)):
         got = []
         while len(got) < count:
             wire.wait(0.1)
@@ -235,12 +235,14 @@ def test_names_of_services_on_the_wire(own_domain):
     wire = Wire()
     client = wire.client(SEND)
     wrote, reads = (
-        [one for one in BuiltinDataReader(wire.participant, topic).take(9) if SEND in one.topic_name]
+        [endpoint for endpoint in BuiltinDataReader(wire.participant, topic).take(9) if SEND in endpoint.topic_name]
         for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
     )
     kind = "nav2_msgs::action::dds_::NavigateToPose_SendGoal_"
-    assert [(one.topic_name, one.type_name) for one in wrote] == [(f"rq{SEND}Request", f"{kind}Request_")]
-    assert [(one.topic_name, one.type_name) for one in reads] == [(f"rr{SEND}Reply", f"{kind}Response_")]
+    assert [(endpoint.topic_name, endpoint.type_name) for endpoint in wrote] == [
+        (f"rq{SEND}Request", f"{kind}Request_")
+    ]
+    assert [(endpoint.topic_name, endpoint.type_name) for endpoint in reads] == [(f"rr{SEND}Reply", f"{kind}Response_")]
     assert not client.matched and "clientid=" in str(wrote[0].qos) and str(wrote[0].qos).count("Reliable")
 
 

@@ -137,7 +137,7 @@ def test_trees_find_frontiers_as_those_of_the_kernels_do():
             grow_trees(scene.grid, scene.at, scene.rng, RRT_SAMPLES, 0.5 * scene.radar_range), scene.grid.width
         )
         blocks = scene.targets.block_of(x, y)
-        ours += len({tuple(one) for one in blocks.tolist()})
+        ours += len({tuple(block) for block in blocks.tolist()})
         theirs += int(now.nav.grow_trees(RRT_SAMPLES, 0.5 * now.nav.radar_range).sum())
     assert ours == pytest.approx(theirs, rel=0.2)
 

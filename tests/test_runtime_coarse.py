@@ -51,15 +51,15 @@ def test_blocks_are_safe_and_stay_where_they_are(yaw):
     whole = KnownGrid(grid, 0.05, (3.0, -2.0), yaw)
     shifted = KnownGrid(grid[7:, 4:], 0.05, tuple(whole.to_map(np.array([4, 7]) * 0.05)), yaw)
     seen = []
-    for one in (whole, shifted):
-        coarse = coarsen(one, 0.35)
+    for fine in (whole, shifted):
+        coarse = coarsen(fine, 0.35)
         middle = coarse.to_map(coarse.centers(np.arange(coarse.known.size)))
-        cells = one.cells(one.from_map(middle))
+        cells = fine.cells(fine.from_map(middle))
         inside = cells >= 0
         free = coarse.known.ravel() == FREE
-        assert (one.known.ravel()[cells[free & inside]] == FREE).all()
-        walls = np.flatnonzero(one.known.ravel() == OBSTACLE)
-        blocks = coarse.cells(coarse.from_map(one.to_map(one.centers(walls))))
+        assert (fine.known.ravel()[cells[free & inside]] == FREE).all()
+        walls = np.flatnonzero(fine.known.ravel() == OBSTACLE)
+        blocks = coarse.cells(coarse.from_map(fine.to_map(fine.centers(walls))))
         assert (coarse.known.ravel()[blocks] == OBSTACLE).all(), "a wall is a wall in any block"
         seen.append(set(map(tuple, np.round(middle[inside & free], 3))))
     assert len(seen[1] - seen[0]) < 0.02 * len(seen[1]), "other blocks than before"

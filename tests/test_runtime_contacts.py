@@ -151,8 +151,8 @@ def test_features_are_those_of_the_env(kind, folder):
         action = env.rand_action(td)
         td = step_mdp(env.step(action))
     at = feature_names(True).index("base_signal")
-    gaps = np.array([abs(one[at] - other[at]) for one, other in signals])
-    assert (gaps < 3e-3).mean() > 0.97 and len({round(float(one[at]), 2) for one, _ in signals}) > 1
+    gaps = np.array([abs(signal[at] - other[at]) for signal, other in signals])
+    assert (gaps < 3e-3).mean() > 0.97 and len({round(float(signal[at]), 2) for signal, _ in signals}) > 1
     assert checked > 60 and told > 3
 
 
@@ -264,13 +264,13 @@ def test_it_is_left_where_the_robot_stands_still_or_is_there(folder):
         tells.append(bool(plan.tells[0]))
         notes += plan.notes
     assert tells == [True] * 6 + [False] * 2
-    assert any("a gave up telling the base station: it did not move for 5 s" in one for one in notes)
+    assert any("a gave up telling the base station: it did not move for 5 s" in note for note in notes)
     planner.reset()
     places, tells = [(3.0, 3.0), (1.0, 1.0), (3.0, 3.0), (3.0, 3.0)], []
     for place, now in zip(places, (0.0, 5.0, 20.0, 5.0 + planner.watch.pause), strict=True):
         plan = planner.plan(world.grid(), CELL, (0.0, 0.0), {"a": place}, now=now)
         tells.append(bool(plan.tells[0]))
-        gave = any("gave up telling the base station: nothing was heard of it" in one for one in plan.notes)
+        gave = any("gave up telling the base station: nothing was heard of it" in note for note in plan.notes)
         assert gave == (place == (1.0, 1.0)), plan.notes
     assert tells == [True, False, False, True], "it is there, and nobody hears it: it goes on for a while"
 
@@ -288,18 +288,18 @@ def test_when_nothing_is_left_to_be_seen_what_is_known_is_told(folder):
 def test_robots_take_over_what_a_mate_tells_of_itself(folder):
     """Who hears that a mate is on its way to tell leaves it to that, and does not count its target."""
     world = World()
-    one, two = (RobotPlanner(name, folder, mates=("a", "b"), **SETTINGS | RADIO) for name in "ab")
-    for planner in (one, two):
+    first, second = (RobotPlanner(name, folder, mates=("a", "b"), **SETTINGS | RADIO) for name in "ab")
+    for planner in (first, second):
         like(planner.team, 5.0)
-    plan = two.plan(world.grid(), CELL, (0.0, 0.0), (3.0, 3.0), now=0.0)
-    assert plan.tells.all() and two.word().memory.tells
-    like(one.team, -5.0)
-    one.hear(two.word())
-    plan = one.plan(world.grid(), CELL, (0.0, 0.0), (3.2, 3.0), now=0.5)
-    book = one.team.book
+    plan = second.plan(world.grid(), CELL, (0.0, 0.0), (3.0, 3.0), now=0.0)
+    assert plan.tells.all() and second.word().memory.tells
+    like(first.team, -5.0)
+    first.hear(second.word())
+    plan = first.plan(world.grid(), CELL, (0.0, 0.0), (3.2, 3.0), now=0.5)
+    book = first.team.book
     assert book.memories["b"].tells and not plan.tells.any() and book.crew == {"a", "b"}
     assert book.memories["a"].met["b"].place == (3.0, 3.0) and STATION not in book.memories["a"].met
-    one.plan(world.grid(), CELL, (0.0, 0.0), (3.2, 3.0), now=1.0, connected={STATION})
+    first.plan(world.grid(), CELL, (0.0, 0.0), (3.2, 3.0), now=1.0, connected={STATION})
     assert book.memories["a"].linked and book.memories["a"].met["b"].used == pytest.approx(0.0)
 
 

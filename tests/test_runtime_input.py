@@ -87,7 +87,7 @@ def test_what_is_strange_in_a_grid_is_unknown_and_said():
     clean[5, 5:8] = -1
     odd[5, 5:8] = np.nan, 101.0, -7.0
     plan, same = TeamPlanner(), TeamPlanner()
-    first, second = (one.plan(grid, 0.1, (0, 0), POSES, now=0.0) for one, grid in ((plan, clean), (same, odd)))
+    first, second = (planner.plan(grid, 0.1, (0, 0), POSES, now=0.0) for planner, grid in ((plan, clean), (same, odd)))
     assert np.array_equal(first.goals, second.goals) and first.notes == ()
     assert second.notes == ("grid: 3 cells hold neither -1 nor 0 to 100 and were taken as unknown",)
     wrapped = TeamPlanner().plan(clean.astype(np.uint8), 0.1, (0, 0), POSES, now=0.0)

@@ -79,12 +79,12 @@ def test_words_and_grids_go_together():
     origin, team = (0.0, 0.0), TeamPlanner("cost_utility", **SETTINGS)
     for _ in range(2):
         found = [
-            one.plan(half, CELL, origin, tuple(at), now=0.0, share=True)
-            for one, half, at in zip(each.values(), halves, world.at, strict=True)
+            planner.plan(half, CELL, origin, tuple(at), now=0.0, share=True)
+            for planner, half, at in zip(each.values(), halves, world.at, strict=True)
         ]
         tell(each)
     wanted = team.plan(world.grid(), CELL, origin, dict(zip(NAMES, world.at, strict=True)), now=0.0)
-    np.testing.assert_array_equal(np.concatenate([one.goals for one in found]), wanted.goals)
+    np.testing.assert_array_equal(np.concatenate([plan.goals for plan in found]), wanted.goals)
     assert (each["a"].word().grid.values >= 0).sum() == (world.grid() >= 0).sum() > (halves[0] >= 0).sum()
 
 

@@ -22,14 +22,14 @@ def test_targets_are_shared_out_as_they_should():
         preference = np.where(rng.random(way.shape) < 0.3, -np.inf, rng.uniform(-1, 1, way.shape) - 0.1 * way)
         body = rng.uniform(0.2, 1.0, robots)
         got = share_targets(preference, way, points, body).tolist()
-        one = {
+        case = {
             "preference": preference.tolist(),
             "way": way.tolist(),
             "point": [points.tolist()] * robots,
             "hears": [[True] * robots] * robots,
             "body": body.tolist(),
         }
-        assert got == ([-1 if k is None else k for k in share(one)] if targets else [-1] * robots)
+        assert got == ([-1 if k is None else k for k in share(case)] if targets else [-1] * robots)
         settled += sum(k >= 0 for k in got)
     assert settled > 500
 
@@ -78,7 +78,7 @@ def test_robots_that_go_back_and_forth_together_are_sent_apart(monkeypatch):
         assert gap(plan) >= 0.4
         said += plan.notes
         world.now += 1.0
-    assert sum("back and forth" in one for one in said) >= 2
+    assert sum("back and forth" in sentence for sentence in said) >= 2
 
 
 def corridor() -> np.ndarray:

@@ -104,7 +104,7 @@ def test_a_robot_that_stands_still_gives_its_target_up_and_the_team_goes_on_with
     world.frozen[0] = True
     with caplog.at_level(logging.WARNING, "maexp.runtime"):
         said = explore(world, planner, 300)
-    gave_up = [one for one in said if one.startswith("robot 0 gave its target up: it did not move")]
+    gave_up = [sentence for sentence in said if sentence.startswith("robot 0 gave its target up: it did not move")]
     assert len(gave_up) == 3, said  # then it is parked, and nothing more is given up
     assert "robot 0 stands still whatever its target: the team plans without it" in said
     assert said[-1] == "done" and world.share() > 0.97
@@ -171,7 +171,7 @@ def test_a_robot_that_goes_back_and_forth_is_sent_to_the_nearest(monkeypatch, ro
         said.append(plan.notes)
         world.now += 1.0
     caught = 2 * round_ - 1
-    assert [k for k, one in enumerate(said) if one] == [caught]
+    assert [k for k, sentences in enumerate(said) if sentences] == [caught]
     assert said[caught] == ("robot 0 went back and forth between targets: it goes on to the nearest",)
     nearest = world.call(TeamPlanner("nearest_frontier", **SETTINGS)).goals[0]
     assert not np.allclose(goals[0], goals[1]) and np.allclose(goals[0], goals[round_])
@@ -200,12 +200,12 @@ def test_a_robot_whose_pose_comes_and_goes_is_watched_while_it_is_there(absent):
         poses = {0: world.at[0]} if there else lost
         plan = planner.plan(world.grid(), CELL, (0.0, 0.0), poses, now=world.now)
         world.now += 1.0
-        return tuple(one for one in plan.notes if "gave" in one)
+        return tuple(note for note in plan.notes if "gave" in note)
 
     assert not any(call(there=k == 0) for k in range(19))  # nobody could drive it
     assert not call(there=True)
     said = [call(there=bool(k % 2)) for k in range(10)]
-    assert [one for one in said if one] == [("robot 0 gave its target up: it did not move for 5 s",)]
+    assert [sentences for sentences in said if sentences] == [("robot 0 gave its target up: it did not move for 5 s",)]
 
 
 def test_a_robot_that_comes_no_nearer_gives_its_target_up():

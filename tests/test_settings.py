@@ -77,9 +77,9 @@ def test_the_values_are_those_of_the_env_and_the_learner():
     maps = [make_map("maze_small", 0)]
     env, shown = make_env(cfg, maps, 2), resolve(cfg, maps)
     assert [
-        one | {"radar": asdict(radar)}
-        for one, radar in zip(map(asdict, env.robot_configs), env.radar_configs, strict=True)
-    ] == [{"radius": None} | one for one in shown["robot"]["team"]]
+        robot | {"radar": asdict(radar)}
+        for robot, radar in zip(map(asdict, env.robot_configs), env.radar_configs, strict=True)
+    ] == [{"radius": None} | robot for robot in shown["robot"]["team"]]
     assert shown["planner"].items() <= asdict(env.planner_config).items()
     assert shown["reward"] == asdict(env.settings.reward) and shown["comm"] == asdict(env.comm_config)
     assert (env.local_steps, env.macro_steps) == (shown["scenario"]["local_steps"], shown["scenario"]["macro_steps"])

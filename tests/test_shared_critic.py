@@ -43,8 +43,10 @@ def encoder_gradient(loss, batch) -> float:
     """What the critic's loss alone moves in the policy's encoder."""
     loss.zero_grad()
     loss(batch)["loss_critic"].backward()
-    grads = [one.grad for key, one in loss.actor_network_params.flatten_keys(".").items() if "encoder" in key]
-    return sum(float(one.abs().sum()) for one in grads if one is not None)
+    grads = [
+        parameter.grad for key, parameter in loss.actor_network_params.flatten_keys(".").items() if "encoder" in key
+    ]
+    return sum(float(grad.abs().sum()) for grad in grads if grad is not None)
 
 
 @pytest.mark.parametrize("name", SHARING)
@@ -137,11 +139,11 @@ def test_teams_are_looked_at_in_parts(monkeypatch):
         logits, seen = chooser.look(features, mask, comm)
         (logits[mask].square().sum() + seen.square().sum()).backward()
         there = logits > target_chooser.NEVER
-        grads = [one.grad.clone() for one in chooser.parameters()]
+        grads = [parameter.grad.clone() for parameter in chooser.parameters()]
         reader.zero_grad()
         read = reader(features, mask, comm, torch.zeros(7, 3, 1), torch.ones(7, 3, dtype=torch.bool))
         read.square().sum().backward()
-        grads += [one.grad.clone() for one in reader.parameters()]
+        grads += [parameter.grad.clone() for parameter in reader.parameters()]
         results[part] = [there.float(), logits[there].detach(), seen.detach(), read.detach(), *grads]
         with torch.no_grad():
             assert torch.equal(chooser.look(features, mask, comm)[0], chooser(features, mask, comm)[0])

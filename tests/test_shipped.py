@@ -79,7 +79,7 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
             whole, *floors = (
                 found[f"{policy}{place} N={size}"]["exploration_ratio"] for place in ("", " on hall", " on yard")
             )
-            assert [one["n"] for one in (whole, *floors)] == [4, 2, 2]
+            assert [results["n"] for results in (whole, *floors)] == [4, 2, 2]
             assert whole["mean"] == pytest.approx((floors[0]["mean"] + floors[1]["mean"]) / 2)
         assert f"cost_utility N={size}" in found["difference"][f"universal N={size}"]
     seen = [found[f"universal N={size}"]["exploration_ratio"]["mean"] for size in (2, 8)]

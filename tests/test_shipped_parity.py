@@ -74,7 +74,7 @@ def test_logits_on_recorded_observations(name):
             inputs = [part[:size] for part in seen]
             with torch.no_grad():
                 wanted = chooser(*inputs)[0].numpy()
-            fed = dict(zip(INPUTS, (one.numpy() for one in inputs), strict=True))
+            fed = dict(zip(INPUTS, (tensor.numpy() for tensor in inputs), strict=True))
             given, there = session.run(["logits"], fed)[0], inputs[1].numpy()
             error = np.abs(given - true[:size])[there].max()
             print(f"{name}, {num_robots} robots, batch of {size}: {error:.1e}, torch's {torchs:.1e}")

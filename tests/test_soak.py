@@ -59,7 +59,7 @@ def test_soak(tmp_path, monkeypatch):
 
     quarter = len(samples) // 4
     second, last = samples[quarter : 2 * quarter], samples[-quarter:]
-    memory = [statistics.median(one[2] for one in part) for part in (second, last)]
+    memory = [statistics.median(sample[2] for sample in part) for part in (second, last)]
     rates = []
     for part in (samples[quarter : 2 * quarter + 1], samples[-quarter - 1 :]):
         count = part[-1][1] - part[0][1]

@@ -157,10 +157,13 @@ def test_what_is_let_through_does_not_collide_and_what_is_not_does(collision):
 
 
 def test_fixed_starts_belong_to_seed_and_map(maps):
-    one, two = make(maps, 8, 3, seed=5, starts="fixed"), make(maps[::-1], 4, 3, seed=5, starts="fixed", first_env=9)
+    first, second = (
+        make(maps, 8, 3, seed=5, starts="fixed"),
+        make(maps[::-1], 4, 3, seed=5, starts="fixed", first_env=9),
+    )
     poses: dict[str, set] = {"maze_small_0": set(), "maze_small_1": set()}
-    for env in (one, two):
-        env.set_episodes(torch.arange(env.num_envs)) if env is two else None
+    for env in (first, second):
+        env.set_episodes(torch.arange(env.num_envs)) if env is second else None
         for _ in range(3):
             env.reset()
             for e, m in enumerate(env.simulation.tensors["map_id"].tolist()):
@@ -169,10 +172,10 @@ def test_fixed_starts_belong_to_seed_and_map(maps):
     env = make(maps, 8, 2, seed=5, starts="fixed")
     env.reset()
     for e, m in enumerate(env.simulation.tensors["map_id"].tolist()):
-        assert where(env)[e].tobytes() == one.simulation.map_starts[m, :2].numpy().tobytes(), "a part of the team"
-    assert (one.simulation.map_starts != make(maps, 8, 3, seed=6, starts="fixed").simulation.map_starts).any()
+        assert where(env)[e].tobytes() == first.simulation.map_starts[m, :2].numpy().tobytes(), "a part of the team"
+    assert (first.simulation.map_starts != make(maps, 8, 3, seed=6, starts="fixed").simulation.map_starts).any()
     env.set_seed(6)
-    assert not torch.equal(env.simulation.map_starts, one.simulation.map_starts[:, :2])
+    assert not torch.equal(env.simulation.map_starts, first.simulation.map_starts[:, :2])
 
 
 def test_fixed_starts_keep_clear():

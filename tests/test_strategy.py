@@ -67,7 +67,7 @@ def goal_of(env: ExplorationEnv, robot: int) -> list[float]:
 
 
 def start(env: ExplorationEnv, *poses) -> None:
-    env.set_starts([[*one, 0.0] for one in poses])
+    env.set_starts([[*pose, 0.0] for pose in poses])
     env.reset()
 
 
@@ -154,7 +154,7 @@ def test_reports_are_rarer_the_longer_the_way(x):
 
 def test_the_next_meeting_is_farther_off_the_more_they_know():
     """All who meet agree on one time, also where one of them is slower."""
-    env = make("rendezvous", robots=2, period="auto", robot=[RobotConfig(max_speed=one) for one in (1.0, 2.0)])
+    env = make("rendezvous", robots=2, period="auto", robot=[RobotConfig(max_speed=speed) for speed in (1.0, 2.0)])
     start(env, (4.0, 10.0), (6.0, 12.0))
     wait(env)
     first = env.strategy.state["due"][0].tolist()
@@ -248,7 +248,7 @@ def test_a_pursuit_pays_by_what_the_other_misses():
     assert not wait(env)[1], "there, and nobody to be heard"
 
 
-@pytest.mark.parametrize("strategy", [one for one in STRATEGIES if one != "opportunistic"])
+@pytest.mark.parametrize("strategy", [strategy for strategy in STRATEGIES if strategy != "opportunistic"])
 @pytest.mark.parametrize("period", [3, "auto"])
 def test_decisions_repeat(strategy, period):
     """For any size of the batch, from a saved state and in a copy, with targets or a planner's goals."""
@@ -264,7 +264,7 @@ def test_decisions_repeat(strategy, period):
         env.set_episodes(torch.arange(env.num_envs))
     generator = torch.Generator().manual_seed(1)
     picks = torch.randint(4, (6, 3, 3), generator=generator)
-    one, many = small.reset(), large.reset()
+    single, many = small.reset(), large.reset()
     on_duty = 0
     for k, pick in enumerate(picks):
         if k == 3:
@@ -272,10 +272,10 @@ def test_decisions_repeat(strategy, period):
             small = pickle.loads(pickle.dumps(small))
             small.load_state_dict(saved)
         states = []
-        for env, td, rows in ((small, one, pick[:1]), (large, many, pick)):
+        for env, td, rows in ((small, single, pick[:1]), (large, many, pick)):
             td["agents", "action", "target"] = rows
             states.append(env.step(td))
-        one, many = (step_mdp(state) for state in states)
+        single, many = (step_mdp(state) for state in states)
         for name in ("pose", "known_weight", "hears"):
             assert torch.equal(small.simulation.tensors[name][0], large.simulation.tensors[name][0]), name
         for name, value in small.strategy.state.items():
@@ -291,10 +291,10 @@ def test_a_new_episode_remembers_nothing():
         td = step_mdp(env.step(policy(td)))
     fresh = make("rendezvous", robots=3, envs=2, base=True, macro_steps=5)
     fresh.reset()
-    for one in (env, fresh):
-        one.set_episodes(torch.arange(2))
-        one.reset()
-        one.step(stay(one))
+    for either in (env, fresh):
+        either.set_episodes(torch.arange(2))
+        either.reset()
+        either.step(stay(either))
     for name, value in env.strategy.state.items():
         if name not in ("place", "spot"):  # those that have never met are nowhere
             assert torch.equal(value, fresh.strategy.state[name]), name

@@ -35,7 +35,7 @@ def test_a_suite_is_as_it_was_frozen(name):
             check_maps(suite, part, build_maps(part))
     frozen = read_frozen(suite)
     for policy, results in frozen.items():
-        values = {part: one.episodes[suite.score] for part, one in results.items()}
+        values = {part: result.episodes[suite.score] for part, result in results.items()}
         assert score.mean_of(values) == suite.frozen["scores"][policy]["score"]
     scores = suite.frozen["scores"]
     assert 0.1 < scores["random"]["score"] < scores[suite.reference]["score"] - 0.05
@@ -110,7 +110,7 @@ def test_another_seed_plays_other_maps(small_suite):
     part = load_suite(str(small_suite)).parts["maze_small"]
     others = [part.indices(7), part.indices(8), load_suite(str(small_suite)).parts["indoor_small"].indices(7)]
     assert part.indices() == [1000, 1001] and part.indices(7) == others[0]
-    assert len({one for several in others for one in several}) == 6 and min(map(min, others)) >= 10_000
+    assert len({number for several in others for number in several}) == 6 and min(map(min, others)) >= 10_000
     assert sums(part, build_maps(part, 7), 7) != sums(part, build_maps(part, 8), 8)
 
 

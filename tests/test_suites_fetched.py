@@ -107,7 +107,7 @@ def refused(halls: Path, tmp_path: Path, words: list[str], capsys, *told: str) -
         assert main(["suite", *task]) == 2
         err = capsys.readouterr().err
         lines = [line for line in err.splitlines() if line.startswith("maexp: ")]
-        assert len(lines) == 1 and all(one in lines[0] for one in told), err
+        assert len(lines) == 1 and all(text in lines[0] for text in told), err
     assert not list(tmp_path.glob("other/actions/*"))
 
 
@@ -140,8 +140,8 @@ def fetched(data_dir, tmp_path_factory):
     """The test split of `floors`, fetched from a server on this machine: of the others nothing."""
     where = tmp_path_factory.mktemp("floors")
     rows = [row for row in csv.DictReader(open(map_sets.SETS / "floors.csv")) if row["split"] in ("test", "licences")]
-    files = [one for name in ("maps2d", "licences") for one in (data_dir / name).iterdir()]
-    content = {hashlib.sha256(one.read_bytes()).hexdigest(): one.read_bytes() for one in files}
+    files = [path for name in ("maps2d", "licences") for path in (data_dir / name).iterdir()]
+    content = {hashlib.sha256(file.read_bytes()).hexdigest(): file.read_bytes() for file in files}
     server = Server({row["address"]: content[row["sha256"]] for row in rows})
     (where / "sets").mkdir()
     (where / "sets" / "floors.yaml").write_text((map_sets.SETS / "floors.yaml").read_text())
@@ -164,7 +164,7 @@ def test_real_1_is_as_it_was_frozen(fetched):
     part = suite.parts["floors"]
     maps = build_maps(part)
     check_maps(suite, part, maps)
-    assert [one.name for one in maps] == part.map_names()
+    assert [world.name for world in maps] == part.map_names()
     frozen = read_frozen(suite)["random"]["floors"]
     env = build_env(part, maps, 4, suite.seed, ObservationConfig(pictures=False), device="cpu")
     with Player("random").open(env) as policy:

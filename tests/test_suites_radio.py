@@ -66,9 +66,9 @@ def test_each_part_has_its_own_score(small, played, capsys):
     content, frozen = json.loads((played / "results.json").read_text()), read_frozen(load_suite(str(small)))
     own = [np.array(content["episodes"][part][metric], dtype=float) for part, metric in SCORES.items()]
     theirs = [frozen["cost_utility"][part].episodes[metric] for part, metric in SCORES.items()]
-    assert content["score"]["mean"] == pytest.approx(np.mean([one.mean() for one in own]))
-    assert content["reference"]["score"] == pytest.approx(np.mean([one.mean() for one in theirs]))
-    less = np.mean([(one - other).mean() for one, other in zip(own, theirs, strict=True)])
+    assert content["score"]["mean"] == pytest.approx(np.mean([values.mean() for values in own]))
+    assert content["reference"]["score"] == pytest.approx(np.mean([values.mean() for values in theirs]))
+    less = np.mean([(mine - reference).mean() for mine, reference in zip(own, theirs, strict=True)])
     assert content["reference"]["difference"]["score"]["mean"] == pytest.approx(less)
     for (part, metric), values in zip(SCORES.items(), own, strict=True):
         seen = np.array(content["episodes"][part]["coverage_auc"])
@@ -110,7 +110,7 @@ def test_a_row_and_the_page_say_what_is_scored(small, played, tmp_path):
 @pytest.mark.parametrize("name", ["score", "done"])
 def test_score_and_end_of_a_part_are_in_the_checksum(name, small, tmp_path):
     changed = {"score": "coverage_auc", "done": "union"}[name]
-    path = write(tmp_path / "small.yaml", lambda one: one["parts"]["indoor_small"].update({name: changed}))
+    path = write(tmp_path / "small.yaml", lambda content: content["parts"]["indoor_small"].update({name: changed}))
     content = yaml.safe_load(path.read_text()) | {"frozen": load_suite(str(small)).frozen}
     path.write_text(yaml.safe_dump(content))
     (tmp_path / "small.csv").write_bytes(small.with_suffix(".csv").read_bytes())

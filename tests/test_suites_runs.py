@@ -34,7 +34,7 @@ def test_a_stopped_run_goes_on_to_the_same_results(small_suite, suite_run, tmp_p
     assert main(words) == 130
     assert f"maexp suite run resume={where}" in capsys.readouterr().err
     monkeypatch.undo()
-    assert sorted(one.name for one in (where / "actions").iterdir()) == [
+    assert sorted(path.name for path in (where / "actions").iterdir()) == [
         "indoor_small-0000.npz",
         "maze_small-0000.npz",
         "maze_small-0003.npz",
@@ -42,10 +42,10 @@ def test_a_stopped_run_goes_on_to_the_same_results(small_suite, suite_run, tmp_p
     kept = (where / "actions" / "indoor_small-0000.npz").stat().st_mtime_ns
     assert main(["suite", "run", f"resume={where}"]) == 0
     assert (where / "actions" / "indoor_small-0000.npz").stat().st_mtime_ns == kept
-    one, other = (json.loads((place / "results.json").read_text()) for place in (suite_run, where))
+    ours, theirs = (json.loads((place / "results.json").read_text()) for place in (suite_run, where))
     for name in ("suite", "score", "parts", "reference", "episodes", "maps", "profile"):
-        assert one[name] == other[name], name
-    assert (one["policy"], other["policy"]) == ("nearest_frontier", "our nearest mark 2")
+        assert ours[name] == theirs[name], name
+    assert (ours["policy"], theirs["policy"]) == ("nearest_frontier", "our nearest mark 2")
     assert verify(where, str(small_suite))["verified"] and not batches
 
 
@@ -68,7 +68,7 @@ def test_a_full_disk_is_one_sentence(copied_run, monkeypatch, capsys):
     monkeypatch.setattr("maexp.agents.suites.run_files.np.savez_compressed", full)
     assert main(["suite", "run", f"resume={copied_run}"]) == 2
     assert "free some space" in capsys.readouterr().err
-    assert not [one for one in (copied_run / "actions").iterdir() if "indoor_small-0000" in one.name]
+    assert not [path for path in (copied_run / "actions").iterdir() if "indoor_small-0000" in path.name]
 
 
 def test_two_runs_cannot_hold_one_folder_and_resume_keeps_what_was_played(copied_run, capsys):
@@ -141,7 +141,7 @@ def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, sm
         run.wait()
     assert run.returncode == 130 and "Go on with: maexp suite run resume=" in told
     end = time.monotonic() + 30
-    while left := [one for one in guests if Path(f"/proc/{one}").exists()]:  # killed, and perhaps not yet gone
+    while left := [guest for guest in guests if Path(f"/proc/{guest}").exists()]:  # killed, and perhaps not yet gone
         assert time.monotonic() < end, left
         time.sleep(0.05)
 
@@ -149,9 +149,9 @@ def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, sm
 def find_guests(parent: int) -> list[int]:
     """Processes of policies that `parent` has started."""
     found = []
-    for one in Path("/proc").glob("[0-9]*"):
+    for path in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            mine = int((one / "stat").read_text().rpartition(")")[2].split()[1]) == parent
-            if mine and b"maexp.agents.policies.guest" in (one / "cmdline").read_bytes():
-                found.append(int(one.name))
+            mine = int((path / "stat").read_text().rpartition(")")[2].split()[1]) == parent
+            if mine and b"maexp.agents.policies.guest" in (path / "cmdline").read_bytes():
+                found.append(int(path.name))
     return found

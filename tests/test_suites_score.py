@@ -13,7 +13,7 @@ def result(values: list[float], maps: list[str]) -> EvaluationResult:
 
 def test_the_score_and_its_interval_count_every_part_alike():
     parts = {"a": result([0.2, 0.4], ["x", "y"]), "b": result([0.8] * 6, list("zzuuvw"))}
-    values = {name: one.episodes["coverage_auc"] for name, one in parts.items()}
+    values = {name: part.episodes["coverage_auc"] for name, part in parts.items()}
     found = score.mean_over_parts(values, parts)
     assert found["mean"] == pytest.approx(0.55) and found["n"] == 8
     assert found["ci95"] == [pytest.approx(0.5), pytest.approx(0.6)]  # only the maps of `a` differ

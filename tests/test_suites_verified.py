@@ -48,9 +48,9 @@ def test_actions_give_the_same_bits_played_in_other_batches(suite_run, small_sui
     with player.open(env) as policy:
         noted = [play_batch(suite, env, policy, first) for first in (0, 2)]
     whole = build_env(part, build_maps(part), 4, suite.seed, ObservationConfig(pictures=False), device="cpu")
-    rows = {name: np.concatenate([getattr(one, name) for one in noted]) for name in run_files.ARRAYS}
-    goal = np.concatenate([one.sent["goal"] for one in noted])
-    metrics = {name: np.concatenate([one.metrics[name] for one in noted]) for name in suite.metrics}
+    rows = {name: np.concatenate([getattr(batch, name) for batch in noted]) for name in run_files.ARRAYS}
+    goal = np.concatenate([batch.sent["goal"] for batch in noted])
+    metrics = {name: np.concatenate([batch.metrics[name] for batch in noted]) for name in suite.metrics}
     again = replay_batch(suite, whole, Batch(0, sent={"goal": goal}, metrics=metrics, **rows))
     for name, values in metrics.items():
         assert np.array_equal(values, again.metrics[name], equal_nan=True), name
@@ -65,18 +65,18 @@ def test_a_run_that_noted_regions_and_offsets_plays_again(small_suite, tmp_path)
 
     def policy(state):
         said.append((draw.integers(0, 64, shape), draw.uniform(-1.2, 1.2, (*shape, 2)).astype(np.float32)))
-        state[REGION], state[OFFSET] = (torch.from_numpy(one) for one in said[-1])
+        state[REGION], state[OFFSET] = (torch.from_numpy(array) for array in said[-1])
         return state
 
     maps = build_maps(part)
     noted = play_batch(suite, build_replay(part, maps, 4, suite.seed), policy, 0)
-    region, offset = (np.stack([one[k] for one in said], 1) for k in (0, 1))
+    region, offset = (np.stack([choice[k] for choice in said], 1) for k in (0, 1))
     earlier = replace(noted, sent={"region": region.astype(np.uint8), "offset": offset})
     run_files.write_batch(tmp_path, suite, part.name, earlier)
     read = run_files.read_batch(tmp_path, suite, part.name, 0)
     assert list(read.sent) == ["region", "offset"]
     again = replay_batch(suite, build_replay(part, maps, 4, suite.seed), read)
-    assert all(np.array_equal(one, again.metrics[name], equal_nan=True) for name, one in noted.metrics.items())
+    assert all(np.array_equal(values, again.metrics[name], equal_nan=True) for name, values in noted.metrics.items())
     assert np.array_equal(noted.sent["goal"], again.sent["goal"])
     earlier.sent["region"][0, 0] = 64
     run_files.write_batch(tmp_path, suite, part.name, earlier)
@@ -118,14 +118,14 @@ def edit_files(change):
 
 def pick(episodes: list[int]):
     """What a file has of these episodes, in this order."""
-    return lambda arrays: arrays.update({name: one[episodes] for name, one in arrays.items()})
+    return lambda arrays: arrays.update({name: array[episodes] for name, array in arrays.items()})
 
 
 def swap_files(where: Path) -> None:
-    one, other = (where / "actions" / f"{part}-0000.npz" for part in ("maze_small", "indoor_small"))
-    kept = one.read_bytes()
-    one.write_bytes(other.read_bytes())
-    other.write_bytes(kept)
+    first, second = (where / "actions" / f"{part}-0000.npz" for part in ("maze_small", "indoor_small"))
+    kept = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(kept)
 
 
 def other_action(arrays: dict) -> None:
@@ -149,7 +149,9 @@ EDITS = {
     "a metric": (edit_json(set_metric), "results.json", "episodes.maze_small.coverage_auc[1]"),
     "an action": (edit_actions(other_action), "actions/maze_small-0003.npz", "episode 3: coverage_auc"),
     "an action, its file as it was told": (
-        lambda where: edit_json(lambda one: one["files"].update({"actions/maze_small-0003.npz": "0" * 64}))(where),
+        lambda where: edit_json(lambda results: results["files"].update({"actions/maze_small-0003.npz": "0" * 64}))(
+            where
+        ),
         "actions/maze_small-0003.npz",
         "SHA-256: the file was changed",
     ),
@@ -165,41 +167,53 @@ EDITS = {
     ),
     "another map": (edit_json(set_map), "results.json", "maps.maze_small.1000"),
     "another map of an episode": (
-        edit_json(lambda one: one["episodes"]["maze_small"]["map"].reverse()),
+        edit_json(lambda results: results["episodes"]["maze_small"]["map"].reverse()),
         "results.json",
         "episodes.maze_small.map",
     ),
     "another version of the suite": (
-        edit_json(lambda one: one["suite"].update(version=2)),
+        edit_json(lambda results: results["suite"].update(version=2)),
         "results.json",
         "suite.version",
     ),
     "another checksum": (
-        edit_json(lambda one: one["suite"].update(checksum="0" * 64)),
+        edit_json(lambda results: results["suite"].update(checksum="0" * 64)),
         "results.json",
         "suite.checksum",
     ),
-    "another seed": (edit_json(lambda one: one["suite"].update(seed=5)), "results.json", "suite.seed"),
-    "a score": (edit_json(lambda one: one["score"].update(mean=0.99)), "results.json", "score.mean"),
-    "an interval": (edit_json(lambda one: one["score"]["ci95"].reverse()), "results.json", "score.ci95[0]"),
+    "another seed": (edit_json(lambda results: results["suite"].update(seed=5)), "results.json", "suite.seed"),
+    "a score": (edit_json(lambda results: results["score"].update(mean=0.99)), "results.json", "score.mean"),
+    "an interval": (edit_json(lambda results: results["score"]["ci95"].reverse()), "results.json", "score.ci95[0]"),
     "a mean of a part": (
-        edit_json(lambda one: one["parts"]["maze_small"]["path_length"].update(mean=1.0)),
+        edit_json(lambda results: results["parts"]["maze_small"]["path_length"].update(mean=1.0)),
         "results.json",
         "parts.maze_small.path_length.mean",
     ),
     "a difference": (
-        edit_json(lambda one: one["reference"]["difference"]["coverage_auc"].update(mean=0.1)),
+        edit_json(lambda results: results["reference"]["difference"]["coverage_auc"].update(mean=0.1)),
         "results.json",
         "reference.difference.coverage_auc.mean",
     ),
     "a profile": (
-        edit_json(lambda one: one["profile"]["policy"].__setitem__(3, 0.5)),
+        edit_json(lambda results: results["profile"]["policy"].__setitem__(3, 0.5)),
         "results.json",
         "profile.policy[3]",
     ),
-    "a time": (edit_json(lambda one: one["decisions"].update(mean_seconds=1e-9)), "results.json", "decisions.mean_sec"),
-    "a reference": (edit_json(lambda one: one["reference"].update(score=0.1)), "results.json", "reference.score"),
-    "a part left out": (edit_json(lambda one: one["parts"].pop("maze_small")), "results.json", "parts.maze_small"),
+    "a time": (
+        edit_json(lambda results: results["decisions"].update(mean_seconds=1e-9)),
+        "results.json",
+        "decisions.mean_sec",
+    ),
+    "a reference": (
+        edit_json(lambda results: results["reference"].update(score=0.1)),
+        "results.json",
+        "reference.score",
+    ),
+    "a part left out": (
+        edit_json(lambda results: results["parts"].pop("maze_small")),
+        "results.json",
+        "parts.maze_small",
+    ),
     "a damaged file": (cut_off, "actions/indoor_small-0000.npz", "is damaged or holds something else"),
     "a missing file": (
         lambda where: (where / "actions" / "maze_small-0000.npz").unlink(),
@@ -228,17 +242,17 @@ EDITS = {
         "holds episodes after the last, 3",
     ),
     "a seed that is none": (
-        edit_json(lambda one: one["suite"].update(seed="x", frozen_maps=False)),
+        edit_json(lambda results: results["suite"].update(seed="x", frozen_maps=False)),
         "results.json",
         "an entry is missing or of another kind",
     ),
     "a seed below 0": (
-        edit_json(lambda one: one["suite"].update(seed=-1, frozen_maps=False)),
+        edit_json(lambda results: results["suite"].update(seed=-1, frozen_maps=False)),
         "results.json",
         "an entry is missing or of another kind",
     ),
     "no JSON": (lambda where: (where / "results.json").write_text("{"), "results.json", "is missing, damaged"),
-    "an entry of another kind": (edit_json(lambda one: one.update(episodes=3)), "results.json", "episodes"),
+    "an entry of another kind": (edit_json(lambda results: results.update(episodes=3)), "results.json", "episodes"),
 }
 
 
@@ -250,7 +264,9 @@ def test_an_edited_run_is_not_believed_and_what_differs_is_named(copied_run, sma
     out, err = capsys.readouterr()
     report = json.loads(out)
     assert not report["verified"] and err.count("\n") == 1 and "is not what it says" in err
-    assert any(one["file"] == file and where in one["where"] for one in report["differences"]), report["differences"]
+    assert any(difference["file"] == file and where in difference["where"] for difference in report["differences"]), (
+        report["differences"]
+    )
 
 
 def test_other_maps_and_starts_are_told_and_verified(small_suite, tmp_path, capsys):

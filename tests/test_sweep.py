@@ -56,11 +56,13 @@ def test_a_sweep_ends_with_one_table_and_planners_play_once(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     assert main(["train", "-m", "seed=3,4", *SMALL]) == 0
     assert played.count("trained") == played.count("untrained") == 2
-    assert sorted(one for one in played if "trained" not in one) == sorted(
+    assert sorted(name for name in played if "trained" not in name) == sorted(
         ["random", "cost_utility", "nearest_frontier"] + ["cost_utility", "nearest_frontier"]  # held out, validation
     )
     summaries = [json.loads(Path("all", str(k), "summary.json").read_text()) for k in range(2)]
-    assert [one["run"]["seed"] for one in summaries] == [3, 3], "of the episodes, which differences are told from"
+    assert [summary["run"]["seed"] for summary in summaries] == [3, 3], (
+        "of the episodes, which differences are told from"
+    )
     assert summaries[0]["cost_utility"] == summaries[1]["cost_utility"]
     assert "evaluation_seed: 3" in Path("all/1/config.yaml").read_text()
     table = capsys.readouterr().out.partition("2 runs, 5 held-out episodes each")[2]

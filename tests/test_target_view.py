@@ -145,7 +145,7 @@ def test_a_saved_state_goes_on_bit_for_bit(planner):
     assert wide
     other.load_state_dict(state)  # a kernel would read wider numbers as others
     assert all(value.dtype == env.state_dict()[name].dtype for name, value in other.state_dict().items())
-    a, b = (play(one, 2, td.clone())[-1] for one in (env, other))
+    a, b = (play(either, 2, td.clone())[-1] for either in (env, other))
     assert torch.equal(a[TARGETS], b[TARGETS])
     with pytest.raises(ValueError, match="target"):
         other.load_state_dict(ExplorationEnv(MAPS, num_envs=4, num_threads=1).state_dict())

@@ -28,9 +28,9 @@ class LargeOperations(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))
-        views = any(one.alias_info and not one.alias_info.is_write for one in func._schema.returns)
-        tensors = [one for one in tree_flatten((args, kwargs, out))[0] if isinstance(one, torch.Tensor)]
-        if not views and any(one.numel() > self.GRAIN for one in tensors):
+        views = any(output.alias_info and not output.alias_info.is_write for output in func._schema.returns)
+        tensors = [leaf for leaf in tree_flatten((args, kwargs, out))[0] if isinstance(leaf, torch.Tensor)]
+        if not views and any(tensor.numel() > self.GRAIN for tensor in tensors):
             self.met.append(func.name())
         return out
 
@@ -98,8 +98,8 @@ def test_policy_and_critic_learn_at_once_what_they_learn_in_turn(name, two_threa
     torch.set_num_threads(2)
     here = {threading.get_ident()}
     assert ran[1, "policy"] == ran[1, "critic"] == ran[2, "policy"] == here and not ran[2, "critic"] & here
-    (two, logs), (one, others) = learned
-    assert logs == others and all(torch.equal(value, two[key]) for key, value in one.items())
+    (double, logs), (single, others) = learned
+    assert logs == others and all(torch.equal(value, double[key]) for key, value in single.items())
 
 
 TIMES = ("advantage", "update")

@@ -50,7 +50,7 @@ def told(env: ExplorationEnv, learner: str) -> tuple[torch.Tensor, torch.Tensor]
 
 def play_branch(env: ExplorationEnv, strategy: str, td, likes: torch.Tensor, named: torch.Tensor) -> None:
     """What a branch plays: a decision as named, int64 [E, N], then multi_criteria with the strategy."""
-    trackers = {name: one.clone() for name, one in env.target_view.tracker.state.items()}
+    trackers = {name: tensor.clone() for name, tensor in env.target_view.tracker.state.items()}
     wanted = torch.where(torch.arange(9) == named.unsqueeze(-1), -NEVER, likes)
     begin(env, td.clone(), wanted, named)
     env.strategy.name = "return_to_base"  # whatever it was
@@ -92,7 +92,7 @@ def test_a_branch_is_worth_what_comes_of_it(learner, strategy):
     player = BranchPlayer(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
     index, advantage = player.try_candidates(td[TARGETS], likes)
     after = env.state_dict()
-    assert all(torch.equal(one, after[name]) for name, one in saved.items()), "the episode was touched"
+    assert all(torch.equal(tensor, after[name]) for name, tensor in saved.items()), "the episode was touched"
     own, worth, compared, telling = index[..., 0].clamp_min(0), {}, 0, 0
     for robot in range(2):
         for k in range(4):

@@ -84,8 +84,8 @@ def test_the_film_is_of_the_episode_that_stands_for_the_mean(monkeypatch):
     monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", film)
     monkeypatch.setattr("maexp.agents.evaluation.films.draw_film", draw_film)
     run("run", 1, "episodes=5", "classical=[nearest_frontier]", "num_robots=2,3", "num_envs=6")
-    known = {one.policy: one for one in seen["results"] if one.num_robots == 2}
-    assert [one.policy for one in seen["episodes"]] == ["trained", "untrained", "nearest_frontier"]
+    known = {result.policy: result for result in seen["results"] if result.num_robots == 2}
+    assert [episode.policy for episode in seen["episodes"]] == ["trained", "untrained", "nearest_frontier"]
     place, told = seen["caption"]
     number = int(re.search(r", episode (\d+) of seed 0$", place)[1])
     apart = known["trained"].episodes["coverage_auc"] - known["nearest_frontier"].episodes["coverage_auc"]
@@ -158,7 +158,7 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
     assert main(["train", *words, "hydra.run.dir=whole", f"total_frames={2 * batch}"]) == 0
     assert main(["train", *words, "hydra.run.dir=halves", f"total_frames={batch}"]) == 0
     assert main(["train", "resume=halves", f"total_frames={2 * batch}"]) == 0
-    whole, halves = (read_metrics(Path(one) / "metrics.csv") for one in ("whole", "halves"))
+    whole, halves = (read_metrics(Path(folder) / "metrics.csv") for folder in ("whole", "halves"))
     assert [row["frames"] for row in whole] == [row["frames"] for row in halves] == [batch, 2 * batch]
     assert [row["loss_critic"] for row in whole] == [row["loss_critic"] for row in halves]
     assert all(row["episodes"] >= 4 for row in whole)
@@ -192,10 +192,10 @@ def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
     short, mine = other_scenarios(cfg, cfg)
     env = make_env(short, load_maps(short.scenario).train, 2, 1)
     assert (env.local_steps, env.macro_steps) == (5, 15)
-    assert [one.name for one in env.maps] == ["maze_small_1"]
-    assert [one.name for one in load_maps(mine.scenario).train] == ["maze_small_3"]
+    assert [world.name for world in env.maps] == ["maze_small_1"]
+    assert [world.name for world in load_maps(mine.scenario).train] == ["maze_small_3"]
     assert cfg.scenario.local_steps is None or cfg.scenario.local_steps == 20
-    assert [title_scenario(one) for one in cfg.scenario.also] == [
+    assert [title_scenario(entry) for entry in cfg.scenario.also] == [
         "maze_small local_steps=5 maps=[1]",
         "pointcloud path=1 file",
     ]
@@ -219,7 +219,7 @@ def test_the_gain_is_the_paired_difference_to_the_best_planner(monkeypatch):
         assert main(["evaluate", place, "policy=nearest_frontier,cost_utility", *where]) == 0
         told = json.loads(Path(name, "results.json").read_text())
         planners = ("nearest_frontier", "cost_utility")
-        best = max(planners, key=lambda one: told[one]["coverage_auc"]["mean"])
+        best = max(planners, key=lambda planner: told[planner]["coverage_auc"]["mean"])
         assert row["validation_coverage_auc"] == pytest.approx(told["trained"]["coverage_auc"]["mean"], abs=1e-6)
         found = told["difference"]["trained"][best]
         for column, metric, factor in (("gain", "coverage_auc", 100), ("steps_95", "coverage_step_95_censored", 1)):

@@ -66,7 +66,7 @@ def test_episode_file_holds_no_pickle_and_appears_whole(played, tmp_path, monkey
     monkeypatch.setattr(np, "savez_compressed", lambda file, **arrays: file.write(b"half") and 1 / 0)
     with pytest.raises(ZeroDivisionError):
         played[0].save(path)
-    assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["a.npz"]
+    assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["a.npz"]
     with np.load(path, allow_pickle=False) as arrays:
         assert all(arrays[name].dtype.kind != "O" for name in arrays.files)
 
@@ -187,7 +187,7 @@ def test_no_team_is_filmed_that_is_not_in_the_results(tmp_path, capsys):
     words = ["policy=random", "episodes=2", "render=true", "render_envs=3", f"hydra.run.dir={tmp_path / 'e'}"]
     assert main(["evaluate", *TINY, *words]) == 0
     assert "render_envs=3 is more than is played (episodes=2): 2 will be filmed" in capsys.readouterr().err
-    assert {one.name for one in (tmp_path / "e" / "episodes").iterdir()} == {"random_0.npz", "random_1.npz"}
+    assert {path.name for path in (tmp_path / "e" / "episodes").iterdir()} == {"random_0.npz", "random_1.npz"}
 
 
 @pytest.mark.parametrize(

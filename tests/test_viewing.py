@@ -139,7 +139,7 @@ def test_colours_of_three_hundred_robots_differ():
     colours = [robot_colour(i) for i in range(300)]
     assert len(set(colours)) == 300 and tuple(colours[:8]) == ROBOT_COLOURS
     background = np.array([UNEXPLORED, EXPLORED, OVERLAP], dtype=int)
-    assert all(np.abs(background - one).sum(axis=1).min() > 90 for one in colours)
+    assert all(np.abs(background - colour).sum(axis=1).min() > 90 for colour in colours)
 
 
 @pytest.mark.parametrize(
@@ -207,8 +207,8 @@ def test_the_picture_shows_the_episode_that_is_asked_for(tmp_path, capsys, monke
     env = ExplorationEnv([make_map("maze_small", 0)], num_envs=3, num_robots=2, macro_steps=2, local_steps=5)
     Path("e/episodes").mkdir(parents=True)
     for name in ("voronoi", "random"):
-        for number, one in enumerate(play_teams(env, POLICIES[name](env), name), 9):
-            one.save(f"e/episodes/{name}_{number}.npz")
+        for number, episode in enumerate(play_teams(env, POLICIES[name](env), name), 9):
+            episode.save(f"e/episodes/{name}_{number}.npz")
 
     def picture(*words) -> np.ndarray:
         view(capsys, *words, "out=a.png", "size=300")
@@ -248,7 +248,7 @@ def test_view_plays_a_policy_on_the_map_that_is_given(tmp_path, capsys, monkeypa
     words = ["policy=random", "num_robots=2", "num_envs=2", "scenario.macro_steps=1", "hydra.run.dir=v", "size=300"]
     printed = view(capsys, "map.npz", *words)
     assert printed.count("maze_small_3, random, 2 robots") == 2 and "maexp view v browser=true" in printed
-    assert [Episode.load(one).map.name for one in sorted(Path("v/episodes").iterdir())] == ["maze_small_3"] * 2
+    assert [Episode.load(path).map.name for path in sorted(Path("v/episodes").iterdir())] == ["maze_small_3"] * 2
     assert "maze_small_3" in view(capsys, "v", "out=again.png", "size=300"), "its folder can be viewed again"
     assert "maze_small_5, random" in view(capsys, "maze_small", "index=5", *words[:-2], "hydra.run.dir=w", "size=300")
 

@@ -65,7 +65,7 @@ def assert_same(first, second, place="checkpoint") -> None:
 
 def assert_same_runs(first: Path, second: Path) -> None:
     assert_same(find_checkpoint(first)[1], find_checkpoint(second)[1])
-    rows = [read_metrics(one / "metrics.csv") for one in (first, second)]
+    rows = [read_metrics(folder / "metrics.csv") for folder in (first, second)]
     assert len(rows[0]) == len(rows[1])
     for pair in zip(*rows, strict=True):
         assert_same(*({name: value for name, value in row.items() if name not in CLOCKS} for row in pair), "metrics")

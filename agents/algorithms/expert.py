@@ -38,7 +38,7 @@ class ExpertUpdater(Updater):
     def __init__(self, loss, settings):
         super().__init__(loss, settings)
         self.memory: dict[int, TensorDict] = {}
-        chooser = next(one for one in loss.actor_network.modules() if isinstance(one, TargetChooser))
+        chooser = next(module for module in loss.actor_network.modules() if isinstance(module, TargetChooser))
         self.scale = chooser.score_weight
 
     def make_policy_optimizer(self) -> torch.optim.Optimizer:
@@ -55,10 +55,10 @@ class ExpertUpdater(Updater):
         self.set_progress(progress)
         found = [self._remember(batch) for batch in batches]
         between, meter = time.perf_counter(), Meter()
-        new = sum(len(one) for one in found)
+        new = sum(len(batch) for batch in found)
         for _ in range(math.ceil(self.settings.epochs * new / self.settings.minibatch_size)):
             meter.add(self._descend())
-        known = sum(len(one) for one in self.memory.values())
+        known = sum(len(memory) for memory in self.memory.values())
         log = {"branched": known, "headroom": _headroom(found)} | meter.means()
         return log | {"advantage": between - begin, "update": time.perf_counter() - between}
 
@@ -84,7 +84,7 @@ class ExpertUpdater(Updater):
 
     def _descend(self) -> dict[str, float]:
         """A step on decisions drawn evenly from all that are known."""
-        total, parts = sum(len(one) for one in self.memory.values()), []
+        total, parts = sum(len(memory) for memory in self.memory.values()), []
         for known in self.memory.values():
             count = max(1, round(self.settings.minibatch_size * len(known) / total))
             parts.append(known[torch.randint(len(known), (count,), device=known.device)])
@@ -120,7 +120,7 @@ class ExpertUpdater(Updater):
     def load_memory(self, memory: dict[str, dict[str, Tensor]]) -> None:
         """Learn from these decisions, as `state_dict` tells them."""
         device = self.policy_params[0].device
-        self.memory = {int(n): TensorDict(one, len(one["mask"])).to(device) for n, one in memory.items()}
+        self.memory = {int(n): TensorDict(arrays, len(arrays["mask"])).to(device) for n, arrays in memory.items()}
 
 
 def tried_others(part: TensorDict) -> Tensor:
@@ -132,6 +132,6 @@ def tried_others(part: TensorDict) -> Tensor:
 
 def _headroom(found: list[TensorDict]) -> float:
     """Mean over robots' decisions of what the best candidate tried was worth over the own choice; NaN without any."""
-    best = [torch.where(tried_others(one), one["advantage"], -torch.inf).amax(-1).flatten() for one in found]
+    best = [torch.where(tried_others(batch), batch["advantage"], -torch.inf).amax(-1).flatten() for batch in found]
     best = torch.cat(best)
     return best[best.isfinite()].clamp_min(0.0).mean().item()

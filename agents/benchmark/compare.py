@@ -44,12 +44,14 @@ def improvement(x: Sample, y: Sample, copies: tuple[Sample, Sample] | None = Non
     rng = np.random.default_rng(seed)
     shares, once, distinct = [], [], np.zeros(2, dtype=int)
     for scenario in (name for name in x if name in y):
-        one, other = (np.asarray(values, dtype=np.float64) for values in (x[scenario], y[scenario]))
-        once.append(win_shares(one, other, np.ones((1, len(one))), np.ones((1, len(other))))[0])
-        labels = [np.arange(len(v)) for v in (one, other)] if copies is None else [group[scenario] for group in copies]
+        first, second = (np.asarray(values, dtype=np.float64) for values in (x[scenario], y[scenario]))
+        once.append(win_shares(first, second, np.ones((1, len(first))), np.ones((1, len(second))))[0])
+        labels = (
+            [np.arange(len(v)) for v in (first, second)] if copies is None else [group[scenario] for group in copies]
+        )
         counts = [_draw(rng, group) for group in labels]
         distinct += [len(np.unique(group)) for group in labels]
-        shares.append(win_shares(one, other, *counts))
+        shares.append(win_shares(first, second, *counts))
     if not once:
         return {"mean": np.nan, "ci95": [np.nan, np.nan], "n": 0}
     ends = np.percentile(np.mean(shares, axis=0), [2.5, 97.5])
@@ -73,12 +75,12 @@ def compare_all(values: dict[str, Sample], copies: dict[str, Sample] | None = No
     """
     names = list(values)
     pairs = {}
-    for i, one in enumerate(names):
+    for i, name in enumerate(names):
         for other in names[i + 1 :]:
-            found = improvement(values[one], values[other], copies and (copies[one], copies[other]))
+            found = improvement(values[name], values[other], copies and (copies[name], copies[other]))
             low, high = found["ci95"]
-            pairs[one, other] = found
-            pairs[other, one] = found | {"mean": 1 - found["mean"], "ci95": [1 - high, 1 - low]}
+            pairs[name, other] = found
+            pairs[other, name] = found | {"mean": 1 - found["mean"], "ci95": [1 - high, 1 - low]}
     return pairs
 
 
@@ -87,7 +89,7 @@ def pairs_csv(pairs: dict[tuple[str, str], dict]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["policy", "better_than", "probability", "ci95_low", "ci95_high", "scenarios"])
-    for (one, other), found in pairs.items():
+    for (policy, other), found in pairs.items():
         numbers = ["" if value != value else f"{value:.4f}" for value in (found["mean"], *found["ci95"])]
-        writer.writerow([one, other, *numbers, found["n"]])
+        writer.writerow([policy, other, *numbers, found["n"]])
     return text.getvalue()

@@ -8,16 +8,16 @@ from maexp.agents.tables import markdown_table
 Played = list[tuple[Cell, EvaluationResult]]
 
 
-def subtract(one: Played, other: Played) -> dict[str, dict]:
+def subtract(played: Played, other: Played) -> dict[str, dict]:
     """{metric: {mean, std, ci95, n}} of a policy's episodes less the same episodes of another; {}: they share none."""
     theirs = {(cell.seed, cell.map): result for cell, result in other}
-    pairs = [(mine, theirs[cell.seed, cell.map]) for cell, mine in one if (cell.seed, cell.map) in theirs]
+    pairs = [(mine, theirs[cell.seed, cell.map]) for cell, mine in played if (cell.seed, cell.map) in theirs]
     return join([mine for mine, _ in pairs]).minus(join([same for _, same in pairs])) if pairs else {}
 
 
 def difference_cells(found: dict[str, dict], goal: float) -> dict[str, str]:
     """{words: +1.2 [0.3, 2.1]} of what is compared of episodes that end at the coverage `goal`."""
-    return {one.words: one.difference(found[one.metric]) for one in compared(goal)}
+    return {measure.words: measure.difference(found[measure.metric]) for measure in compared(goal)}
 
 
 def differences_markdown(rival: str, rows: dict[str, dict], goal: float = 0.95) -> str:

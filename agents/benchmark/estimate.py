@@ -69,9 +69,9 @@ def estimate_cells(cfg: BenchmarkSettings, cells: list[Cell], suites: int, worke
         UserError: settings or maps that cannot be used.
     """
     if not cfg.estimate:
-        return Estimate({one: _volume(cfg, one, suites) for one in cells}, workers, measured=False)
-    scenarios = {one.scenario: one for one in cells}
-    algorithms = {one.policy: one for one in cells if one.trains}
+        return Estimate({cell: _volume(cfg, cell, suites) for cell in cells}, workers, measured=False)
+    scenarios = {cell.scenario: cell for cell in cells}
+    algorithms = {cell.policy: cell for cell in cells if cell.trains}
     drive = {name: _measure_env(cfg, cell) for name, cell in scenarios.items()}
     learn = {name: _measure_learner(cfg, cell) for name, cell in algorithms.items()}
     seconds = {}

@@ -27,7 +27,7 @@ from maexp.agents.tables import (
 )
 from maexp.envs.metrics import in_reach
 
-ROWS = [one for one in MEASURES.values() if one.symbol]
+ROWS = [measure for measure in MEASURES.values() if measure.symbol]
 SHOWN = ("ER", "AUC", "CS85", "CS95", "to 95", "MO85")  # on the terminal, where there is room for six
 SHOWN_TO_THE_END = ("ER", "AUC", "CS95", "to 95", "CS99", "to 99")
 ORACLE = "oracle"
@@ -89,7 +89,7 @@ def pool_column(suite: str, cells: list[tuple[int, EvaluationResult]]) -> Column
     pooled = join([result for _, result in cells])
     seeds: dict[int, dict[str, float]] = {}
     for seed in dict.fromkeys(seed for seed, _ in cells):
-        same = join([result for one, result in cells if one == seed])
+        same = join([result for cell_seed, result in cells if cell_seed == seed])
         seeds[seed] = {name: _mean(values) for name, values in same.episodes.items()}
     evidence = pooled.evidence._replace(policy=pooled.policy + SHORT[suite])
     return Column(pooled.policy, suite, pooled.summary(), evidence, seeds)
@@ -102,25 +102,25 @@ def _mean(values: np.ndarray) -> float:
 
 def best(means: dict[str, float | None], row: Measure) -> set[str]:
     """Names with the best mean as printed: several where they tie, none where there is no value or only one name."""
-    printed = {name: float(row.write(one)) for name, one in means.items() if one is not None and one == one}
+    printed = {name: float(row.write(mean)) for name, mean in means.items() if mean is not None and mean == mean}
     if len(means) < 2 or not printed:
         return set()
-    top = max(row.better * one for one in printed.values())
-    return {name for name, one in printed.items() if row.better * one == top}
+    top = max(row.better * number for number in printed.values())
+    return {name for name, number in printed.items() if row.better * number == top}
 
 
 def best_columns(columns: list[Column], row: Measure) -> set[str]:
     """Names of the columns that are bold in a row; each set of maps is compared by itself."""
     found: set[str] = set()
-    for suite in dict.fromkeys(one.suite for one in columns):
-        rivals = [one for one in columns if one.suite == suite and one.policy != ORACLE]
-        found |= best({one.name: one.summary[row.metric]["mean"] for one in rivals}, row)
+    for suite in dict.fromkeys(column.suite for column in columns):
+        rivals = [column for column in columns if column.suite == suite and column.policy != ORACLE]
+        found |= best({rival.name: rival.summary[row.metric]["mean"] for rival in rivals}, row)
     return found
 
 
 def evidence_of(columns: list[Column]) -> list[str]:
     """Sentences on what the figures rest on, where that is little."""
-    return describe_evidence([one.evidence for one in columns])
+    return describe_evidence([column.evidence for column in columns])
 
 
 # Parts of a cell
@@ -128,15 +128,15 @@ def evidence_of(columns: list[Column]) -> list[str]:
 
 def value_text(column: Column, row: Measure) -> str:
     """68.8 ± 5.7, or - where no episode got there."""
-    one = column.summary[row.metric]
-    return f"{row.write(one['mean'])} ± {row.write(one['std'])}" if one["n"] else NONE
+    summary = column.summary[row.metric]
+    return f"{row.write(summary['mean'])} ± {row.write(summary['std'])}" if summary["n"] else NONE
 
 
 def interval_text(column: Column, row: Measure) -> str:
     """[67.2, 70.1], and of how many episodes where it can be fewer than all; "" where there is neither."""
-    one = column.summary[row.metric]
-    counted = row.symbol.startswith(("CS", "MO")) or not one["n"]
-    return f"{brackets(one, row.write)} {reached(one, column.total) * counted}".strip()
+    summary = column.summary[row.metric]
+    counted = row.symbol.startswith(("CS", "MO")) or not summary["n"]
+    return f"{brackets(summary, row.write)} {reached(summary, column.total) * counted}".strip()
 
 
 def paper_text(scenario: str, column: Column, row: Measure, digits: int | None = None) -> str | None:
@@ -163,7 +163,7 @@ def print_tables(tables: dict[str, list[Column]], console: Console | None = None
             console.print(Text(sentence))
     if len(tables) > 1:
         console.print(draw_overview(tables))
-    console.print(Group(*(Text(one, style="dim") for one in NOTES)))
+    console.print(Group(*(Text(note, style="dim") for note in NOTES)))
 
 
 def draw_table(scenario: str, columns: list[Column], rows: list[Measure]) -> Table:
@@ -178,7 +178,7 @@ def draw_table(scenario: str, columns: list[Column], rows: list[Measure]) -> Tab
         lines.append([column.name.replace(" (", "\n("), *cells])
         published = [paper_text(scenario, column, row, row.digits) for row in rows]
         if any(published):
-            lines.append([Text(one or NONE, style="dim") for one in ("  paper", *published)])
+            lines.append([Text(text or NONE, style="dim") for text in ("  paper", *published)])
     title = f"{scenario}: {columns[0].total} episodes a policy"
     return terminal_table(title, ["policy", *(row.heading.replace(" steps", "") for row in rows)], lines)
 
@@ -187,11 +187,11 @@ def draw_overview(tables: dict[str, list[Column]]) -> Table:
     """Exploration ratio of every policy in every scenario."""
     row = ROWS[0]
     lines = []
-    for name in dict.fromkeys(one.name for columns in tables.values() for one in columns):
+    for name in dict.fromkeys(column.name for columns in tables.values() for column in columns):
         cells = []
         for columns in tables.values():
             bold = best_columns(columns, row)
-            found = next((one for one in columns if one.name == name), None)
+            found = next((column for column in columns if column.name == name), None)
             cells.append(TableCell(value_text(found, row) if found else "", name in bold).terminal())
         lines.append([name.replace(" (", "\n("), *cells])
     heads = ["policy", *(scenario.replace("_", "\n", 1) for scenario in tables)]
@@ -200,10 +200,10 @@ def draw_overview(tables: dict[str, list[Column]]) -> Table:
 
 def _narrow(column: Column, row: Measure) -> str:
     """How many got there for CS, else the interval: there is no room for both."""
-    one = column.summary[row.metric]
-    if row.symbol.startswith("CS") or not one["n"]:
-        return reached(one, column.total)
-    return brackets(one, row.write).strip()
+    summary = column.summary[row.metric]
+    if row.symbol.startswith("CS") or not summary["n"]:
+        return reached(summary, column.total)
+    return brackets(summary, row.write).strip()
 
 
 # Files
@@ -235,12 +235,12 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
     for scenario, columns in tables.items():
         bold = {row.metric: best_columns(columns, row) for row in ROWS}
         for column in columns:
-            for metric, one in column.summary.items():
+            for metric, summary in column.summary.items():
                 row = rows.get(metric)
                 published = paper_value(scenario, column.policy, metric) or ("", "")
                 scale = row.factor if row else 1.0
                 published = [value / scale if value != "" else "" for value in published]
-                numbers = [one["mean"], one["std"], *one["ci95"]]
+                numbers = [summary["mean"], summary["std"], *summary["ci95"]]
                 seeds = " ".join(f"{seed}:{means[metric]:.6g}" for seed, means in column.seeds.items())
                 is_best = int(column.name in bold[metric]) if row else ""
                 writer.writerow(
@@ -250,7 +250,7 @@ def table_csv(tables: dict[str, list[Column]]) -> str:
                         column.suite,
                         metric,
                         *map(_csv_number, numbers),
-                        one["n"],
+                        summary["n"],
                         column.total,
                         is_best,
                         *map(_csv_number, published),
@@ -281,8 +281,8 @@ def table_markdown(
         rows = []
         for row in rows_for(goal):
             bold = best_columns(columns, row)
-            rows.append([row.heading, *(_markdown_cell(scenario, one, row, bold) for one in columns)])
-        lines += markdown_table(["", *(one.name for one in columns)], rows)
+            rows.append([row.heading, *(_markdown_cell(scenario, column, row, bold) for column in columns)])
+        lines += markdown_table(["", *(column.name for column in columns)], rows)
         if scenario in (below or {}):
             lines += ["", below[scenario]]
         parts.append("\n".join(lines))
@@ -297,24 +297,24 @@ def _markdown_cell(scenario: str, column: Column, row: Measure, bold: set[str]) 
 
 def table_latex(tables: dict[str, list[Column]], heading: str = "", goal: float = 0.95) -> str:
     """One tabular for \\input: scenarios and metrics as rows, policies as columns; needs booktabs and multirow."""
-    names = list(dict.fromkeys(one.name for columns in tables.values() for one in columns))
+    names = list(dict.fromkeys(column.name for columns in tables.values() for column in columns))
     rows = rows_for(goal)
     lines = [f"% {heading}", r"% \usepackage{booktabs,multirow}"]
     lines += [rf"\begin{{tabular}}{{ll{'c' * len(names)}}}", r"\toprule"]
     lines.append(latex_row(["", "", *map(latex_text, names)]))
     for scenario, columns in tables.items():
         lines.append(r"\midrule")
-        have = [next((one for one in columns if one.name == name), None) for name in names]
-        published = any(paper_text(scenario, one, ROWS[0]) for one in columns)
+        have = [next((column for column in columns if column.name == name), None) for name in names]
+        published = any(paper_text(scenario, column, ROWS[0]) for column in columns)
         height = len(rows) * (3 if published else 2)
         for k, row in enumerate(rows):
             head = rf"\multirow{{{height}}}{{*}}{{{latex_text(scenario)}}}" if k == 0 else ""
             bold = best_columns(columns, row)
-            cells = [one and TableCell(value_text(one, row), one.name in bold).latex() for one in have]
-            intervals = [one and latex_small(interval_text(one, row)) for one in have]
+            cells = [column and TableCell(value_text(column, row), column.name in bold).latex() for column in have]
+            intervals = [column and latex_small(interval_text(column, row)) for column in have]
             lines += [latex_row([head, latex_text(row.heading), *cells]), latex_row(["", "", *intervals])]
             if published:
-                texts = [one and paper_text(scenario, one, row) for one in have]
-                papers = [one and latex_small(TableCell(one).latex()) for one in texts]
+                texts = [column and paper_text(scenario, column, row) for column in have]
+                papers = [text and latex_small(TableCell(text).latex()) for text in texts]
                 lines.append(latex_row(["", latex_small("paper"), *papers]))
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *("% " + one for one in NOTES)]) + "\n"
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", *("% " + note for note in NOTES)]) + "\n"

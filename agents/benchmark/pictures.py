@@ -32,8 +32,8 @@ def draw_coverage_panels(curves: dict[str, dict], title: str, path) -> Path:
         figure = Figure(figsize=(4.2 * len(curves), 4.4), layout="constrained")
         axes = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
         for ax, (name, lines) in zip(axes, curves.items(), strict=True):
-            others = [one for one in lines if one != REFERENCE]
-            draw_coverage_lines(ax, lines, {one: k for k, one in enumerate(others)} | {REFERENCE: BLACK})
+            others = [name for name in lines if name != REFERENCE]
+            draw_coverage_lines(ax, lines, {name: k for k, name in enumerate(others)} | {REFERENCE: BLACK})
             finish(ax, name, "coverage [%], mean and its 95 % interval" if ax is axes[0] else "", legend=False)
             ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
@@ -119,7 +119,7 @@ def draw_improvement(pairs: dict[tuple[str, str], dict], listed: list[str], path
     """
     if not pairs:
         raise ValueError("pairs is empty; give at least two policies")
-    names = list(dict.fromkeys(one for one, _ in pairs))
+    names = list(dict.fromkeys(policy for policy, _ in pairs))
     chosen = [(a, b) for i, a in enumerate(listed) for b in listed[i + 1 :]][:PAIRS]
     side = 1.9 + 0.42 * len(names)
     with rc_context(LOOK):
@@ -136,15 +136,15 @@ def _draw_matrix(figure: Figure, ax, pairs: dict, names: list[str]) -> None:
     """P(row > column) in per cent, bold where the interval leaves out one half."""
     size = len(names)
     values = np.full((size, size), np.nan)
-    for (one, other), found in pairs.items():
-        values[names.index(one), names.index(other)] = found["mean"]
+    for (policy, other), found in pairs.items():
+        values[names.index(policy), names.index(other)] = found["mean"]
     image = ax.imshow(100 * values, vmin=0, vmax=100, cmap="PuOr_r")
-    for (one, other), found in pairs.items():
+    for (policy, other), found in pairs.items():
         mean, (low, high) = found["mean"], found["ci95"]
         if mean == mean:
             ax.text(
                 names.index(other),
-                names.index(one),
+                names.index(policy),
                 f"{100 * mean:.0f}",
                 ha="center",
                 va="center",
@@ -160,10 +160,10 @@ def _draw_matrix(figure: Figure, ax, pairs: dict, names: list[str]) -> None:
 
 
 def _draw_pairs(ax, pairs: dict, chosen: list[tuple[str, str]]) -> None:
-    for row, (one, other) in enumerate(chosen):
-        _draw_point(ax, row, pairs[one, other], COLOURS[0], "o")
+    for row, (policy, other) in enumerate(chosen):
+        _draw_point(ax, row, pairs[policy, other], COLOURS[0], "o")
     ax.axvline(50, color="#606060", linewidth=1, linestyle=(0, (4, 2)))
-    ax.set_yticks(range(len(chosen)), [f"{one} > {other}" for one, other in chosen])
+    ax.set_yticks(range(len(chosen)), [f"{policy} > {other}" for policy, other in chosen])
     ax.set_ylim(len(chosen) - 0.5, -0.5)
     ax.set_xlim(0, 100)
     ax.set_xlabel("probability [%], 95 % interval")

@@ -119,7 +119,7 @@ def training_cell(cfg: BenchmarkSettings, cell: Cell) -> Cell:
 def list_cells(cfg: BenchmarkSettings) -> list[Cell]:
     """All cells in the order they are run: seed by seed, scenario by scenario, classical policies first."""
     names = policy_names(cfg)
-    ordered = [one for one in names if one not in TRAININGS] + [one for one in names if one in TRAININGS]
+    ordered = [name for name in names if name not in TRAININGS] + [name for name in names if name in TRAININGS]
     return [
         Cell(scenario, policy, seed, index)
         for seed in as_list(cfg.seeds)
@@ -162,7 +162,7 @@ def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> NamedPolicy:
 def policy_sources(cfg: BenchmarkSettings) -> dict[str, str]:
     """By its name, what changes with a policy that does not come with the package."""
     players = [find_player(word, "policies", name) for word, name in word_names(cfg).items()]
-    return {one.name: one.source for one in players if one.source}
+    return {player.name: player.source for player in players if player.source}
 
 
 def check_lists(cfg: DictConfig) -> None:
@@ -203,7 +203,7 @@ def _check_policy_per_map(cfg: BenchmarkSettings) -> None:
     if cfg.policy_per_map is None:
         return
     counts = plain(cfg.policy_per_map) if OmegaConf.is_dict(cfg.policy_per_map) else cfg.policy_per_map
-    good = isinstance(counts, dict) and all(type(one) is int and one >= 1 for one in counts.values())
+    good = isinstance(counts, dict) and all(type(count) is int and count >= 1 for count in counts.values())
     if not good:
         raise UserError(f"policy_per_map={counts} must say how many maps of each scenario, as {{maze: 4}}.")
     for scenario in as_list(cfg.scenarios):
@@ -288,9 +288,9 @@ def render(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, dict):
-        return "{" + ",".join(f"{name}:{render(one)}" for name, one in value.items()) + "}"
+        return "{" + ",".join(f"{name}:{render(item)}" for name, item in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ",".join(render(one) for one in value) + "]"
+        return "[" + ",".join(render(item) for item in value) + "]"
     return str(value) if str(value).startswith("${scenario.") else quote(str(value))
 
 
@@ -340,7 +340,7 @@ def shared_settings(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _is_free(name: str) -> bool:
-    return any(name == one or name.startswith(f"{one}.") for one in FREE)
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in FREE)
 
 
 def check_unchanged(where: Path, cfg: DictConfig) -> None:
@@ -357,7 +357,10 @@ def check_unchanged(where: Path, cfg: DictConfig) -> None:
     before, now = plan["settings"], json.loads(json.dumps(shared_settings(cfg)))
     names = [name for name in now if name in before and before[name] != now[name]]  # others came or went with the code
     if names:
-        told = [["left open" if one[name] is None else one[name] for one in (before, now)] for name in names[:4]]
+        told = [
+            ["left open" if plan_settings[name] is None else plan_settings[name] for plan_settings in (before, now)]
+            for name in names[:4]
+        ]
         listed = ", ".join(f"{name} (was {was}, now {to})" for name, (was, to) in zip(names, told, strict=False))
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         raise UserError(

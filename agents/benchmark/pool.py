@@ -78,12 +78,12 @@ class WorkerPool:
 
     def running(self) -> list[Cell]:
         """The cells being run."""
-        return [one.cell for one in self.workers if one.cell is not None]
+        return [worker.cell for worker in self.workers if worker.cell is not None]
 
     def _employ(self) -> None:
         """Give every idle worker a cell; start workers while there are too few."""
         while self.waiting:
-            idle = next((one for one in self.workers if one.cell is None), None)
+            idle = next((worker for worker in self.workers if worker.cell is None), None)
             if idle is None and len(self.workers) < self.count:
                 idle = self._start()
             if idle is None:
@@ -100,7 +100,7 @@ class WorkerPool:
         env = dict(os.environ, OMP_NUM_THREADS="1", MKL_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
         gpu = None
         if self.gpus:
-            taken = [one.gpu for one in self.workers]
+            taken = [other.gpu for other in self.workers]
             gpu = min(range(self.gpus), key=taken.count)
             shown = os.environ.get("CUDA_VISIBLE_DEVICES")
             env["CUDA_VISIBLE_DEVICES"] = shown.split(",")[gpu] if shown else str(gpu)

@@ -50,21 +50,21 @@ class Report:
         Raises:
             UserError: one is damaged.
         """
-        for scenario, policy in dict.fromkeys((one.scenario, one.policy) for one in self.cells):
+        for scenario, policy in dict.fromkeys((cell.scenario, cell.policy) for cell in self.cells):
             for suite in self.suites:
                 self.results(scenario, policy, suite)
 
     def update(self, done: list[Cell]) -> None:
         """Write the tables when a scenario has been through all its policies with a seed."""
-        blocks = {(one.seed, one.scenario) for one in done}
-        blocks = {one for one in blocks - self._written if self._is_whole(one)}
+        blocks = {(cell.seed, cell.scenario) for cell in done}
+        blocks = {block for block in blocks - self._written if self._is_whole(block)}
         if blocks:
             self._written |= blocks
             self.write_tables()
 
     def _is_whole(self, block: tuple[int, str]) -> bool:
-        cells = [one for one in self.cells if (one.seed, one.scenario) == block]
-        return all(finished(self.where, one, suite) for one in cells for suite in self.suites)
+        cells = [cell for cell in self.cells if (cell.seed, cell.scenario) == block]
+        return all(finished(self.where, cell, suite) for cell in cells for suite in self.suites)
 
     def finish(self) -> None:
         """Everything, and the table on the terminal."""
@@ -96,10 +96,10 @@ class Report:
     def tables(self) -> dict[str, list[Column]]:
         """Per scenario the columns of all policies that have finished cells."""
         tables: dict[str, list[Column]] = {}
-        policies = list(dict.fromkeys(one.policy for one in self.cells))
-        for scenario in dict.fromkeys(one.scenario for one in self.cells):
+        policies = list(dict.fromkeys(cell.policy for cell in self.cells))
+        for scenario in dict.fromkeys(cell.scenario for cell in self.cells):
             columns = [self._column(scenario, policy, suite) for suite in self.suites for policy in policies]
-            columns = [one for one in columns if one is not None]
+            columns = [column for column in columns if column is not None]
             if columns:
                 tables[scenario] = columns
         return tables
@@ -130,7 +130,7 @@ class Report:
             write_text(self.where / "table.tex", table_latex(tables, self.heading(), goal))
             content = {}
             for scenario, columns in tables.items():
-                named = {one.name: one.summary for one in columns}
+                named = {column.name: column.summary for column in columns}
                 named |= {"difference": apart[scenario]} if apart[scenario] else {}
                 content[scenario] = named
                 run = self.describe([scenario]) | {"best_classical": rivals[scenario]}
@@ -141,7 +141,7 @@ class Report:
 
     def _rival(self, scenario: str) -> str | None:
         """The best classical planner on the validation maps."""
-        planners = [name for name in dict.fromkeys(one.policy for one in self.cells) if name in CLASSICAL]
+        planners = [name for name in dict.fromkeys(cell.policy for cell in self.cells) if name in CLASSICAL]
         played = {name: self.results(scenario, name, VALIDATION) for name in planners}
         return find_best({name: [result for _, result in cells] for name, cells in played.items()})
 
@@ -149,18 +149,18 @@ class Report:
         """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b on the same maps, for every a that is learned or one's own
         and all others."""
         found: dict[str, dict] = {}
-        for one in (one for one in columns if is_learned(one.policy)):
-            for other in (other for other in columns if other is not one and other.suite == one.suite):
-                mine, theirs = (self.results(scenario, column.policy, one.suite) for column in (one, other))
+        for learned in (column for column in columns if is_learned(column.policy)):
+            for other in (other for other in columns if other is not learned and other.suite == learned.suite):
+                mine, theirs = (self.results(scenario, column.policy, learned.suite) for column in (learned, other))
                 if apart := subtract(mine, theirs):
-                    found.setdefault(one.name, {})[other.name] = apart
+                    found.setdefault(learned.name, {})[other.name] = apart
         return found
 
     def heading(self) -> str:
         """A sentence on what the tables show."""
         cfg = self.cfg
         length = f"{cfg.total_frames:,} macro steps" if cfg.iterations is None else f"{cfg.iterations:,} iterations"
-        seeds = ", ".join(str(one) for one in as_list(cfg.seeds))
+        seeds = ", ".join(str(seed) for seed in as_list(cfg.seeds))
         text = f"maexp benchmark, preset {cfg.preset}: {cfg.num_robots} robots, planner {cfg.planner.name}, "
         if cfg.planner.name == "dwa":
             text += f"clearance factor {cfg.planner.clearance_factor or 'of the scenario'}, "
@@ -171,8 +171,8 @@ class Report:
 
     def describe(self, scenarios: list[str]) -> dict:
         """What was run, of the cells that are done."""
-        known = {cell: one.run for (cell, _), one in self._results.items() if cell.scenario in scenarios}
-        chosen = [(suite, one.run) for (cell, suite), one in self._results.items() if cell.scenario in scenarios]
+        known = {cell: result.run for (cell, _), result in self._results.items() if cell.scenario in scenarios}
+        chosen = [(suite, result.run) for (cell, suite), result in self._results.items() if cell.scenario in scenarios]
         runs = [run for _, run in chosen]
         return {
             "preset": self.cfg.preset,
@@ -184,17 +184,17 @@ class Report:
             "success_coverage": self.cfg.scenario.success_coverage,
             "num_robots": self.cfg.num_robots,
             "planner": self.cfg.planner.name,
-            "cells": {"done": len(known), "all": sum(one.scenario in scenarios for one in self.cells)},
+            "cells": {"done": len(known), "all": sum(cell.scenario in scenarios for cell in self.cells)},
             "commit": find_commit(),
-            "commits_of_cells": sorted({str(one["commit"]) for one in runs}),
+            "commits_of_cells": sorted({str(run["commit"]) for run in runs}),
             "versions": {name: metadata.version(name) for name in PACKAGES},
-            "seconds": round(sum(one["seconds"] for one in runs), 2),
+            "seconds": round(sum(run["seconds"] for run in runs), 2),
             "training_seconds": round(sum(self._trainings(known).values()), 2),
         }
 
     def _trainings(self, runs: dict[Cell, dict]) -> dict[Cell, float]:
         """Seconds of every training, each once."""
-        return {training_cell(self.cfg, cell): one.get("training_seconds", 0.0) for cell, one in runs.items()}
+        return {training_cell(self.cfg, cell): run.get("training_seconds", 0.0) for cell, run in runs.items()}
 
     # Pictures
 
@@ -202,7 +202,7 @@ class Report:
         """All pictures and the table behind the comparison; returns their names."""
         written = []
         for suite in self.suites:
-            played = {name: [one for one in columns if one.suite == suite] for name, columns in tables.items()}
+            played = {name: [column for column in columns if column.suite == suite] for name, columns in tables.items()}
             played = {name: columns for name, columns in played.items() if columns}
             if played:
                 written += self._draw_suite(suite, played)
@@ -235,18 +235,18 @@ class Report:
         values: Samples = {}
         copies: Samples = {}
         for scenario, columns in played.items():
-            for one in columns:
-                pooled = join([result for _, result in self.results(scenario, one.policy, suite)])
-                values.setdefault(one.policy, {})[scenario] = pooled.episodes["exploration_ratio"]
-                copies.setdefault(one.policy, {})[scenario] = pooled.copies()
+            for column in columns:
+                pooled = join([result for _, result in self.results(scenario, column.policy, suite)])
+                values.setdefault(column.policy, {})[scenario] = pooled.episodes["exploration_ratio"]
+                copies.setdefault(column.policy, {})[scenario] = pooled.copies()
         return values, copies
 
     def _curves(self, scenario: str, columns: list[Column]) -> dict[str, dict]:
         """Panel -> policy -> times [s], coverage [episodes, times], maps [episodes]; `random` is in both panels."""
         curves = {}
-        for one in columns:
-            found = pool([result for _, result in self.results(scenario, one.policy, one.suite)])
-            curves[one.policy] = (found.times, found.coverage, found.maps)
+        for column in columns:
+            found = pool([result for _, result in self.results(scenario, column.policy, column.suite)])
+            curves[column.policy] = (found.times, found.coverage, found.maps)
         trained = {name: curve for name, curve in curves.items() if is_learned(name)}
         classical = {name: curve for name, curve in curves.items() if not is_learned(name)}
         if trained and "random" in classical:
@@ -266,8 +266,11 @@ def against(apart: dict[str, dict], rival: str | None) -> dict[str, dict]:
 def _points(scenario: str, columns: list[Column]) -> list[tuple]:
     """What `draw_overview` shows of a scenario."""
     points = []
-    for one in columns:
-        kind = "trained" if is_learned(one.policy) else "classical"
-        found, published = one.summary["exploration_ratio"], paper_value(scenario, one.policy, "exploration_ratio")
-        points.append((one.policy, kind, found, published and published[0] / 100))
+    for column in columns:
+        kind = "trained" if is_learned(column.policy) else "classical"
+        found, published = (
+            column.summary["exploration_ratio"],
+            paper_value(scenario, column.policy, "exploration_ratio"),
+        )
+        points.append((column.policy, kind, found, published and published[0] / 100))
     return points

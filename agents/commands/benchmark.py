@@ -80,7 +80,7 @@ def run_locked(cfg: BenchmarkSettings, where: Path, overrides: list[str]) -> int
     """The same, while no one else is at the folder."""
     suites = as_list(cfg.maps)
     cells = list_cells(cfg)
-    todo = [one for one in cells if not all(finished(where, one, suite) for suite in suites)]
+    todo = [cell for cell in cells if not all(finished(where, cell, suite) for suite in suites)]
     report = Report(cfg, where, cells, suites)
     check_unchanged(where, cfg)
     report.read_all()
@@ -174,7 +174,7 @@ class BenchmarkProgress(Progress):
         ended = [*pool.outcome.done, *pool.outcome.failed]
         shares = {cell: read_share(cell_folder(self.where, cell) / "log.txt") for cell in pool.running()}
         weight = self.expected.weight
-        self.spent_weight = sum(weight(one) for one in ended)
+        self.spent_weight = sum(weight(cell) for cell in ended)
         self.spent_weight += sum(weight(cell) * share for cell, (share, _) in shares.items())
         note = describe_running([(cell.scenario, cell.policy, text) for cell, (_, text) in shares.items()])
         self.show(self.first + len(ended), note)
@@ -182,7 +182,7 @@ class BenchmarkProgress(Progress):
     def describe(self, note: str = "") -> str:
         """Cells done, time left, the running ones."""
         spent = time.monotonic() - self.begin
-        whole = sum(self.expected.weight(one) for one in self.todo)
+        whole = sum(self.expected.weight(cell) for cell in self.todo)
         left = spent * (whole - self.spent_weight) / self.spent_weight if self.spent_weight > 0 else float("inf")
         return "  ".join(part for part in (f"{self.done}/{self.total} cells", f"{duration(left)} left", note) if part)
 

@@ -93,7 +93,7 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
         baseline = None if cfg.baseline is None else load_baseline(cfg.baseline)
         suite = load_maps(cfg.scenario, train=False)
         maps = suite.held_out
-        places = [[one] for one in maps] if cfg.scenario.path is not None else [maps]
+        places = [[world] for world in maps] if cfg.scenario.path is not None else [maps]
         count = min(cfg.num_envs, cfg.episodes)
         players = find_teams(cfg)
         suit_observation(cfg, players)
@@ -102,16 +102,16 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
             player.check_maps(maps)
             player.make(envs[0][0])
         steps = [env.local_steps * env.macro_steps for env in envs[0]]
-        names = [one.name for one in players]
+        names = [player.name for player in players]
         if baseline is not None:
             run_here = describe_run(cfg, maps, 0.0) | {"steps": steps}
             baseline.check(run_here, [(name, size) for name in names for size in team_sizes(cfg.num_robots)])
         best = {}
-        if any(one.learned for one in players):
+        if any(player.learned for player in players):
             best = {size: choose_best(cfg, suite, names, size) for size in team_sizes(cfg.num_robots)}
     write_config(resolve(cfg, maps), where, "evaluate", overrides)
     begin(where, asked, overrides)
-    results = [one for team in envs for one in evaluate_places(cfg, team, players, where / FOLDER)]
+    results = [result for team in envs for result in evaluate_places(cfg, team, players, where / FOLDER)]
     report(cfg, results, suite, best, where / "results.json", steps=steps)
     write_episodes(where / EPISODES_FILE, results)
     draw_ends(cfg, maps, players[0], where / "picture.png")
@@ -174,7 +174,7 @@ def evaluate_places(
         return parts[0]
     results = [pool(list(those)) for those in zip(*parts, strict=True)]
     for env, those in zip(envs, parts, strict=True):
-        results += [replace(one, place=env.maps[0].name) for one in those]
+        results += [replace(result, place=env.maps[0].name) for result in those]
     return results
 
 
@@ -205,7 +205,7 @@ def report(
     Args:
         best: team size -> the classical planner that is the best on the validation maps, if that was asked
     """
-    seconds = sum(one.seconds for one in results)
+    seconds = sum(result.seconds for result in results)
     known = {str(size): name for size, name in best.items() if name is not None}
     extra |= {"held_out": suite.is_held_out} | ({"best_classical": known} if known else {})
     extra |= {"algorithm": cfg.algorithm.name} if "checkpoint" not in cfg or cfg.checkpoint else {}
@@ -228,13 +228,15 @@ def draw_results(results: list[EvaluationResult], where: Path) -> list[str]:
     """Pictures of what came of all maps together: coverage over time, the metrics, the robots' shares; their names."""
     from maexp.agents.evaluation.plots import draw_contributions, draw_coverage, draw_summary
 
-    whole = [one for one in results if not one.place]
+    whole = [result for result in results if not result.place]
     named = dict(zip(result_names(whole), whole, strict=True))
-    draw_coverage({name: (one.times, one.coverage, one.maps) for name, one in named.items()}, where / "coverage.png")
-    summaries = {name: one.summary() for name, one in named.items()}
-    goal = {"success_coverage": max(one.success_coverage for one in whole)}
+    draw_coverage(
+        {name: (result.times, result.coverage, result.maps) for name, result in named.items()}, where / "coverage.png"
+    )
+    summaries = {name: result.summary() for name, result in named.items()}
+    goal = {"success_coverage": max(result.success_coverage for result in whole)}
     draw_summary(summaries | {"run": goal}, where / "metrics.png")
-    draw_contributions({name: one.shares for name, one in named.items()}, where / "shares.png")
+    draw_contributions({name: result.shares for name, result in named.items()}, where / "shares.png")
     return ["coverage.png", "metrics.png", "shares.png"]
 
 
@@ -243,7 +245,7 @@ def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSui
     words = f"{count} {'held-out ' * suite.is_held_out}episode{'s' * (count != 1)}"
     if len(results[0].episodes["exploration_ratio"]) > count:
         words += f" on each of {len(suite.held_out)} maps"
-    return words + ", for each team size" * (len({one.num_robots for one in results}) > 1)
+    return words + ", for each team size" * (len({result.num_robots for result in results}) > 1)
 
 
 def draw_ends(cfg: EvaluateSettings, maps: list, player: NamedPolicy, path: Path) -> None:

@@ -67,11 +67,11 @@ def describe_training(cfg: ExportSettings, saved: dict) -> dict[str, Any]:
 def result_files(cfg: ExportSettings, checkpoint: Path) -> list[Path]:
     """Results of the evaluations that are named, or else of the run's own."""
     if cfg.results:
-        return [find_results(Path(one)) for one in split_folders(cfg.results)]
+        return [find_results(Path(folder)) for folder in split_folders(cfg.results)]
     own = checkpoint.parent.parent / RESULTS[1]
     return [own] if own.is_file() else []
 
 
 def split_folders(text: str) -> list[str]:
     """`a,b` as two folders, where there is none of that name."""
-    return [text] if Path(text).exists() else [one.strip() for one in text.split(",") if one.strip()]
+    return [text] if Path(text).exists() else [part.strip() for part in text.split(",") if part.strip()]

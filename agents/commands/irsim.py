@@ -69,7 +69,7 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     title = f"{world.name}: {cfg.num_robots} robots, {player.name}"
     written = [where / "results.json", draw_curves(curves, title, where / "coverage.png")]
     written.append(write_gif(frames, where / "film.gif", FILM_SPEED))
-    print(f"Written: {', '.join(str(one) for one in written)}")
+    print(f"Written: {', '.join(str(path) for path in written)}")
     return 0
 
 

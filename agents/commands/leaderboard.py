@@ -67,7 +67,7 @@ def run(cfg: LeaderboardSettings, where: None, overrides: list[str]) -> int:
         if path.exists() and (before := rows.read_row(path)) != row:
             _tell_replaced(path, before, row)
         rows.write_row(out, row)  # at once: what is done stays, should a later place be damaged
-    kept = [rows.read_row(one) for one in rows.find_rows(out)]
+    kept = [rows.read_row(path) for path in rows.find_rows(out)]
     written = site.write_site(out, kept)
     suites = len(site.group(kept))
     print(f"{len(kept)} rows on {suites} suite{'s' * (suites != 1)}. Written: {', '.join(map(short, written))}")
@@ -79,7 +79,7 @@ def _tell_replaced(path: Path, before: dict, row: dict) -> None:
     if before["policy"] != row["policy"]:
         told = f"{row['policy']} would replace {before['policy']} in {short(path)}"
         raise UserError(f"{told}: give it another name with maexp suite run ... name=NAME.")
-    suite, scores = row["suite"]["name"], [f"{one['score']['mean']:.3f}" for one in (before, row)]
+    suite, scores = row["suite"]["name"], [f"{version['score']['mean']:.3f}" for version in (before, row)]
     print(f"{row['policy']} on {suite} was there already, with score {scores[0]}, and is replaced: now {scores[1]}.")
 
 
@@ -93,7 +93,7 @@ def _read_all(cfg: LeaderboardSettings) -> Iterator[dict]:
         if kind != "run":
             yield from map(rows.read_row, [place] if kind == "row" else rows.find_rows(place))
             continue
-        count = sum(len(one["decisions"]) for one in read_json(place / RESULTS)["episodes"].values())
+        count = sum(len(part["decisions"]) for part in read_json(place / RESULTS)["episodes"].values())
         with Progress(f"playing {place} again", count) as progress:
             row = rows.make_row(place, cfg.suite, cfg.verify, progress.advance)
         yield row

@@ -94,7 +94,7 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
         print(told)
         written = write_files(cfg, where, world, imported)
     write_text(where / "report.txt", told + "\n")
-    print(f"Written: {', '.join(str(one) for one in written)}")
+    print(f"Written: {', '.join(str(path) for path in written)}")
     if report.ok and cfg.task in ("make", "import"):
         size = [] if cfg.robot.radius is None else [f"robot.radius={cfg.robot.radius:g}"]
         print(f"Next: {command('train', 'scenario=pointcloud', f'scenario.path={written[0]}', *size)}")
@@ -142,11 +142,11 @@ def print_scenarios() -> None:
     """The table of scenarios and the formats of files."""
     head = f"{'scenario':<26}{'maps':>6}{'spacing m':>11}{'size m':>8}{'radar m':>9}{'speed m/s':>11}"
     print(head + "  local x macro steps")
-    for name, one in SCENARIOS.items():
-        size = "yours" if one.size is None else f"{one.size:g}"
-        steps = f"{one.local_steps} x {one.macro_steps or 'from the free area'}"
+    for name, scenario in SCENARIOS.items():
+        size = "yours" if scenario.size is None else f"{scenario.size:g}"
+        steps = f"{scenario.local_steps} x {scenario.macro_steps or 'from the free area'}"
         print(
-            f"{name:<26}{one.count or 'yours':>6}{one.resolution:>11g}{size:>8}{one.radar_range:>9g}"
-            f"{one.max_speed:>11g}  {steps}"
+            f"{name:<26}{scenario.count or 'yours':>6}{scenario.resolution:>11g}{size:>8}{scenario.radar_range:>9g}"
+            f"{scenario.max_speed:>11g}  {steps}"
         )
     print(f"\nFiles that can be imported: {FORMATS}")

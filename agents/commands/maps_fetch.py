@@ -43,15 +43,19 @@ def _fetch(found: MapSet, where: Path, address: str) -> None:
     """Licences first, so that no map is there without its own."""
     from maexp.envs.importing.download import download
 
-    entries = sorted(found.entries, key=lambda one: one.split != LICENCES)
-    with Progress(f"fetching {found.name}", sum(one.bytes for one in entries)) as progress:
-        for one in entries:
+    entries = sorted(found.entries, key=lambda entry: entry.split != LICENCES)
+    with Progress(f"fetching {found.name}", sum(entry.bytes for entry in entries)) as progress:
+        for entry in entries:
             with _blame_source():
                 download(
-                    f"{address.rstrip('/')}/{one.address}", where / one.place, one.bytes, one.sha256, progress.advance
+                    f"{address.rstrip('/')}/{entry.address}",
+                    where / entry.place,
+                    entry.bytes,
+                    entry.sha256,
+                    progress.advance,
                 )
-            if one.split != LICENCES:
-                _write_yaml(where / one.place, one)
+            if entry.split != LICENCES:
+                _write_yaml(where / entry.place, entry)
 
 
 @contextmanager

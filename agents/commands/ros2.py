@@ -64,12 +64,12 @@ def make_driver(cfg: Ros2Settings) -> TeamDriver:
 
 def driver_settings(cfg: Ros2Settings) -> DriverSettings:
     """Those of the team; what was not given is as `DriverSettings` has it."""
-    values = {one.name: cfg[one.name] for one in fields(DriverSettings)}
-    several = [one.name for one in fields(DriverSettings) if isinstance(one.default, tuple)]
+    values = {field.name: cfg[field.name] for field in fields(DriverSettings)}
+    several = [field.name for field in fields(DriverSettings) if isinstance(field.default, tuple)]
     for name in several:
         values[name] = as_list(values[name])
         if name in ("offsets", "robot_radius"):
-            values[name] = [_number(name, one) for one in values[name]]
+            values[name] = [_number(name, value) for value in values[name]]
     return read_settings(values)
 
 
@@ -94,7 +94,7 @@ def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
 
     suite = load_suite(cfg.place)
     suite.check()
-    names = tuple(str(one) for one in as_list(cfg.robots))
+    names = tuple(str(robot) for robot in as_list(cfg.robots))
     serving = Serving(names, cfg.tf == "own", cfg.wait_for, cfg.stands, cfg.limit, cfg.answer, _tell)
     player = Ros2Player(cfg.name, wire, serving)
     settings = {name: cfg[name] for name in KEPT} | {"policy": WORD, "num_envs": 1, "decision_limit": None}

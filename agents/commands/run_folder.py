@@ -52,7 +52,7 @@ def _create_new(folder: Path) -> Path:
 
 def check_writable(folder: Path) -> None:
     """Raise UserError unless files can be created in `folder`, or in the nearest folder above that exists."""
-    place = next(one for one in (folder, *folder.parents) if one.exists())
+    place = next(path for path in (folder, *folder.parents) if path.exists())
     if not place.is_dir():
         raise UserError(f"{place} is a file, so {folder} cannot be a folder: {ADVICE}.")
     try:

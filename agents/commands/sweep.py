@@ -58,7 +58,7 @@ def run_sweep(verb: str, overrides: list[str]) -> int:
             return STOPPED
         runs = swept_words(folder, [*swept])
         combine_curves(runs, folder / "curves.png")
-        evaluated = tell_runs({" ".join(words) or one.name: one for one, words in runs.items()}, folder / "runs.csv")
+        evaluated = tell_runs({" ".join(words) or path.name: path for path, words in runs.items()}, folder / "runs.csv")
     table = ", their table in runs.csv" * evaluated
     print(f"All runs are in {short(folder)}, their curves together in curves.png{table}")
     return 0
@@ -95,7 +95,7 @@ def _run_jobs(verb: str, words: list[str]) -> None:
 def swept_words(folder: Path, names: list[str]) -> dict[Path, list[str]]:
     """The runs below `folder`, with the words of each that set one of `names`."""
     runs = {}
-    for config in sorted(folder.glob("*/config.yaml"), key=lambda one: (len(one.parent.name), one.parent.name)):
+    for config in sorted(folder.glob("*/config.yaml"), key=lambda path: (len(path.parent.name), path.parent.name)):
         words = config.read_text().splitlines()[0].split()[3:]
         runs[config.parent] = [word for word in words if word.partition("=")[0] in names]
     return runs

@@ -42,7 +42,7 @@ def prepare(overrides: list[str]) -> Recipe:
     place = find_override(overrides, "resume")
     if place is None:
         begins = [find_override(overrides, name) for name in ("warm_start", "algorithm.begin_from")]
-        return Recipe(overrides, [word for one in begins for word in starts_as(one)])
+        return Recipe(overrides, [word for start in begins for word in starts_as(start)])
     if find_override(overrides, "hydra.run.dir") is not None:
         raise UserError("resume and hydra.run.dir together are ambiguous: a resumed run goes on in its own folder.")
     return continue_run(*_resumable(place), overrides, "train")
@@ -84,7 +84,9 @@ def find_others(cfg: TrainSettings) -> list[NamedPolicy]:
     """The policies played at the end beside the trained one."""
     words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
     others = find_players(words, "classical")
-    return [one for one in others if one.direct] if cfg.planner.name == "direct" else others  # the rest pick goals
+    return (
+        [player for player in others if player.direct] if cfg.planner.name == "direct" else others
+    )  # the rest pick goals
 
 
 def run(cfg: TrainSettings, where: Path, overrides: list[str]) -> int:
@@ -146,12 +148,12 @@ def finish(done: TrainingRun) -> None:
     device, held_out = choose_device(cfg, "train_device"), done.suite.held_out
     if cfg.episodes:
         envs = [make_env(shown, held_out, size, device=device) for size in done.sizes]
-        results = [one for env in envs for one in evaluate_all(cfg, env, players, where / FOLDER)]
+        results = [result for env in envs for result in evaluate_all(cfg, env, players, where / FOLDER)]
         report(cfg, results, done.suite, best, where / "summary.json", training_seconds=round(done.seconds, 2))
         written += ["summary.json", *draw_results(results, where)]
     size = done.sizes[0]
-    beside = [one for one in players if one.kind in ("checkpoint", "start") or one.name == best.get(size)]
-    draw_curves(where, done.validation.rival, [one for one in results if one.num_robots == size], beside)
+    beside = [player for player in players if player.kind in ("checkpoint", "start") or player.name == best.get(size)]
+    draw_curves(where, done.validation.rival, [result for result in results if result.num_robots == size], beside)
     env = envs[0] if results else make_env(shown, held_out[:1], size, 1, device=device)
     draw_rollout(cfg, env, beside, results, where / "rollout.gif")
     written += ["curves.png", "rollout.gif"]
@@ -184,8 +186,8 @@ def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside
     """curves.png from metrics.csv, and from what the players `beside` the trained one did in the end."""
     from maexp.agents.evaluation.learning import draw_curves as draw
 
-    names = [one.name for one in beside]
-    ends = {one.policy: (one.times, one.coverage, one.maps) for one in results if one.policy in names}
+    names = [player.name for player in beside]
+    ends = {result.policy: (result.times, result.coverage, result.maps) for result in results if result.policy in names}
     draw(where / "metrics.csv", where / "curves.png", rival=rival, ends=ends)
 
 
@@ -200,7 +202,7 @@ def draw_rollout(
     from maexp.agents.evaluation.films import draw_film, play_teams
     from maexp.envs.film import write_gif
 
-    known = {one.policy: one for one in results if one.num_robots == env.num_robots}
+    known = {result.policy: result for result in results if result.num_robots == env.num_robots}
     number, caption = 0, []
     if known:
         rival = known[teams[-1].name] if len(teams) > 1 else None
@@ -211,6 +213,6 @@ def draw_rollout(
             f"{pair}: {100 * apart:+.1f} points of coverage over time, of {count} episodes the closest to the mean "
             f"({100 * mean:+.1f})"
         ]
-    episodes = [play_teams(env, one.make(env), one.name, teams=[number], seed=cfg.seed)[0] for one in teams]
+    episodes = [play_teams(env, player.make(env), player.name, teams=[number], seed=cfg.seed)[0] for player in teams]
     caption.insert(0, f"{episodes[0].map.name}, episode {number} of seed {cfg.seed}")
     write_gif(draw_film(episodes, caption, columns=len(episodes)), path)

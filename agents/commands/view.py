@@ -154,7 +154,7 @@ def choose_files(files: list[Path], place: Path, episode: int | None, policy: st
     named = sorted((*split_name(file), file) for file in files)
     policies = sorted({name for _, name, _ in named})
     if policy is not None:
-        named = [one for one in named if one[1].split("_N")[0] == policy]
+        named = [parts for parts in named if parts[1].split("_N")[0] == policy]
         if not named:
             raise UserError(f"policy={policy} has no episode in {place}: there are those of {', '.join(policies)}.")
     numbers = sorted({number for number, *_ in named})
@@ -196,7 +196,7 @@ def check_team(cfg: ViewSettings, episodes: list[Episode]) -> None:
         value = getattr(cfg, name)
         if value is not None and not episodes:
             raise UserError(f"{name}={value} is not here: there is no team on a map alone; add policy=NAME.")
-    fewest = min((one.num_robots for one in episodes), default=0)
+    fewest = min((episode.num_robots for episode in episodes), default=0)
     if cfg.seen_by is not None and not 0 <= cfg.seen_by < fewest:
         raise UserError(f"seen_by={cfg.seen_by} is not here: give one of 0 to {fewest - 1}.")
 
@@ -260,7 +260,7 @@ def show_page(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap |
     """The page in the browser until interrupted, or the page as a file."""
     from maexp.envs.viewing.page import Page, write_page
 
-    stages = [make_stage(cfg, one.map, True) for one in episodes] or [make_stage(cfg, world, False)]
+    stages = [make_stage(cfg, episode.map, True) for episode in episodes] or [make_stage(cfg, world, False)]
     if cfg.out is not None:
         write_page(stages[0], episodes[0] if episodes else None, Path(cfg.out), cfg.seen_by)
         print(f"Written: {short(Path(cfg.out).absolute())} (open it in a browser; needs no server)")

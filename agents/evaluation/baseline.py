@@ -56,25 +56,25 @@ class Baseline:
         """{name: {metric: {mean, std, ci95, n}}} of each result less the earlier one, where there is one; maps that
         were played one by one have their own."""
         found = {}
-        for name, one in zip(result_names(results), results, strict=True):
-            before = self.results.get((one.policy, one.num_robots))
+        for name, result in zip(result_names(results), results, strict=True):
+            before = self.results.get((result.policy, result.num_robots))
             if before is not None:
-                found[name] = one.minus(_on(before, one.place))
+                found[name] = result.minus(_on(before, result.place))
         return found
 
 
 def write_episodes(path: Path, results: list[EvaluationResult]) -> None:
     """A line for each episode of each policy and team size: every metric, nothing where the episode has none."""
-    whole = [one for one in results if not one.place]
+    whole = [result for result in results if not result.place]
     metrics = list(whole[0].episodes)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*KEY, *metrics])
-    for one in whole:
-        for k, place in enumerate(one.maps):
-            values = (float(one.episodes[metric][k]) for metric in metrics)
+    for result in whole:
+        for k, place in enumerate(result.maps):
+            values = (float(result.episodes[metric][k]) for metric in metrics)
             numbers = ("" if np.isnan(value) else value for value in values)
-            writer.writerow([one.policy, one.num_robots, place, *numbers])
+            writer.writerow([result.policy, result.num_robots, place, *numbers])
     write_text(path, text.getvalue())
 
 
@@ -105,8 +105,11 @@ def load_baseline(path: str) -> Baseline:
 def describe_changes(changes: dict[str, dict], folder: Path, goal: float) -> list[str]:
     """A sentence for each result of episodes that end at the coverage `goal`: how far it is from the baseline."""
     told = compared(goal)
-    amounts = {name: [one.describe_difference(found[one.metric]) for one in told] for name, found in changes.items()}
-    return [f"{name} less {short(folder)}: {', '.join(one)}." for name, one in amounts.items()]
+    amounts = {
+        name: [measure.describe_difference(found[measure.metric]) for measure in told]
+        for name, found in changes.items()
+    }
+    return [f"{name} less {short(folder)}: {', '.join(amount)}." for name, amount in amounts.items()]
 
 
 def _on(result: EvaluationResult, place: str) -> EvaluationResult:

@@ -50,7 +50,9 @@ def find_best(played: dict[str, Sequence[EvaluationResult]]) -> str | None:
         played: policy -> its results, each of the same weight, on validation maps.
     """
     scores = {
-        name: np.mean([one.episodes[DECIDES].mean() for one in results]) for name, results in played.items() if results
+        name: np.mean([result.episodes[DECIDES].mean() for result in results])
+        for name, results in played.items()
+        if results
     }
     return max(scores, key=scores.get, default=None)
 
@@ -61,31 +63,31 @@ def describe_differences(results: list[EvaluationResult], best: dict[int, str | 
     Args:
         best: team size -> its name
     """
-    whole = [one for one in results if not one.place]
-    rivals = {one.num_robots: one for one in whole if one.policy == best.get(one.num_robots)}
+    whole = [result for result in results if not result.place]
+    rivals = {result.num_robots: result for result in whole if result.policy == best.get(result.num_robots)}
     return [
         _describe(
             name,
-            f"{rivals[one.num_robots].policy}, the best classical planner on the validation maps",
-            one.minus(rivals[one.num_robots]),
-            one.success_coverage,
+            f"{rivals[result.num_robots].policy}, the best classical planner on the validation maps",
+            result.minus(rivals[result.num_robots]),
+            result.success_coverage,
         )
-        for name, one in zip(result_names(whole), whole, strict=True)
-        if one.learned and one.num_robots in rivals
+        for name, result in zip(result_names(whole), whole, strict=True)
+        if result.learned and result.num_robots in rivals
     ]
 
 
 def describe_training(results: list[EvaluationResult]) -> list[str]:
     """A sentence for each size of the trained team: how far it is ahead of what it started from."""
-    starts = {one.num_robots: one for one in results if one.policy in STARTS}
+    starts = {result.num_robots: result for result in results if result.policy in STARTS}
     return [
-        _describe(name, STARTS[start.policy], one.minus(start), one.success_coverage)
-        for name, one in zip(result_names(results), results, strict=True)
-        if one.policy == "trained" and (start := starts.get(one.num_robots))
+        _describe(name, STARTS[start.policy], result.minus(start), result.success_coverage)
+        for name, result in zip(result_names(results), results, strict=True)
+        if result.policy == "trained" and (start := starts.get(result.num_robots))
     ]
 
 
-def find_typical(one: EvaluationResult, other: EvaluationResult | None, among: int) -> tuple[int, float, float]:
+def find_typical(result: EvaluationResult, other: EvaluationResult | None, among: int) -> tuple[int, float, float]:
     """The episode that stands for the mean: of the first `among`, the one whose difference in coverage over time is
     closest to the mean of all.
 
@@ -95,14 +97,16 @@ def find_typical(one: EvaluationResult, other: EvaluationResult | None, among: i
     Returns:
         Its number, its difference and the mean.
     """
-    apart = one.episodes[DECIDES] - (0.0 if other is None else other.episodes[DECIDES])
+    apart = result.episodes[DECIDES] - (0.0 if other is None else other.episodes[DECIDES])
     number = int(np.abs(apart[:among] - apart.mean()).argmin())
     return number, float(apart[number]), float(apart.mean())
 
 
 def _describe(name: str, rival: str, found: dict[str, dict], goal: float) -> str:
     apart = ", ".join(
-        one.describe_difference(found[one.metric]) for one in compared(goal) if one.metric != "collisions"
+        measure.describe_difference(found[measure.metric])
+        for measure in compared(goal)
+        if measure.metric != "collisions"
     )
     name = name.replace("trained", "The trained team", 1)
     return f"{name} {verdict(found[DECIDES])} {rival}: {apart}."

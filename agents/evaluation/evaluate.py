@@ -54,7 +54,7 @@ class EvaluationResult:
 
     def copies(self, *others: "EvaluationResult") -> np.ndarray:
         """A number for each episode, the same for copies (`label_copies`); `others` played the same episodes."""
-        return label_copies(self.maps, *(one.episodes for one in (self, *others)))
+        return label_copies(self.maps, *(result.episodes for result in (self, *others)))
 
     @property
     def evidence(self) -> Evidence:
@@ -78,31 +78,31 @@ class EvaluationResult:
     def _summarise(self, values: dict[str, np.ndarray], copies: np.ndarray) -> dict[str, dict]:
         trainings = [] if self.trainings is None else [self.trainings]
         weights = resample_weights(self.maps, *trainings, copies=copies)
-        return {name: summarise(one, weights, copies) for name, one in values.items()}
+        return {name: summarise(value, weights, copies) for name, value in values.items()}
 
 
 def join(parts: list[EvaluationResult]) -> EvaluationResult:
     """The episodes of several results as those of one, without what was recorded."""
     return replace(
         parts[0],
-        episodes={metric: np.concatenate([one.episodes[metric] for one in parts]) for metric in parts[0].episodes},
-        seconds=sum(one.seconds for one in parts),
-        maps=np.concatenate([one.maps for one in parts]),
+        episodes={metric: np.concatenate([part.episodes[metric] for part in parts]) for metric in parts[0].episodes},
+        seconds=sum(part.seconds for part in parts),
+        maps=np.concatenate([part.maps for part in parts]),
         place="",
         times=None,
         coverage=None,
         shares=None,
-        trainings=None if parts[0].trainings is None else np.concatenate([one.trainings for one in parts]),
+        trainings=None if parts[0].trainings is None else np.concatenate([part.trainings for part in parts]),
         run={},
     )
 
 
 def pool(parts: list[EvaluationResult]) -> EvaluationResult:
     """The episodes of several recorded results of one policy as one result."""
-    recorded = [(one.times, one.coverage) for one in parts if one.times is not None and one.coverage is not None]
+    recorded = [(part.times, part.coverage) for part in parts if part.times is not None and part.coverage is not None]
     times = np.unique(np.concatenate([its for its, _ in recorded]))
     lines = [np.interp(times, its, line) for its, coverage in recorded for line in coverage]
-    shares = None if parts[0].shares is None else np.concatenate([one.shares for one in parts])
+    shares = None if parts[0].shares is None else np.concatenate([part.shares for part in parts])
     return replace(join(parts), times=times, coverage=np.stack(lines), shares=shares)
 
 
@@ -165,18 +165,18 @@ def _play_or_read(
         map_id = env.simulation.tensors["map_id"].cpu().numpy()
         if kept is not None:
             arrays = {f"info_{name}": value.cpu().numpy() for name, value in final.items()} | {"map_id": map_id}
-            arrays |= {f"recorded_{name}": one for name, one in (recorder.batch() if recorder else {}).items()}
+            arrays |= {f"recorded_{name}": array for name, array in (recorder.batch() if recorder else {}).items()}
             kept.write(first, arrays | random_numbers(env.device))
         return final, map_id.tolist()
     go_on_with_random_numbers(arrays, env.device)
     if recorder is not None:
         recorder.add(_part(arrays, "recorded_"))
-    info = {name: torch.from_numpy(one).to(env.device) for name, one in _part(arrays, "info_").items()}
+    info = {name: torch.from_numpy(array).to(env.device) for name, array in _part(arrays, "info_").items()}
     return TensorDict(info, batch_size=numbers.shape), arrays["map_id"].tolist()
 
 
 def _part(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): one for name, one in arrays.items() if name.startswith(prefix)}
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 @torch.no_grad()

@@ -21,10 +21,10 @@ class Evidence(NamedTuple):
 def describe_evidence(found: Sequence[Evidence]) -> list[str]:
     """Sentences on copies, few episodes and few maps; none where there is enough of all."""
     sentences = []
-    for kind in dict.fromkeys((one.episodes, one.distinct) for one in found):
-        names = [one.policy for one in found if (one.episodes, one.distinct) == kind]
+    for kind in dict.fromkeys((evidence.episodes, evidence.distinct) for evidence in found):
+        names = [evidence.policy for evidence in found if (evidence.episodes, evidence.distinct) == kind]
         sentences += _describe_episodes(*kind, names if len(names) < len(found) else [])
-    some = [one.maps for one in found if one.distinct >= LEAST_DISTINCT]
+    some = [evidence.maps for evidence in found if evidence.distinct >= LEAST_DISTINCT]
     if some and min(some) < FEW_MAPS:
         count = min(some)
         sentences.append(f"The intervals rest on {_count(count, 'map')}: they tell little of others.")
@@ -37,8 +37,8 @@ def _describe_episodes(episodes: int, distinct: int, names: list[str]) -> list[s
     if distinct == episodes:
         told = f"{_count(episodes, 'episode')}{whose}"
     else:
-        one = "is" if distinct == 1 else "are"
-        told = f"Of {_count(episodes, 'episode')}{whose} {distinct} {one} distinct, the rest copies"
+        verb = "is" if distinct == 1 else "are"
+        told = f"Of {_count(episodes, 'episode')}{whose} {distinct} {verb} distinct, the rest copies"
     if distinct < LEAST_DISTINCT:
         return [f"{told}: too few for an interval, which takes {LEAST_DISTINCT}."]
     return [] if distinct == episodes else [f"{told}: the intervals count each once."]

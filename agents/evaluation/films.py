@@ -74,10 +74,10 @@ def draw_film(episodes: list[Episode], caption: Sequence[str] = (), columns: int
 
     Where policies differ, each team's picture has the name of its own on top. `caption`: lines of text over all.
     """
-    several = len({one.policy for one in episodes}) > 1
+    several = len({episode.policy for episode in episodes}) > 1
     width = next(pixels for most, pixels in WIDTHS if len(episodes) <= most)
     frames, latest = [], {}
-    for step in np.unique(np.concatenate([one.step for one in episodes])):
+    for step in np.unique(np.concatenate([episode.step for episode in episodes])):
         for k, episode in enumerate(episodes):
             record = int(np.searchsorted(episode.step, step, side="right")) - 1
             if latest.get(k, (-1,))[0] != record:  # a team that is done stands still
@@ -95,4 +95,4 @@ def write_film(episodes: list[Episode], folder: Path, name: str, kind: str) -> l
     """Write `film_NAME.KIND` and `episodes/NAME_K.npz`, K counted from 0; returns what was written."""
     path = WRITERS[kind](draw_film(episodes), folder / f"film_{name}.{kind}")
     (folder / EPISODES).mkdir(exist_ok=True)
-    return [path] + [one.save(folder / EPISODES / f"{name}_{k}.npz") for k, one in enumerate(episodes)]
+    return [path] + [episode.save(folder / EPISODES / f"{name}_{k}.npz") for k, episode in enumerate(episodes)]

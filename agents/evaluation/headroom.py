@@ -21,13 +21,13 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
         same size and `CEILING` is ahead in all resamples of maps and of at least `LEAST_DISTINCT` distinct episodes.
     """
     groups: dict[tuple, list[tuple[str, EvaluationResult]]] = {}
-    for name, one in zip(names, results, strict=True):
-        groups.setdefault((one.place, one.num_robots), []).append((name, one))
+    for name, result in zip(names, results, strict=True):
+        groups.setdefault((result.place, result.num_robots), []).append((name, result))
     found = {}
     for group in groups.values():
-        known = {one.policy: one for _, one in group}
+        known = {result.policy: result for _, result in group}
         if BASE in known and CEILING in known:
-            others = {name: one for name, one in group if one.policy not in (BASE, CEILING)}
+            others = {name: result for name, result in group if result.policy not in (BASE, CEILING)}
             found |= _shares(others, known[BASE], known[CEILING])
     return found
 
@@ -35,8 +35,8 @@ def headroom_shares(results: list[EvaluationResult], names: list[str]) -> dict[s
 def describe_shares(results: list[EvaluationResult], names: list[str]) -> list[str]:
     """A sentence for each share."""
     sentences = []
-    for name, one in headroom_shares(results, names).items():
-        mean, low, high = (f"{100 * share:.0f}" for share in (one["mean"], *one["ci95"]))
+    for name, figures in headroom_shares(results, names).items():
+        mean, low, high = (f"{100 * share:.0f}" for share in (figures["mean"], *figures["ci95"]))
         lead = f"the lead of {CEILING} over {BASE} in coverage over time"
         sentences.append(f"{name} wins {mean} % [{low}, {high}] of the headroom, {lead}.")
     return sentences
@@ -44,17 +44,17 @@ def describe_shares(results: list[EvaluationResult], names: list[str]) -> list[s
 
 def _shares(others: dict[str, EvaluationResult], base: EvaluationResult, ceiling: EvaluationResult) -> dict[str, dict]:
     headroom, found = _lead(ceiling, base), {}
-    for name, one in others.items():
-        copies = base.copies(ceiling, one)
+    for name, result in others.items():
+        copies = base.copies(ceiling, result)
         weights = resample_weights(base.maps, copies=copies)
         drawn = resampled_means(headroom, weights)
         if headroom.mean() <= 0.0 or drawn.min() <= 0.0 or len(np.unique(copies)) < LEAST_DISTINCT:
             continue
-        lead = _lead(one, base)
+        lead = _lead(result, base)
         low, high = np.percentile(resampled_means(lead, weights) / drawn, [2.5, 97.5])
         found[name] = {"mean": float(lead.mean() / headroom.mean()), "ci95": [float(low), float(high)], "n": len(lead)}
     return found
 
 
-def _lead(one: EvaluationResult, base: EvaluationResult) -> np.ndarray:
-    return one.episodes["coverage_auc"] - base.episodes["coverage_auc"]
+def _lead(result: EvaluationResult, base: EvaluationResult) -> np.ndarray:
+    return result.episodes["coverage_auc"] - base.episodes["coverage_auc"]

@@ -68,7 +68,7 @@ def identify(
     """
     settings = resolve(cfg, env.maps)
     return {
-        "settings": {one: settings[one] for one in PLAYED if one in settings and one != "num_threads"},
+        "settings": {name: settings[name] for name in PLAYED if name in settings and name != "num_threads"},
         "maps": checksums(env.maps),
         "teams": [env.num_envs, env.num_robots, str(env.device)],
         "episodes": episodes,
@@ -81,8 +81,10 @@ def digest_weights(policy: Callable) -> str:
     """Changes with the weights of a network; "" for what has none."""
     digest = hashlib.sha256()
     weights = policy.state_dict() if isinstance(policy, torch.nn.Module) else {}
-    for name, one in weights.items():
-        digest.update(name.encode() + (one.cpu().numpy().tobytes() if torch.is_tensor(one) else repr(one).encode()))
+    for name, weight in weights.items():
+        digest.update(
+            name.encode() + (weight.cpu().numpy().tobytes() if torch.is_tensor(weight) else repr(weight).encode())
+        )
     return digest.hexdigest()[:16] if weights else ""
 
 

@@ -98,7 +98,9 @@ def _moving(tables: list[dict], unit: str, factor: float, columns: list) -> list
     """The columns of a panel that are not flat; the gain always counts."""
 
     def moves(name: str) -> bool:
-        lines = [_smooth(factor * one[name][np.isfinite(one[name])]) for one in tables if _has_values(one, name)]
+        lines = [
+            _smooth(factor * table[name][np.isfinite(table[name])]) for table in tables if _has_values(table, name)
+        ]
         return name == PAIRED[0] or any(np.ptp(line) > LEAST_CHANGE.get(unit, 0.0) for line in lines)
 
     return [entry for entry in columns if moves(entry[0])]
@@ -126,7 +128,7 @@ def _read_seeds(source) -> list[dict[str, np.ndarray]]:
     source = list(source)
     if source and isinstance(source[0], dict):
         return [_columns(source)]
-    return [_read_table(Path(one)) for one in source]
+    return [_read_table(Path(path)) for path in source]
 
 
 def _read_table(path: Path) -> dict[str, np.ndarray]:

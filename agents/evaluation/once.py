@@ -36,8 +36,8 @@ def play_once(name: str, env: ExplorationEnv, play: Callable[[], EvaluationResul
     starts = env.simulation.tensors["starts"].cpu().numpy()
     clouds = (env.starts, *(points for m in env.maps for points in (m.name, m.free, m.boundary)))
     content = zlib.crc32(starts.tobytes())
-    for one in clouds:
-        content = zlib.crc32(one.encode() if isinstance(one, str) else one.tobytes(), content)
+    for cloud in clouds:
+        content = zlib.crc32(cloud.encode() if isinstance(cloud, str) else cloud.tobytes(), content)
     key = (name, repr(env.settings), content, *played)
     if key not in kept:
         kept[key] = play()

@@ -116,9 +116,11 @@ def draw_summary(summary, path) -> Path:
     """
     if isinstance(summary, str | Path):
         summary = json.loads(Path(summary).read_text())
-    policies = {name: one for name, one in summary.items() if isinstance(one, dict) and one.keys() & {*METRICS}}
+    policies = {
+        name: figures for name, figures in summary.items() if isinstance(figures, dict) and figures.keys() & {*METRICS}
+    }
     goal = summary.get("run", {}).get("success_coverage", 1.0)
-    shown = [name for name in METRICS if any(_mean(one, name) is not None for one in policies.values())]
+    shown = [name for name in METRICS if any(_mean(figures, name) is not None for figures in policies.values())]
     shown = [MEASURES[name] for name in shown if in_reach(name, goal)]
     if not shown:
         raise ValueError(
@@ -126,10 +128,10 @@ def draw_summary(summary, path) -> Path:
         )
     with rc_context(LOOK):
         figure, axes = panels(len(shown), height=2.1 + 0.1 * len(policies))
-        for ax, one in zip(axes, shown, strict=True):
-            _draw_bars(ax, policies, one.metric, one.factor)
-            ax.set_title(one.title, loc="left")
-            ax.set_xlabel(UNITS.get(one.unit, one.unit))
+        for ax, metric in zip(axes, shown, strict=True):
+            _draw_bars(ax, policies, metric.metric, metric.factor)
+            ax.set_title(metric.title, loc="left")
+            ax.set_xlabel(UNITS.get(metric.unit, metric.unit))
         return save(figure, path)
 
 
@@ -140,7 +142,7 @@ def _mean(metrics: dict, name: str) -> float | None:
 
 def _draw_bars(ax, policies: dict, metric: str, factor: float) -> None:
     """A horizontal bar a policy, the first on top, with its value; and of how many episodes where some are missing."""
-    total = max((one.get("exploration_ratio", {}).get("n") or 0) for one in policies.values())
+    total = max((figures.get("exploration_ratio", {}).get("n") or 0) for figures in policies.values())
     partial = False
     for row, metrics in enumerate(policies.values()):
         mean, value = _mean(metrics, metric), metrics.get(metric, {})

@@ -38,7 +38,7 @@ def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
     return {
         "format": FORMAT,
         "scenario": cfg.scenario.name,
-        "maps": [one.name for one in maps],
+        "maps": [world.name for world in maps],
         "seed": cfg.seed,
         "episodes": cfg.episodes,
         "success_coverage": cfg.scenario.success_coverage,
@@ -50,21 +50,27 @@ def describe_run(cfg: EpisodeSettings, maps: list, seconds: float) -> dict:
 
 def result_names(results: list[EvaluationResult]) -> list[str]:
     """A name per result: the policy, with the map and the team's size where several of them were played."""
-    several = len({one.num_robots for one in results}) > 1
-    places = [f" on {one.place}" if one.place else "" for one in results]
-    sizes = [f" N={one.num_robots}" if several else "" for one in results]
-    return [f"{one.policy}{place}{size}" for one, place, size in zip(results, places, sizes, strict=True)]
+    several = len({result.num_robots for result in results}) > 1
+    places = [f" on {result.place}" if result.place else "" for result in results]
+    sizes = [f" N={result.num_robots}" if several else "" for result in results]
+    return [f"{result.policy}{place}{size}" for result, place, size in zip(results, places, sizes, strict=True)]
 
 
 def paired_differences(results: list[EvaluationResult]) -> dict[str, dict]:
     """{a: {b: {metric: {mean, std, ci95, n}}}} of a - b on the same episodes, for every learned a and all others."""
     named = list(zip(result_names(results), results, strict=True))
 
-    def others(one: EvaluationResult) -> list[tuple[str, EvaluationResult]]:
-        alike = (one.place, one.num_robots)
-        return [(name, other) for name, other in named if other is not one and (other.place, other.num_robots) == alike]
+    def others(result: EvaluationResult) -> list[tuple[str, EvaluationResult]]:
+        alike = (result.place, result.num_robots)
+        return [
+            (name, other) for name, other in named if other is not result and (other.place, other.num_robots) == alike
+        ]
 
-    learned = {name: {rival: one.minus(other) for rival, other in others(one)} for name, one in named if one.learned}
+    learned = {
+        name: {rival: result.minus(other) for rival, other in others(result)}
+        for name, result in named
+        if result.learned
+    }
     return {name: found for name, found in learned.items() if found}
 
 
@@ -72,24 +78,24 @@ def write_results(path: Path, results: list[EvaluationResult], run: dict) -> Non
     """{policy: {metric: {mean, std, ci95, n}}}; `difference`: the same of the learned ones less each other; `run`: what
     was run; `headroom_share`: leads by that of `clairvoyant` (`headroom`)."""
     names = result_names(results)
-    named = {name: one.summary() for name, one in zip(names, results, strict=True)}
+    named = {name: result.summary() for name, result in zip(names, results, strict=True)}
     shares = headroom_shares(results, names)
     named |= {"difference": found} if (found := paired_differences(results)) else {}
     named |= {"headroom_share": shares} if shares else {}
     named["run"] = run | {
-        "num_robots": sorted({one.num_robots for one in results}),
-        "distinct_episodes": {name: one.evidence.distinct for name, one in zip(names, results, strict=True)},
+        "num_robots": sorted({result.num_robots for result in results}),
+        "distinct_episodes": {name: result.evidence.distinct for name, result in zip(names, results, strict=True)},
     }
     write_json(path, named)
 
 
 def print_results(results: list[EvaluationResult], title: str) -> None:
     """`print_summaries` of results; below it what they rest on, where it is little."""
-    rows = [(name, one.summary()) for name, one in zip(result_names(results), results, strict=True)]
+    rows = [(name, result.summary()) for name, result in zip(result_names(results), results, strict=True)]
     print_summaries(title, rows, results[0].success_coverage)
-    whole = [one for one in results if not one.place]
+    whole = [result for result in results if not result.place]
     named = zip(result_names(whole), whole, strict=True)
-    evidence = [one.evidence._replace(policy=name) for name, one in named]
+    evidence = [result.evidence._replace(policy=name) for name, result in named]
     shares = describe_shares(whole, result_names(whole))
     for sentence in [*describe_evidence(evidence), *describe_starts(whole), *shares]:
         print(sentence)
@@ -98,11 +104,11 @@ def print_results(results: list[EvaluationResult], title: str) -> None:
 def describe_starts(results: list[EvaluationResult]) -> list[str]:
     """A sentence for each team size of which some see enough of the map where they start: nothing was left to do."""
     sentences = []
-    for one in {one.num_robots: one for one in results if one.coverage is not None}.values():
-        over = int((one.coverage[:, 0] >= one.success_coverage).sum())
+    for result in {result.num_robots: result for result in results if result.coverage is not None}.values():
+        over = int((result.coverage[:, 0] >= result.success_coverage).sum())
         if over:
-            team = f"{one.num_robots} robots" if one.num_robots > 1 else "the robot"
-            episodes, goal = len(one.coverage), f"{100 * one.success_coverage:g} %"
+            team = f"{result.num_robots} robots" if result.num_robots > 1 else "the robot"
+            episodes, goal = len(result.coverage), f"{100 * result.success_coverage:g} %"
             sentences.append(
                 f"In {over} of {episodes} episodes {team} saw {goal} of the map from the start: they say nothing of a "
                 "policy. Take a larger map, fewer robots or a smaller radar.range."
@@ -127,7 +133,7 @@ def print_summaries(
         total = summary["exploration_ratio"]["n"]
         metrics = (_cell(metric, summary[metric], total) for metric in columns)
         cells.append([name, *(tell(summary) for tell in more.values()), *metrics])
-    print_table(title, ["policy", *more, *(MEASURES[one].column for one in columns)], cells)
+    print_table(title, ["policy", *more, *(MEASURES[metric].column for metric in columns)], cells)
 
 
 def find_columns(rows: list[tuple[str, dict]], goal: float) -> list[str]:

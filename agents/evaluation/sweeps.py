@@ -29,8 +29,8 @@ def tell_runs(runs: dict[str, Path], path: Path) -> bool:
         return False
     rows = [row for name, summary in found.items() for row in _teams(name, summary)]
     rows += _planners(found)
-    goal = max(one["run"]["success_coverage"] for one in found.values())
-    episodes = max(one["run"]["episodes"] for one in found.values())
+    goal = max(summary["run"]["success_coverage"] for summary in found.values())
+    episodes = max(summary["run"]["episodes"] for summary in found.values())
     print_summaries(f"{len(found)} runs, {episodes} held-out episodes each", rows, goal, {LEAD: _lead})
     columns = find_columns(rows, goal)
     text = io.StringIO(newline="")
@@ -45,13 +45,13 @@ def tell_runs(runs: dict[str, Path], path: Path) -> bool:
 def _teams(run: str, summary: dict[str, Any]) -> list[tuple[str, dict]]:
     """The trained teams of a run, one of each size, with their lead over the best classical planner."""
     rows, best = [], summary["run"].get("best_classical", {})
-    for name, one in summary.items():
+    for name, figures in summary.items():
         if not TRAINED.fullmatch(name):
             continue
         size = name.removeprefix("trained")
         rival = best.get(size.removeprefix(" N=") or str(summary["run"]["num_robots"][0]), "") + size
         lead = summary.get("difference", {}).get(name, {}).get(rival, {}).get(DECIDES)
-        rows.append((run + size, one | ({LEAD: lead} if lead else {})))
+        rows.append((run + size, figures | ({LEAD: lead} if lead else {})))
     return rows
 
 

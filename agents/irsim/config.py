@@ -46,10 +46,10 @@ class TrialConfig:
 
     def __post_init__(self):
         zero = ("range_noise", "pose_noise", "pose_drift", "people", "seed")
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if not (math.isfinite(value) and (value > 0 or (value == 0 and one.name in zero))):
-                least = "0 or more" if one.name in zero else "above 0"
-                raise ValueError(f"{one.name}={value!r} must be a finite number, {least}")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and (value > 0 or (value == 0 and field.name in zero))):
+                least = "0 or more" if field.name in zero else "above 0"
+                raise ValueError(f"{field.name}={value!r} must be a finite number, {least}")
         if self.beams < 8 or self.beams > 3600:
             raise ValueError(f"beams={self.beams} must be 8 to 3600")

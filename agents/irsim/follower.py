@@ -87,7 +87,7 @@ class Follower:
         for share in SHARES if wanted else ():
             if room(share * wanted, yaw) >= keep:
                 return share * wanted, yaw
-        return 0.0, max((yaw, 0.0), key=lambda one: min(room(0.0, one), keep))
+        return 0.0, max((yaw, 0.0), key=lambda turn: min(room(0.0, turn), keep))
 
     def _track(self, wanted: float, speed: float, yaw: float, aside: float) -> np.ndarray:
         """Places in the robot's frame [m] until it stands again, [k, 2]."""

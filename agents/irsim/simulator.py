@@ -51,10 +51,10 @@ class Simulator:
             world = Path(folder) / "world.yaml"
             world.write_text(yaml.safe_dump(self._describe(floor, image, starts)))
             self.env = _import_irsim().make(str(world), headless=True, log_level="CRITICAL", seed=config.seed)
-        objects = sorted(self.env.objects, key=lambda one: one.id)
-        self.robots = [one for one in objects if one.role == "robot"]
-        self.people = [one for one in objects if one.role == "obstacle" and one.shape == "circle"]
-        self.ids = [one.id for one in (*self.robots, *self.people)]
+        objects = sorted(self.env.objects, key=lambda thing: thing.id)
+        self.robots = [thing for thing in objects if thing.role == "robot"]
+        self.people = [thing for thing in objects if thing.role == "obstacle" and thing.shape == "circle"]
+        self.ids = [thing.id for thing in (*self.robots, *self.people)]
 
     def _describe(self, floor: FloorCells, image: Path, starts: np.ndarray) -> dict:
         c, size = self.config, np.array(floor.free.shape) * floor.cell
@@ -107,23 +107,26 @@ class Simulator:
     @property
     def poses(self) -> np.ndarray:
         """x, y [m] and heading [rad] of each robot, [N, 3]."""
-        return np.array([one.state[:3, 0] for one in self.robots])
+        return np.array([robot.state[:3, 0] for robot in self.robots])
 
     @property
     def crashed(self) -> np.ndarray:
         """Robots that touch a wall, each other or somebody now; they stand still. bool [N]."""
-        return np.array([bool(one.collision_flag) for one in self.robots])
+        return np.array([bool(robot.collision_flag) for robot in self.robots])
 
     def scans(self) -> list[Scan]:
         """What the lidars measure now."""
-        return [Scan(one.lidar.angle_list, one.lidar.range_data.copy(), one.lidar.valid.copy()) for one in self.robots]
+        return [
+            Scan(robot.lidar.angle_list, robot.lidar.range_data.copy(), robot.lidar.valid.copy())
+            for robot in self.robots
+        ]
 
     def step(self, commands: np.ndarray) -> None:
         """0.1 s with the speeds [m/s] and yaw rates [rad/s] of each robot, [N, 2]."""
         walks = self.walkers.step(self.poses[:, :2], DT)
-        actions = [one.reshape(2, 1) for one in (*np.asarray(commands, float), *walks)]
+        actions = [command.reshape(2, 1) for command in (*np.asarray(commands, float), *walks)]
         self.env.step(actions, self.ids)
-        self.walkers.places = np.array([one.state[:2, 0] for one in self.people]).reshape(-1, 2)
+        self.walkers.places = np.array([person.state[:2, 0] for person in self.people]).reshape(-1, 2)
 
 
 def _import_irsim():

@@ -54,7 +54,9 @@ class MapPredictor(nn.Module):
         widths = [width, 2 * width, 4 * width, 4 * width]
         self.inputs = nn.Sequential(Layer(2 * PATCH**2, width), Layer(width, width))
         pairs = list(zip(widths, widths[1:], strict=False))
-        self.down = nn.ModuleList(nn.Sequential(Layer(one, two, 2), Layer(two, two)) for one, two in pairs)
+        self.down = nn.ModuleList(
+            nn.Sequential(Layer(fine, coarse, 2), Layer(coarse, coarse)) for fine, coarse in pairs
+        )
         self.lift = nn.ModuleList(nn.Conv2d(coarse, fine, 1, bias=False) for fine, coarse in pairs)
         self.up = nn.ModuleList(Layer(fine, fine) for fine, _ in pairs)
         self.head = nn.Conv2d(width, PATCH**2, 1)
@@ -154,7 +156,7 @@ def distance_to_free(known: Tensor, most: int) -> Tensor:
 
 def predictor_names() -> list[str]:
     """Predictors that ship."""
-    return sorted(one.parent.name for one in PREDICTORS.glob(f"*/{CONTRACT}"))
+    return sorted(path.parent.name for path in PREDICTORS.glob(f"*/{CONTRACT}"))
 
 
 def find_predictor(name: str | Path) -> Path:

@@ -139,8 +139,8 @@ class TargetChooser(nn.Module):
         lead, places = comm.shape[:-2], mask.shape[-1]
         parts, back = split_teams(*flatten(features, mask, comm))
         looks = [self._look(*part) for part in parts]
-        logits = torch.cat([F.pad(one, (0, places - one.shape[-1]), value=NEVER) for one, _ in looks])[back]
-        seen = torch.cat([one for _, one in looks])[back]
+        logits = torch.cat([F.pad(scores, (0, places - scores.shape[-1]), value=NEVER) for scores, _ in looks])[back]
+        seen = torch.cat([robots for _, robots in looks])[back]
         return logits.reshape(*lead, *logits.shape[1:]), seen.reshape(*lead, *seen.shape[1:])
 
     def _look(self, features: Tensor, mask: Tensor, comm: Tensor) -> tuple[Tensor, Tensor]:
@@ -205,7 +205,7 @@ class SeenReader(nn.Module):
 def with_state(seen: Tensor, time_left: Tensor, alive: Tensor, *coverage: Tensor) -> Tensor:
     """`seen` [batch, robots, width], followed by what critics are told besides."""
     parts = [seen, time_left, alive.unsqueeze(-1).to(seen.dtype)]
-    parts += [one.unsqueeze(1).expand(-1, seen.shape[1], -1) for one in coverage]
+    parts += [share.unsqueeze(1).expand(-1, seen.shape[1], -1) for share in coverage]
     return torch.cat(parts, dim=-1)
 
 

@@ -29,7 +29,7 @@ def write_card(name: str, trained: dict[str, Any], starts_from: str, files: list
         files: results of its evaluations.
         note: what else is to be known of the training.
     """
-    places = ", ".join(f"`{one}`" for one in trained["scenarios"])
+    places = ", ".join(f"`{scenario}`" for scenario in trained["scenarios"])
     teams = ", ".join(map(str, trained["num_robots"]))
     lines = [
         f"# {name}",
@@ -88,10 +88,10 @@ def describe_results(file: Path) -> list[str]:
             f"`{run['scenario']}`, {describe_maps(run)}, {run['episodes']} episodes, {teams}mean and 95 % interval:",
             "",
         ]
-        cells = [[name, *(_cell(values.get(one)) for one in SHOWN)] for name, values in rows.items()]
+        cells = [[name, *(_cell(values.get(metric)) for metric in SHOWN)] for name, values in rows.items()]
         return [
             *lines,
-            *markdown_table(["policy", *(MEASURES[one].column for one in SHOWN)], cells),
+            *markdown_table(["policy", *(MEASURES[metric].column for metric in SHOWN)], cells),
             "",
             *_differences(content),
         ]
@@ -112,7 +112,7 @@ def _differences(content: dict[str, Any]) -> list[str]:
     sentences = []
     for size, best in content["run"].get("best_classical", {}).items():
         for name, rivals in content.get("difference", {}).items():
-            label = next((one for one in (f"{best} N={size}", best) if one in rivals), None)
+            label = next((name for name in (f"{best} N={size}", best) if name in rivals), None)
             if label is not None:
                 apart = MEASURES[NEXT].describe_difference(rivals[label][NEXT], digits=2)
                 sentences += [

@@ -67,11 +67,11 @@ class OraclePlanner(FrontierPlanner):
 
     def __init__(self, env: ExplorationEnv):
         super().__init__(env, rank_by_utility)
-        grids = [open_cells(build_nav_grid(one)) for one in env.maps]
+        grids = [open_cells(build_nav_grid(world)) for world in env.maps]
         shape = (len(grids), self.tracker.nav.known.shape[-1])
         self.open = torch.zeros(shape, dtype=torch.bool, device=env.device)
-        for row, one in zip(self.open, grids, strict=True):
-            row[: len(one)] = torch.from_numpy(one).to(env.device)
+        for row, grid in zip(self.open, grids, strict=True):
+            row[: len(grid)] = torch.from_numpy(grid).to(env.device)
 
     def look(self) -> TensorScene:
         scene, nav = super().look(), self.tracker.nav

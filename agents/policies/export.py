@@ -58,7 +58,7 @@ def export_policy(
 
     weights = save({key: value.contiguous() for key, value in chooser.state_dict().items()})
     files = {NETWORK: to_onnx(chooser, env.num_robots), WEIGHTS: weights}
-    sums = {key: hashlib.sha256(one).hexdigest() for key, one in files.items()}
+    sums = {key: hashlib.sha256(content).hexdigest() for key, content in files.items()}
     for file, content in files.items():
         write_file(folder / file, lambda out, content=content: out.write(content))
     write_text(folder / CARD, card)
@@ -80,7 +80,7 @@ def find_chooser(policy: torch.nn.Module) -> TargetChooser:
 
 def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: dict[str, Any]) -> dict[str, Any]:
     """What goes in and out, in which units, and what the policy was trained for."""
-    places = {one: numbers_of(find_scenario(one)) for one in trained.get("scenarios", [])}
+    places = {scenario: numbers_of(find_scenario(scenario)) for scenario in trained.get("scenarios", [])}
     own = numbers_of_env(env)
     if env.scenario.name in places:
         places[env.scenario.name] = own
@@ -106,7 +106,7 @@ def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: di
         "trained": trained | {"scenarios": places},
         "team_sizes": {"trained": trained.get("num_robots", [env.num_robots]), "most": MOST["robots"]},
         "opset": OPSET,
-        "versions": {one: metadata.version(one) for one in PACKAGES},
+        "versions": {package: metadata.version(package) for package in PACKAGES},
         "commit": find_commit(),
     }
 
@@ -115,7 +115,7 @@ def numbers_of_env(env: ExplorationEnv) -> dict[str, float]:
     """What robots are like in an env, in m and s: those that a policy looks at, and the resolution."""
     robots = env.simulation.robot_tensors
     return {
-        "radar_range": max(one.range for one in env.radar_configs),
+        "radar_range": max(radar.range for radar in env.radar_configs),
         "robot_radius": float(robots["collision_threshold"].max()),
         "max_speed": float(robots["max_speed"].max()),
         "max_accel": float(robots["max_accel"].max()),
@@ -201,7 +201,7 @@ def without_traces(network: bytes) -> bytes:
         *graph.input,
         *graph.output,
         *graph.initializer,
-        *(node for one in model.functions for node in one.node),
+        *(node for function in model.functions for node in function.node),
     ):
         part.ClearField("metadata_props")
         part.ClearField("doc_string")

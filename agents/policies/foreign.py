@@ -69,9 +69,9 @@ class TeamSight:
         self.rows, grids = self.known_grids.rows_per_env, self.known_grids.grids
         finish_filling(env.device)
         self.launch = launch_on(env.device)
-        width, height, cell, origin = (getattr(grids, one).numpy() for one in ("width", "height", "cell", "origin"))
+        width, height, cell, origin = (getattr(grids, name).numpy() for name in ("width", "height", "cell", "origin"))
         self.shapes = list(zip(height.tolist(), width.tolist(), strict=True))
-        self.cells, self.origins = cell.tolist(), [tuple(one) for one in origin.tolist()]
+        self.cells, self.origins = cell.tolist(), [tuple(corner) for corner in origin.tolist()]
         shape = (env.num_envs, env.num_robots, env.num_robots)
         self.poses, self.velocities = np.full((*shape, 3), np.nan), np.full((*shape, 2), np.nan)
 
@@ -126,14 +126,14 @@ class TeamSight:
         ]
         return {
             "num_robots": env.num_robots,
-            "radar_range": float(max(one.range for one in env.radar_configs)),
+            "radar_range": float(max(radar.range for radar in env.radar_configs)),
             "robot_radius": _largest(robots["collision_threshold"][team]),
             "max_speed": _largest(robots["max_speed"][team]),
             "max_accel": _largest(robots["max_accel"][team]),
             "drive": env.robot_configs[0].kind,
             "seconds": round(env.macro_steps * env.local_steps * DT, 6),
             "decision_seconds": round(env.local_steps * DT, 6),
-            "seed": int(np.random.SeedSequence([one % 2**32 for one in keys]).generate_state(1)[0]) >> 1,
+            "seed": int(np.random.SeedSequence([key % 2**32 for key in keys]).generate_state(1)[0]) >> 1,
         }
 
     def to_action(self, goals: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:

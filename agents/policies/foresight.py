@@ -120,7 +120,7 @@ class Foresight:
         self.team = GridTeam(
             room_for(world.known.shape),
             world.cell,
-            [self._robot(float(one), motion) for one in radius],
+            [self._robot(float(body_radius), motion) for body_radius in radius],
             reach,
             self.config.local_steps or imagined_steps(reach, motion),
             self.clearance_factor,

@@ -50,7 +50,9 @@ def main(word: str) -> int:
 
 def find(word: str) -> Callable[[], Any] | None:
     """What makes the policy; None: the word names something that is no class with `act`."""
-    plug_in = next((one for one in metadata.entry_points(group=GROUP) if one.name == word), None)
+    plug_in = next(
+        (entry_point for entry_point in metadata.entry_points(group=GROUP) if entry_point.name == word), None
+    )
     reference = word if plug_in is None else plug_in.value.partition("[")[0].replace(" ", "")
     if ":" not in reference or os.path.exists(reference):
         from maexp.agents.runtime.agent import TeamAgent
@@ -60,7 +62,7 @@ def find(word: str) -> Callable[[], Any] | None:
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     found = reduce(getattr, names.split("."), importlib.import_module(module))
-    if isinstance(found, type) and not any({"act", "__call__"} & set(vars(one)) for one in found.__mro__):
+    if isinstance(found, type) and not any({"act", "__call__"} & set(vars(base)) for base in found.__mro__):
         raise TypeError(f"{names} is a class without act(observation)")
     return found if callable(found) and hasattr(found, "act") else None
 
@@ -81,7 +83,7 @@ def to_array(goals: Any) -> np.ndarray:
 def describe(error: BaseException) -> str:
     """ValueError in planner.py, line 12: what it says."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [one for one in frames if one.filename != __file__]
+    own = [frame for frame in frames if frame.filename != __file__]
     place = f" in {os.path.basename(own[-1].filename)}, line {own[-1].lineno}" if own else ""
     text = " ".join(str(error).split()).rstrip(".")[:300]
     return f"{type(error).__name__}{place}{f': {text}' if text else ''}"

@@ -92,7 +92,7 @@ class HostedPolicy:
                 self._lose(team, Lost(f"it {error}"))
         region, offset = self.sight.to_action(goals)
         state["agents", "action", "region"], state["agents", "action", "offset"] = region, offset
-        state["lost"] = torch.tensor([bool(one) for one in self.reasons], device=self.env.device).unsqueeze(-1)
+        state["lost"] = torch.tensor([bool(reason) for reason in self.reasons], device=self.env.device).unsqueeze(-1)
         state["decision_seconds"] = torch.from_numpy(seconds).to(self.env.device).unsqueeze(-1)
         return state
 
@@ -113,8 +113,8 @@ class HostedPolicy:
         self, questions: dict[int, dict], wanted: str, limit: float | None = None, patience: float | None = None
     ) -> dict[int, dict]:
         """Answers of the wanted type by team; the teams of all others are lost."""
-        asked = {team: one for team, one in questions.items() if self.guests[team] is not None}
-        pairs = [(self.guests[team], one) for team, one in asked.items()]
+        asked = {team: question for team, question in questions.items() if self.guests[team] is not None}
+        pairs = [(self.guests[team], question) for team, question in asked.items()]
         answers = ask_all(pairs, limit or self.limit, patience or self.patience)
         good = {}
         for team, answer in zip(asked, answers, strict=True):

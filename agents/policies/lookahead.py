@@ -63,7 +63,7 @@ class LookaheadPlanner(FrontierPlanner):
         teams = (self.env.simulation.tensors["active"] != 0).nonzero().squeeze(-1)
         distinct = self.env.targets_config.distinct
         for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
-            theirs = {name: one[some] for name, one in offers.items()}
+            theirs = {name: offer[some] for name, offer in offers.items()}
             chosen[some] = search_in_turn(self.rollouts, some, theirs, distinct)
         if not bool(chosen.any()):
             return own, waits
@@ -85,7 +85,7 @@ class LookaheadPlanner(FrontierPlanner):
         there = (index >= 0) & scene.alive.unsqueeze(-1)
         place = index.clamp_min(0)
         cell, block = scene.cells().gather(2, place), scene.block.gather(2, place)
-        toward, point = (pick_places(one, place) for one in (scene.middle, scene.points))
+        toward, point = (pick_places(points, place) for points in (scene.middle, scene.points))
         block = torch.where(index >= 0, block, -1)
         value = (preference if self.trained else value_in_turn(scene)).gather(2, place)
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)

@@ -12,7 +12,7 @@ from maexp.agents.settings.verbs.evaluate import NAMES
 
 def plug_ins() -> dict[str, metadata.EntryPoint]:
     """The policies that installed packages offer, by their names."""
-    return {one.name: one for one in metadata.entry_points(group=GROUP)}
+    return {entry_point.name: entry_point for entry_point in metadata.entry_points(group=GROUP)}
 
 
 def check_name(word: str, setting: str) -> None:

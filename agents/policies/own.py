@@ -53,8 +53,8 @@ def find_own(word: str, setting: str = "policy") -> Callable[..., Any]:
     try:
         found = reduce(getattr, names.split("."), place)
     except AttributeError as error:
-        own = {name: one for name, one in vars(place).items() if getattr(one, "__module__", "") == module}
-        there = [name for name, one in own.items() if callable(one)]
+        own = {name: thing for name, thing in vars(place).items() if getattr(thing, "__module__", "") == module}
+        there = [name for name, thing in own.items() if callable(thing)]
         listed = f"it has {', '.join(there[:6])}" if there else "it holds no function"
         raise UserError(f"{given}: {module} has no {names}: {listed}.") from error
     if not callable(found):
@@ -170,7 +170,7 @@ class OwnPolicy:
     def _find_wrong(self, action: dict[str, torch.Tensor]) -> str:
         """What is wrong with an action, to complete "policy NAME ..."; "" for nothing."""
         whole = {"region": REGIONS**2, "target": self.targets}
-        alone = "control" if self.direct else next((one for one in ("target", "goal") if one in action), None)
+        alone = "control" if self.direct else next((key for key in ("target", "goal") if key in action), None)
         heads = (alone,) if alone else ("region", "offset")
         for head in heads:
             value = action.get(head)

@@ -47,7 +47,7 @@ class Lost(Exception):
 
     def __str__(self) -> str:
         words = " ".join(super().__str__().split())[:MOST_REASON]
-        return "".join(one if one.isprintable() else "?" for one in words)
+        return "".join(character if character.isprintable() else "?" for character in words)
 
 
 class Session(subprocess.Popen):
@@ -89,7 +89,7 @@ class Guest:
     @property
     def files(self) -> list[BinaryIO]:
         """All that are open between us."""
-        return [one for one in (self.asked, self.answers, self.spoken) if one is not None]
+        return [file for file in (self.asked, self.answers, self.spoken) if file is not None]
 
     def begin(self, message: dict[str, Any]) -> None:
         """Put a question."""
@@ -254,7 +254,7 @@ def ask_all(
             selector.register(guest.answers, selectors.EVENT_READ, (k, "receive"))
             if guest.spoken is not None:
                 selector.register(guest.spoken, selectors.EVENT_READ, (k, "listen"))
-        while any(one is None for one in answers):
+        while any(answer is None for answer in answers):
             events = selector.select(POLL)
             for key, _ in events:
                 _serve(selector, key, questions[key.data[0]][0], answers, settle)

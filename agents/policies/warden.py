@@ -40,10 +40,10 @@ def watch(run: int) -> str:
 def end_marked(mark: str) -> bool:
     """End all processes whose mark begins so; whether there were any."""
     for number in range(ROUNDS):  # some may start others meanwhile
-        left = [one for one in Path("/proc").glob("[0-9]*") if _has_mark(one, f"{MARK}={mark}".encode())]
-        for one in left:
+        left = [path for path in Path("/proc").glob("[0-9]*") if _has_mark(path, f"{MARK}={mark}".encode())]
+        for path in left:
             with suppress(ProcessLookupError, PermissionError):
-                os.kill(int(one.name), signal.SIGKILL)
+                os.kill(int(path.name), signal.SIGKILL)
         if not left:
             return number > 0
     return True
@@ -51,7 +51,7 @@ def end_marked(mark: str) -> bool:
 
 def _has_mark(process: Path, mark: bytes) -> bool:
     try:
-        return any(one.startswith(mark) for one in (process / "environ").read_bytes().split(b"\0"))
+        return any(variable.startswith(mark) for variable in (process / "environ").read_bytes().split(b"\0"))
     except OSError:  # it has ended, or is somebody else's
         return False
 

@@ -63,9 +63,9 @@ def unpack(body: bytes) -> dict[str, Any]:
 def _is_plain(value: Any, depth: int = DEPTH) -> bool:
     """Whether a value can be printed and made an array: of lists of words NumPy makes gigabytes."""
     if isinstance(value, dict):
-        return depth > 0 and all(_is_plain(one, depth - 1) for one in value.values())
+        return depth > 0 and all(_is_plain(item, depth - 1) for item in value.values())
     if isinstance(value, list):
-        return depth > 0 and all(not isinstance(one, str | bytes) and _is_plain(one, depth - 1) for one in value)
+        return depth > 0 and all(not isinstance(item, str | bytes) and _is_plain(item, depth - 1) for item in value)
     return True
 
 
@@ -99,6 +99,6 @@ def _unpack_array(value: dict) -> Any:
         return value
     kind, shape, data = value["dtype"], value["shape"], value["data"]
     known = isinstance(kind, str) and kind in KINDS and isinstance(data, bytes)
-    if not known or not isinstance(shape, list) or not all(type(one) is int and 0 <= one < 2**31 for one in shape):
+    if not known or not isinstance(shape, list) or not all(type(size) is int and 0 <= size < 2**31 for size in shape):
         raise ValueError(f"an array of {kind!r} and shape {str(shape)[:60]}")
     return np.frombuffer(data, np.dtype(kind).newbyteorder("<")).reshape(shape).astype(kind)

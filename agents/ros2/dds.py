@@ -265,7 +265,7 @@ class Client:
 
     def take(self) -> Iterator[Any]:
         """The answers to this client that have come since; `seq` is the number of the question."""
-        return (one for one in self.answers.take() if one.guid == self.guid)
+        return (answer for answer in self.answers.take() if answer.guid == self.guid)
 
     @property
     def matched(self) -> bool:

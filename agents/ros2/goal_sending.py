@@ -63,7 +63,7 @@ class NavigationServer:
     def __init__(self, wire: Wire, robot: str):
         place = _place(robot)
         self.sent, self.cancelled, self.asked = (
-            wire.server(f"{place}/{one}") for one in ("send_goal", "cancel_goal", "get_result")
+            wire.server(f"{place}/{value}") for value in ("send_goal", "cancel_goal", "get_result")
         )
         self.feedback, self.status = wire.writer(f"{place}/feedback"), wire.writer(f"{place}/status")
         self.goals: dict[bytes, Goal] = {}
@@ -182,7 +182,7 @@ class NavigationClient:
 
     def __init__(self, wire: Wire, robot: str):
         place = _place(robot)
-        self.sends, self.cancels = (wire.client(f"{place}/{one}") for one in ("send_goal", "cancel_goal"))
+        self.sends, self.cancels = (wire.client(f"{place}/{value}") for value in ("send_goal", "cancel_goal"))
         self.status = wire.reader(f"{place}/status")
         self.uuid, self.number = b"", 0  # of the last goal, until it has ended
 
@@ -206,10 +206,10 @@ class NavigationClient:
     def ended(self) -> bool:
         """Whether the last goal was refused or has ended since; told once."""
         list(self.cancels.take())
-        over = any(one.seq == self.number and not one.accepted for one in self.sends.take())
+        over = any(send.seq == self.number and not send.accepted for send in self.sends.take())
         for message in self.status.take():
-            for one in message.status_list:
-                over |= one.goal_info.goal_id.uuid == self.uuid and one.status >= SUCCEEDED
+            for value in message.status_list:
+                over |= value.goal_info.goal_id.uuid == self.uuid and value.status >= SUCCEEDED
         if over:
             self.uuid, over = b"", bool(self.uuid)
         return over

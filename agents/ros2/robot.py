@@ -35,7 +35,7 @@ class Ros2Robot(Ros2Team):
         places = {name: f"/{name}/maexp" for name in (driver.name, *driver.mates)}
         self.words = {name: wire.reader(f"{places[name]}/word") for name in driver.mates}
         self.grids = {name: wire.reader(f"{places[name]}/map") for name in driver.mates}
-        self.says, self.shows = (wire.writer(f"{places[driver.name]}/{one}") for one in ("word", "map"))
+        self.says, self.shows = (wire.writer(f"{places[driver.name]}/{topic}") for topic in ("word", "map"))
         self.told: float | None = None  # time of the last word [s]
         self.since = 0.0  # when it was told [s by the wall]
         self.near = set(driver.mates)  # who is waited for
@@ -65,7 +65,7 @@ class Ros2Robot(Ros2Team):
 
     def _note(self, sentence: str) -> None:
         """Told once; what others wrote does nothing to a terminal."""
-        sentence = "".join(one if one.isprintable() else "?" for one in sentence[:300])
+        sentence = "".join(character if character.isprintable() else "?" for character in sentence[:300])
         if sentence not in self.noted:
             self.noted.add(sentence)
             self.tell(sentence)

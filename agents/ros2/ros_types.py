@@ -97,8 +97,8 @@ def _make_classes() -> dict[str, type]:
     for message, text in TABLE.items():
         hints, defaults = {}, {}
         before = HEADER if message.endswith(("_Request", "_Response")) else ""
-        for one in f"{before}{text}".split(", "):
-            kind, name = one.split()
+        for part in f"{before}{text}".split(", "):
+            kind, name = part.split()
             hints[name], defaults[name] = _read_field(found, kind, ONE.get((message, name)))
         words = {"typename": wire_name(message).replace("::", ".")}
         made = new_class(

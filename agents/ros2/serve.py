@@ -132,10 +132,10 @@ class Robot:
 
     def __init__(self, name: str, wire: Wire, own_tf: bool):
         self.name, place = name, f"/{name}"
-        self.map, self.odom, self.scan = (wire.writer(f"{place}/{one}") for one in ("map", "odom", "scan"))
+        self.map, self.odom, self.scan = (wire.writer(f"{place}/{topic}") for topic in ("map", "odom", "scan"))
         self.goals, self.action = wire.reader(f"{place}/goal_pose"), NavigationServer(wire, name)
         before = "" if own_tf else f"{name}/"
-        self.frames = {one: before + one for one in ("map", "odom", "base_link", "base_scan")}
+        self.frames = {frame: before + frame for frame in ("map", "odom", "base_link", "base_scan")}
         root = [] if own_tf else [("map", self.frames["map"])]
         self.still = [
             *root,
@@ -229,7 +229,7 @@ class Ros2Policy:
             raise UserError("A suite with limited radios cannot be served: tf tells where every robot is.")
         self.env, self.wire, self.clock, self.serving = env, wire, clock, serving
         self.sight, self.reasons, self.said = TeamSight(env), [""], set()
-        self.floors = [make_floor(one) for one in env.maps]
+        self.floors = [make_floor(world) for world in env.maps]
         self.robots = [Robot(name, wire, serving.own_tf) for name in serving.names(env.num_robots)]
         places = [f"/{robot.name}" for robot in self.robots] if serving.own_tf else [""]
         self.tf = [wire.writer(f"{place}/tf") for place in places]
@@ -337,7 +337,7 @@ class Ros2Policy:
         """Told once, and no more after `MOST_TOLD`; what others wrote does nothing to a terminal."""
         if sentence not in self.said and len(self.said) < MOST_TOLD:
             self.said.add(sentence)
-            self.serving.tell("".join(one if one.isprintable() else "?" for one in sentence[:300]))
+            self.serving.tell("".join(character if character.isprintable() else "?" for character in sentence[:300]))
 
     def _now(self) -> int:
         """What the clock shows now [ns]."""
@@ -381,7 +381,7 @@ class Ros2Policy:
         return places
 
     def _publish_scan(self, robot: Robot, now: int, pose: Pose, number: int) -> None:
-        message, reach = robot.scan.make(), float(max(one.range for one in self.env.radar_configs))
+        message, reach = robot.scan.make(), float(max(radar.range for radar in self.env.radar_configs))
         fill_scan(message, robot.frames["base_scan"], now, look(self.floors[number], pose, reach), reach)
         robot.scan.write(message)
 

@@ -93,7 +93,7 @@ class Ros2Team:
         """
         self.wire.wait(POLL)
         maps = self._take_maps()  # first: what belongs to them has come before
-        told = [one for message in self.episode.take() if (one := self._read_episode(message.data)) is not None]
+        told = [episode for message in self.episode.take() if (episode := self._read_episode(message.data)) is not None]
         if told and told[-1].get("over"):
             return True
         if told:
@@ -143,7 +143,7 @@ class Ros2Team:
             found = json.loads(text)
             if found.get("over"):
                 return found
-            named = isinstance(found["robots"], list) and all(isinstance(one, str) for one in found["robots"])
+            named = isinstance(found["robots"], list) and all(isinstance(name, str) for name in found["robots"])
             if named and all(type(found[name]) in (int, float) and math.isfinite(found[name]) for name in NUMBERS):
                 return found
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):

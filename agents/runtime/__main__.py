@@ -66,7 +66,7 @@ def measure(given: MeasureSettings) -> None:
     poses = [(1.5 + 1.2 * (k % 5), 1.5 + 1.2 * (k // 5), 0.0) for k in range(given.robots)]
     print(f"{given.robots} robots, {grid.shape[1]} x {grid.shape[0]} cells of {given.resolution:g} m")
     trained = shipped_names() if importlib.util.find_spec("onnxruntime") else []
-    search = [LOOKAHEAD] if all(importlib.util.find_spec(one) for one in ("torch", "warp")) else []
+    search = [LOOKAHEAD] if all(importlib.util.find_spec(module) for module in ("torch", "warp")) else []
     for name in (*CHOICES, *trained, *search):
         planner, spent = TeamPlanner(name, radar_range=5.0, robot_radius=0.3), []
         for now in range(given.calls):
@@ -121,7 +121,7 @@ def run(given: SimulateSettings, grid: np.ndarray, cell: float, policy: str, see
     course = explore(floor, planner, given.seconds)
     print(describe(policy if distinct else f"{policy}, shared", seed, course), flush=True)
     if given.notes:
-        print("".join(f"    {one}\n" for one in course.notes), end="")
+        print("".join(f"    {note}\n" for note in course.notes), end="")
     if given.picture:
         draw(given.picture, floor, course, policy)
     return course
@@ -143,19 +143,22 @@ def describe(policy: str, seed: int, course: Course) -> str:
 def compare(policy: str, apart: list[Course], shared: list[Course], limit: float) -> str:
     """A table of means: robots that take distinct targets, robots that may share one, and the paired difference with
     its 95 % interval over runs. A share that was never seen counts with the time limit [s]."""
-    rows = {f"{100 * mark:g} % [s]": lambda one, k=k: min(one.reached[k], limit) for k, mark in enumerate(MARKS)}
-    rows |= {"done [s]": lambda one: one.seconds if one.done else limit, "driven [m]": lambda one: one.driven}
-    rows |= {"needless duplicates": lambda one: one.needless, "close goals": lambda one: one.close}
-    rows |= {"waits": lambda one: one.waits, "runs that were done": lambda one: 100.0 * one.done}
+    rows = {f"{100 * mark:g} % [s]": lambda course, k=k: min(course.reached[k], limit) for k, mark in enumerate(MARKS)}
+    rows |= {
+        "done [s]": lambda course: course.seconds if course.done else limit,
+        "driven [m]": lambda course: course.driven,
+    }
+    rows |= {"needless duplicates": lambda course: course.needless, "close goals": lambda course: course.close}
+    rows |= {"waits": lambda course: course.waits, "runs that were done": lambda course: 100.0 * course.done}
     head = f"{'':<20}{'distinct':>10}{'shared':>10}   distinct - shared [95 %]"
     lines = [f"{policy}, {len(apart)} runs: means", head]
     for name, tell in rows.items():
-        one, other = (np.array([tell(course) for course in courses], float) for courses in (apart, shared))
-        drawn = np.random.default_rng(0).integers(len(one), size=(2000, len(one)))
-        low, high = np.percentile((one - other)[drawn].mean(1), [2.5, 97.5])
+        distinct, alike = (np.array([tell(course) for course in courses], float) for courses in (apart, shared))
+        drawn = np.random.default_rng(0).integers(len(distinct), size=(2000, len(distinct)))
+        low, high = np.percentile((distinct - alike)[drawn].mean(1), [2.5, 97.5])
         unit = " %" * (name == "runs that were done")
-        difference = f"{(one - other).mean():+.1f} [{low:+.1f}, {high:+.1f}]" if len(one) > 4 else ""
-        lines.append(f"{name:<20}{f'{one.mean():.1f}{unit}':>10}{f'{other.mean():.1f}{unit}':>10}   {difference}")
+        difference = f"{(distinct - alike).mean():+.1f} [{low:+.1f}, {high:+.1f}]" if len(distinct) > 4 else ""
+        lines.append(f"{name:<20}{f'{distinct.mean():.1f}{unit}':>10}{f'{alike.mean():.1f}{unit}':>10}   {difference}")
     return "\n".join(lines)
 
 
@@ -192,8 +195,8 @@ def read_words(words: list[str]) -> MeasureSettings | SimulateSettings:
     add_settings(parser, kind)
     given = vars(parser.parse_args(words[simulates:]))
     try:
-        for one in fields(kind):
-            check_value(f"--{one.name}", given[one.name], kinds(kind)[one.name], one.metadata)
+        for field in fields(kind):
+            check_value(f"--{field.name}", given[field.name], kinds(kind)[field.name], field.metadata)
     except ValueError as error:
         parser.error(str(error))
     picture = Path(given.get("picture") or "x.png")
@@ -204,16 +207,16 @@ def read_words(words: list[str]) -> MeasureSettings | SimulateSettings:
 
 def add_settings(parser: argparse.ArgumentParser, kind: type) -> None:
     """An argument for each setting of a dataclass: a list stands by itself, the others are named."""
-    for one in fields(kind):
-        of, default = kinds(kind)[one.name][0], None if one.default is MISSING else one.default
-        told = explain(one.metadata) + (f"; default: {default}" if default else "")
+    for field in fields(kind):
+        of, default = kinds(kind)[field.name][0], None if field.default is MISSING else field.default
+        told = explain(field.metadata) + (f"; default: {default}" if default else "")
         if get_origin(of) is list:
-            parser.add_argument(one.name, nargs="*", help=told)
+            parser.add_argument(field.name, nargs="*", help=told)
         elif of is bool:
-            parser.add_argument(f"--{one.name}", action="store_true", help=told)
+            parser.add_argument(f"--{field.name}", action="store_true", help=told)
         else:
             reads = {"type": float, "nargs": 2} if get_origin(of) is tuple else {"type": of}
-            parser.add_argument(f"--{one.name}", default=default, help=told, **reads)
+            parser.add_argument(f"--{field.name}", default=default, help=told, **reads)
 
 
 def main() -> None:

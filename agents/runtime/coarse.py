@@ -49,7 +49,7 @@ def _join(grid: KnownGrid, side: int, parts: np.ndarray) -> tuple[KnownGrid, np.
         return padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side)
 
     solid = (blocks(grid.known == OBSTACLE)).any((1, 3))
-    known, inside = (blocks(one)[:, side // 2, :, side // 2] for one in (grid.known, parts))
+    known, inside = (blocks(layer)[:, side // 2, :, side // 2] for layer in (grid.known, parts))
     x, y = grid.to_map(-low * grid.cell)
     known = np.where(solid, np.uint8(OBSTACLE), known)
     return KnownGrid(known, grid.cell * side, (float(x), float(y)), grid.yaw), inside

@@ -121,7 +121,7 @@ class ContactBook:
         self.crew |= set(team.names)
         self.used, self.now, self.seen, notes = used, now, set(links), []
         places = {name: tuple(at) for name, at in zip(team.names, team.at.tolist(), strict=True) if at[0] == at[0]}
-        places = {name: one.at for name, one in self.memories.items()} | places
+        places = {name: memory.at for name, memory in self.memories.items()} | places
         if self.base is not None:
             places[BASE] = tuple(self.base.tolist())
         for robot, name in enumerate(team.names):
@@ -200,7 +200,7 @@ class ContactBook:
     def on_duty(self, team: Team, robots: np.ndarray) -> np.ndarray:
         """Who of these robots, int [n], is on its way to tell, bool [n]."""
         memories = [self.memories.get(team.names[robot]) for robot in robots]
-        return np.array([one is not None and one.tells for one in memories], bool)
+        return np.array([memory is not None and memory.tells for memory in memories], bool)
 
     def add_to(self, moment: Moment, scene: ArrayScene, names: list[Hashable], can: np.ndarray) -> Moment:
         """The moment with one candidate more, [n, M + 1], to go and tell the base station, and with `Contacts`.
@@ -236,11 +236,11 @@ class ContactBook:
             return np.reshape(np.array(values, np.float64), (len(names), 1))
 
         pairs = list(zip(memories, others, strict=True))
-        since = [[one.since(mate, self.used, decision) for mate in mates] for one, mates in pairs]
+        since = [[memory.since(mate, self.used, decision) for mate in mates] for memory, mates in pairs]
         tells = np.zeros_like(moment.mask)
         tells[:, -1] = moment.mask[:, -1]
         shared = {
-            "mates_untold": each([max([0.0, *map(one.untold, mates)]) for one, mates in pairs]) / disc,
+            "mates_untold": each([max([0.0, *map(memory.untold, mates)]) for memory, mates in pairs]) / disc,
             "mates_since": each([sum(row) / max(len(row), 1) for row in since]),
             "mates_far": np.stack(
                 [self._far_from_mates(scene, at, *pair) for at, pair in zip(point, pairs, strict=True)]
@@ -250,14 +250,14 @@ class ContactBook:
             none = dict.fromkeys(("untold", "since", "linked", "way", "spare"), each([0.0] * len(names)))
             blank = np.zeros_like(moment.travel)
             return Contacts(tells=tells, **none, far=blank, signal=blank, **shared)
-        way = each([self._way_back(one) for one in memories])
+        way = each([self._way_back(memory) for memory in memories])
         gap = np.linalg.norm(point - scene.grid.from_map(self.base), axis=-1)
         drive = self.motion.max_speed * PACE * self.time_limit
         return Contacts(
             tells=tells,
-            untold=each([one.untold(BASE) for one in memories]) / disc,
-            since=each([one.since(BASE, self.used, decision) for one in memories]),
-            linked=each([one.linked for one in memories]),
+            untold=each([memory.untold(BASE) for memory in memories]) / disc,
+            since=each([memory.since(BASE, self.used, decision) for memory in memories]),
+            linked=each([memory.linked for memory in memories]),
             way=way / scene.radar_range,
             spare=1.0 - self.used - way / drive,
             far=gap / scene.radar_range,
@@ -369,7 +369,7 @@ def read_comm(given: CommConfig | Mapping[str, Any] | None) -> CommConfig | None
     if given is None:
         return None
     if isinstance(given, Mapping):
-        names = [one.name for one in fields(CommConfig)]
+        names = [setting.name for setting in fields(CommConfig)]
         if wrong := [str(name) for name in given if name not in names]:
             raise ValueError(f"comm names {wrong[0]!r}: choose among {', '.join(USED)}")
         given = CommConfig(**given)

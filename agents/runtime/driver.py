@@ -311,7 +311,7 @@ class TeamDriver:
 
 def read_settings(values: dict[str, Any]) -> DriverSettings:
     """Of parameters by their names. ROS has none without a value: 0.0, "" and [0.0] stand for what is not given."""
-    known, found = {one.name: one.default for one in fields(DriverSettings)}, {}
+    known, found = {field.name: field.default for field in fields(DriverSettings)}, {}
     for name, value in values.items():
         if isinstance(known[name], tuple):
             found[name] = () if list(value) == [0.0] else tuple(value)

@@ -76,11 +76,11 @@ class LearnedChoice:
         except Exception as error:  # onnxruntime raises classes of its own
             reason = " ".join(str(error).split())[:200]
             raise ValueError(f"{folder / NETWORK} is not a network that onnxruntime runs ({reason})") from None
-        taken = {one.name: one.shape for one in self.session.get_inputs()}
+        taken = {tensor.name: tensor.shape for tensor in self.session.get_inputs()}
         width = len(feature_names(self.contract.radio))
         if tuple(taken) != INPUTS or taken["features"][3:] != [width]:
             raise ValueError(f"{folder / NETWORK} takes {taken}, not {width} features a candidate: {AGAIN}")
-        if "logits" not in (given := [one.name for one in self.session.get_outputs()]):
+        if "logits" not in (given := [tensor.name for tensor in self.session.get_outputs()]):
             raise ValueError(f"{folder / NETWORK} gives {', '.join(given)}, and no logits: {AGAIN}")
 
     def logits(self, candidates: Candidates) -> np.ndarray:
@@ -127,7 +127,7 @@ def read_contract(folder: Path) -> Contract:
         raise ValueError(f"{folder} was made for other features than this version of maexp has: {AGAIN}")
     numbers = [content.get(name) for name in NUMBERS]
     count = content.get("candidates")
-    right = all(type(one) in (int, float) and 0 < one < 1e6 for one in numbers)
+    right = all(type(number) in (int, float) and 0 < number < 1e6 for number in numbers)
     if not right or type(count) is not int or not 0 < count <= 1024:
         raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {AGAIN}")
     read_checked(folder, content, NETWORK)

@@ -97,11 +97,11 @@ class Frames:
 
     def take(self, message, still: bool = False) -> None:
         """A tf2_msgs/TFMessage; `still`: it is of /tf_static, whose frames stay where they are."""
-        for one in message.transforms:
-            move = one.transform
+        for transform in message.transforms:
+            move = transform.transform
             pose = (move.translation.x, move.translation.y, read_yaw(move.rotation))
-            time = math.inf if still else read_time(one.header.stamp)
-            self.put(one.child_frame_id, one.header.frame_id, pose, time)
+            time = math.inf if still else read_time(transform.header.stamp)
+            self.put(transform.child_frame_id, transform.header.frame_id, pose, time)
 
     def put(self, frame: str, parent: str, pose: Pose, time: float) -> None:
         """Where a frame stands since `time` [s]; names may begin with a slash, as in ROS 1."""

@@ -79,7 +79,7 @@ def list_targets(frontier: np.ndarray, reached: np.ndarray, side: int, search: i
     key, which = np.unique(key, return_inverse=True)
     block = np.stack([key % STRIDE, key // STRIDE], axis=1) + lower
     size = np.bincount(which, minlength=len(block))
-    total = np.stack([np.bincount(which, one, len(block)) for one in (x, y)], axis=1).astype(np.int64)
+    total = np.stack([np.bincount(which, coordinates, len(block)) for coordinates in (x, y)], axis=1).astype(np.int64)
     cell = _nearest_reached(reached, block * side - shift, size, total, side, search)
     found = cell >= 0
     return Targets(block[found], cell[found], size[found], side, shift)

@@ -109,8 +109,8 @@ def _check_values(grid) -> np.ndarray:
 
 
 def _check_origin(origin) -> tuple[float, float, float]:
-    numbers = [_number(one) for one in _listed(origin)]
-    known = [one for one in numbers if one is not None]
+    numbers = [_number(coordinate) for coordinate in _listed(origin)]
+    known = [number for number in numbers if number is not None]
     if len(known) != len(numbers) or len(known) not in (2, 3) or max(map(abs, known)) > 1e8:
         raise ValueError(f"origin={origin!r} must be x, y [m] and at most a yaw [rad] of the lower left corner")
     x, y, yaw = [*known, 0.0][:3]

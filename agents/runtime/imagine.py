@@ -24,7 +24,7 @@ def read_lookahead(given: LookaheadConfig | Mapping[str, Any] | None) -> Lookahe
     if given is None or isinstance(given, LookaheadConfig):
         config = given or LookaheadConfig()
     elif isinstance(given, Mapping):
-        names = [one.name for one in fields(LookaheadConfig)]
+        names = [field.name for field in fields(LookaheadConfig)]
         if wrong := [str(name) for name in given if name not in names]:
             raise ValueError(f"lookahead names {wrong[0]!r}: choose among {', '.join(names)}")
         config = LookaheadConfig(**given)

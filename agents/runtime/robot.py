@@ -129,8 +129,10 @@ class RobotPlanner:
             own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             own = merge_grids([own, *self.grids.values()])
             grid, resolution, origin = own.values, own.resolution, own.origin
-        self.heard = {name: one for name, one in self.heard.items() if one.time - now <= self.memory}  # none from later
-        words = {name: one for name, one in self.heard.items() if now - one.time <= self.memory and name != BASE}
+        self.heard = {
+            name: word for name, word in self.heard.items() if word.time - now <= self.memory
+        }  # none from later
+        words = {name: word for name, word in self.heard.items() if now - word.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
@@ -147,19 +149,19 @@ class RobotPlanner:
         """What mates have told of radios takes the place of what was guessed of them."""
         if self.team.book is not None:
             self.team.book.crew |= {self.name, *self.mates, *self.heard} - {BASE}
-            told = {name: one.memory for name, one in self.heard.items() if one.memory is not None}
+            told = {name: word.memory for name, word in self.heard.items() if word.memory is not None}
             self.team.book.memories |= told
 
 
 def _row(plan: Plan, row: int) -> Plan:
     """One robot's part of a plan; it is done when the team is."""
-    one = slice(row, row + 1)
+    only = slice(row, row + 1)
     return replace(
         plan,
-        names=plan.names[one],
-        goals=plan.goals[one],
-        active=plan.active[one],
-        waits=plan.waits[one],
-        ways=plan.ways[one],
-        tells=plan.tells[one],
+        names=plan.names[only],
+        goals=plan.goals[only],
+        active=plan.active[only],
+        waits=plan.waits[only],
+        ways=plan.ways[only],
+        tells=plan.tells[only],
     )

@@ -13,7 +13,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "shipped"
 
 def shipped_names() -> list[str]:
     """Names of the policies that come with the package."""
-    return sorted(one.parent.name for one in SHIPPED.glob(f"*/{CONTRACT}"))
+    return sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONTRACT}"))
 
 
 def find_policy(policy: str | Path, others: Iterable[str] = (), setting: str = "policy") -> Path:

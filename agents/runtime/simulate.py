@@ -171,7 +171,7 @@ def _note(course: Course, plan: Plan, floor: SimulatedFloor, now: float) -> None
     share = floor.share()
     course.reached[(share >= np.array(MARKS)) & np.isinf(course.reached)] = now
     course.waits += int(plan.waits.sum())
-    course.notes += [f"{now:.0f} s: {one}" for one in plan.notes]
+    course.notes += [f"{now:.0f} s: {note}" for note in plan.notes]
     close, needless = count_close(plan, floor.radius)
     course.close += close
     course.needless += needless

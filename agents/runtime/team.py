@@ -48,8 +48,8 @@ def read_team(poses, velocities, radius, notes: list[str]) -> Team:
     """
     names, rows = _split(poses, "poses", "{name: (x, y, yaw)} or numbers [N, 2] or [N, 3]")
     pose = np.full((len(names), 3), np.nan)
-    for row, (name, one) in enumerate(zip(names, rows, strict=True)):
-        pose[row] = _pose(name, one)
+    for row, (name, given) in enumerate(zip(names, rows, strict=True)):
+        pose[row] = _pose(name, given)
     team = Team(
         names,
         pose[:, :2],
@@ -110,10 +110,10 @@ def _read_radius(radius, names: tuple) -> np.ndarray:
     if np.ndim(radius) == 0 and not isinstance(radius, Mapping):
         radius = [radius] * len(names)
     given = _match(radius, names, "robot_radius")
-    values = [_numbers(one) for one in given]
-    for name, one, value in zip(names, given, values, strict=True):
+    values = [_numbers(radius_given) for radius_given in given]
+    for name, wrong, value in zip(names, given, values, strict=True):
         if value is None or value.ndim or not 0.0 < value < 1e3:
-            raise ValueError(f"robot_radius of robot {name!r} is {one!r}: give metres above 0")
+            raise ValueError(f"robot_radius of robot {name!r} is {wrong!r}: give metres above 0")
     return np.array(values, np.float64).reshape(len(names))
 
 

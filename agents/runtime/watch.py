@@ -99,7 +99,7 @@ class Watch:
                 track.since = track.best_since = now
             if track.hold not in number:
                 track.hold = None
-        self.tracks = {name: one for name, one in self.tracks.items() if now - one.seen <= self.pause}
+        self.tracks = {name: kept for name, kept in self.tracks.items() if now - kept.seen <= self.pause}
         return notes
 
     def _look_beside(self, blocks: list[Block], beside: np.ndarray) -> list[str]:
@@ -207,10 +207,10 @@ class Watch:
         if block is None or track.block in (None, block):
             return False
         taken = [*track.past, (block, at)]
-        blocks = [one for one, _ in taken]
+        blocks = [block for block, _ in taken]
         for period in PERIODS:
             round_ = blocks[-period:]
             again = len(set(round_)) > 1 and blocks[-2 * period :] == round_ * 2
-            if again and all(one in present for one in round_):
+            if again and all(block in present for block in round_):
                 return bool(np.linalg.norm(at - taken[-2 * period][1]) < room)
         return False

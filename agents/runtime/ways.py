@@ -167,7 +167,7 @@ class _WayBack:
         rim = ((0, 0), (1, 1), (1, 1))
         # Views of memory: single cells are read faster from them than from arrays.
         self.distance = memoryview(np.pad(distance, rim, constant_values=UNREACHED).ravel())
-        self.tight = memoryview(np.pad([one == TIGHT for one in passable], rim).ravel())
+        self.tight = memoryview(np.pad([row == TIGHT for row in passable], rim).ravel())
         self.steps = (STEPS[:, 1] * (self.width + 2) + STEPS[:, 0]).tolist()
 
     def enter(self, cell: int, robot: int) -> int:

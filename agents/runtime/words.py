@@ -38,9 +38,9 @@ def read_word(text: str) -> Word:
 
 
 def _read_memory(found: dict[str, Any]) -> Memory:
-    met = {_name(name): _read_contact(one) for name, one in found["met"].items()}
+    met = {_name(name): _read_contact(contact) for name, contact in found["met"].items()}
     flags = found["linked"], found["tells"]
-    if not all(isinstance(one, bool) for one in flags):
+    if not all(isinstance(flag, bool) for flag in flags):
         raise ValueError
     return Memory(_numbers(found["at"], 2), _number(found["driven"]), _number(found["known"]), *flags, met)
 

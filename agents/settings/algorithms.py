@@ -192,8 +192,8 @@ def _tunings(name: str, summary: str, settings: AlgorithmSettings, **reference) 
 
 
 TUNINGS = {
-    one.name: one
-    for one in (
+    tunings.name: tunings
+    for tunings in (
         _tunings(
             "ippo", "independent PPO: each robot's critic sees its own observation", ClippedSettings(), **_CLIPPED
         ),

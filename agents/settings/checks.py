@@ -27,10 +27,12 @@ def check_ranges(cfg: DictConfig, verb: str) -> None:
     settings that only tell it of a run may hold what another verb needs, as episodes=0.
     """
     for kind, node, prefix in ((SCHEMAS[verb], cfg, ""), (CollectorSettings, cfg.get("collector"), "collector.")):
-        for one in fields(kind) if node is not None else ():
-            limits = one.metadata.get("limits", {})
+        for setting in fields(kind) if node is not None else ():
+            limits = setting.metadata.get("limits", {})
             if limits.get("low") is not None or limits.get("above") is not None:
-                check_value(prefix + one.name, node[one.name], kinds(kind)[one.name], one.metadata, UserError)
+                check_value(
+                    prefix + setting.name, node[setting.name], kinds(kind)[setting.name], setting.metadata, UserError
+                )
 
 
 def check_seed(value: Any, name: str = "seed") -> None:
@@ -41,7 +43,7 @@ def check_seed(value: Any, name: str = "seed") -> None:
 
 def check_distinct(name: str, values: Sequence) -> None:
     """Raise UserError where a list names something twice."""
-    twice = next((one for k, one in enumerate(values) if one in values[:k]), None)
+    twice = next((value for k, value in enumerate(values) if value in values[:k]), None)
     if twice is not None:
         raise UserError(f"{name}={','.join(map(str, values))} names {twice} twice: give each once.")
 
@@ -50,7 +52,7 @@ def words_of(value: Any) -> list[str]:
     """The words of a setting that names one policy or several."""
     if value is None:
         return []
-    return [value] if isinstance(value, str) else [str(one) for one in value]
+    return [value] if isinstance(value, str) else [str(item) for item in value]
 
 
 def team_sizes(value: Any) -> list[int]:
@@ -64,7 +66,7 @@ def team_sizes(value: Any) -> list[int]:
         sizes = list(sizes)
     except TypeError:
         sizes = []
-    if not sizes or not all(type(one) is int and one >= 1 for one in sizes):
+    if not sizes or not all(type(size) is int and size >= 1 for size in sizes):
         raise UserError(f"num_robots={value} must be a whole number, 1 or more, or several as num_robots=1,2,6.")
     check_distinct("num_robots", sizes)
     return sizes

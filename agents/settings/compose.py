@@ -24,8 +24,8 @@ def group_choices(group: str) -> dict[str, str]:
 
     found = {name: summary for name, (summary, _) in stored_choices().get(group, {}).items()}
     folder = resources.files("maexp.conf").joinpath(group)
-    files = [one for one in folder.iterdir() if one.name.endswith(".yaml")] if folder.is_dir() else []
-    return dict(sorted((found | {one.name[:-5]: _first_comment(one.read_text()) for one in files}).items()))
+    files = [path for path in folder.iterdir() if path.name.endswith(".yaml")] if folder.is_dir() else []
+    return dict(sorted((found | {file.name[:-5]: _first_comment(file.read_text()) for file in files}).items()))
 
 
 def _first_comment(text: str) -> str:
@@ -39,7 +39,9 @@ def groups() -> list[str]:
     from maexp.agents.settings.schema import stored_choices
 
     folder = resources.files("maexp.conf")
-    return sorted({*stored_choices(), *(one.name for one in folder.iterdir() if one.is_dir() and one.name[0] != "_")})
+    return sorted(
+        {*stored_choices(), *(path.name for path in folder.iterdir() if path.is_dir() and path.name[0] != "_")}
+    )
 
 
 def compose_recipe(verb: str, recipe: Recipe) -> DictConfig:
@@ -122,12 +124,12 @@ def _suggest(name: str, verb: str) -> str:
     from maexp.agents.settings.schema import schema
 
     names = _flat_names(OmegaConf.structured(schema(verb)))
-    holding = [one for one in names if name in re.split(r"[._]", one)]
-    nearest = [one for one in holding if one.count(".") == min(other.count(".") for other in holding)]
+    holding = [candidate for candidate in names if name in re.split(r"[._]", candidate)]
+    nearest = [candidate for candidate in holding if candidate.count(".") == min(other.count(".") for other in holding)]
     if meant := nearest or difflib.get_close_matches(name, names, 1, 0.7):
         return f": did you mean {' or '.join(meant[:3])}"
     parent = name.rpartition(".")[0]
-    beside = [one for one in names if one.rpartition(".")[0] == parent]
+    beside = [candidate for candidate in names if candidate.rpartition(".")[0] == parent]
     return f": choose one of {', '.join(beside)}" if beside else f" (see maexp {verb} --help)"
 
 

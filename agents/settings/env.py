@@ -42,15 +42,15 @@ def team_configs(
     entries = OmegaConf.to_container(cfg.robot.team)
     _check_team(entries)
     entries = [entries[i % len(entries)] for i in range(num_robots)]
-    robots = [robot_config(cfg, one) for one in entries]
-    return robots, [read(RadarConfig, cfg.radar, **one.get("radar", {})) for one in entries]
+    robots = [robot_config(cfg, entry) for entry in entries]
+    return robots, [read(RadarConfig, cfg.radar, **entry.get("radar", {})) for entry in entries]
 
 
 def _check_team(entries: object) -> None:
-    allowed = [one.name for one in fields(RobotConfig)] + ["radar"]
-    if not isinstance(entries, list) or not all(isinstance(one, dict) for one in entries):
+    allowed = [field.name for field in fields(RobotConfig)] + ["radar"]
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise UserError("robot.team must be a list of settings, as [{kind: ackermann}, {kind: differential}].")
-    for name in (name for one in entries for name in one):
+    for name in (name for entry in entries for name in entry):
         if name not in allowed:
             raise UserError(f"robot.team has no setting {name}: choose one of {', '.join(allowed)}.")
 

@@ -20,7 +20,7 @@ FREE_GROUPS = tuple(name for name, kind in GROUPS.items() if not supplied(kind))
 ModelSettings = storable(ModelConfig)
 AlgorithmSettings = optional_settings(*{type(row.default): None for row in TUNINGS.values()})
 ImportSettings = storable(ImportOptions)
-SUPPLIED = tuple(one.name for one in fields(Scenario) if one.metadata.get("help"))
+SUPPLIED = tuple(setting.name for setting in fields(Scenario) if setting.metadata.get("help"))
 """What a scenario's row supplies; null: what the map's own scenario says."""
 
 

@@ -32,7 +32,7 @@ def _indices(name: str, value: Any, default: Iterable[int]) -> list[int]:
         return list(default)
     value = OmegaConf.to_container(value) if OmegaConf.is_list(value) else value
     indices = [value] if isinstance(value, int) else value
-    good = isinstance(indices, list) and indices and all(type(one) is int and one >= 0 for one in indices)
+    good = isinstance(indices, list) and indices and all(type(index) is int and index >= 0 for index in indices)
     if not good:
         raise UserError(f"{name}={value} must be a list of whole numbers, 0 or more, as [0,1,2].")
     return indices

@@ -64,7 +64,7 @@ class ModelConfig:
             names = ("action", "target_width", "target_heads", "starts_from", "score_weight")
         else:
             critics = ("target_width", "target_heads", "starts_from", "score_weight", "critic_hidden", "critic_encoder")
-            names = tuple(one.name for one in fields(self) if one.name not in critics)
+            names = tuple(field.name for field in fields(self) if field.name not in critics)
         return {name: getattr(self, name) for name in names}
 
 

@@ -104,7 +104,7 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
         if name == "scenario.starts" and value not in STARTS:  # kept with the run, as the next
             value = str(Path(value).expanduser().absolute())
         if name == "scenario.path":  # kept with the run, which may be resumed from another folder
-            value = ",".join(str(Path(one).expanduser().absolute()) for one in split_paths(value))
+            value = ",".join(str(Path(path).expanduser().absolute()) for path in split_paths(value))
         return f"{name}={quote(value)}"
     if not multirun and name in POLICIES.get(verb, ()) and not OPERATOR.match(value):
         return f"{name}={quote_policies(value, verb == 'benchmark')}"
@@ -151,8 +151,8 @@ def split_paths(text: str) -> list[str]:
     """
     if text.startswith("[") and text.endswith("]"):
         text = text[1:-1]
-    parts = [one.strip() for one in text.split(",") if one.strip()]
-    single = Path(text).expanduser().exists() or not all(Path(one).suffix for one in parts)
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    single = Path(text).expanduser().exists() or not all(Path(part).suffix for part in parts)
     return [text] if single else parts
 
 
@@ -170,13 +170,13 @@ def _is_quoted(text: str) -> bool:
 def find_override(overrides: list[str], name: str) -> str | None:
     """The value that the last override of `name` gives, unquoted; None if there is none."""
     parsed = OverridesParser.create().parse_overrides(overrides)
-    values = [one.value() for one in parsed if one.key_or_group == name and not one.is_delete()]
+    values = [override.value() for override in parsed if override.key_or_group == name and not override.is_delete()]
     return None if not values or values[-1] is None else str(values[-1])
 
 
 def set_names(overrides: list[str]) -> list[str]:
     """Full names of the settings and groups that the words set."""
-    return [one.key_or_group for one in OverridesParser.create().parse_overrides(overrides)]
+    return [override.key_or_group for override in OverridesParser.create().parse_overrides(overrides)]
 
 
 def without(overrides: list[str], *names: str) -> list[str]:
@@ -186,8 +186,8 @@ def without(overrides: list[str], *names: str) -> list[str]:
     except HydraException as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"The checkpoint holds settings that cannot be read ({reason}): give another one.") from error
-    roots = [one.key_or_group.split(".")[0] for one in parsed]
-    keys = [one.key_or_group for one in parsed]
+    roots = [override.key_or_group.split(".")[0] for override in parsed]
+    keys = [override.key_or_group for override in parsed]
     rows = zip(overrides, roots, keys, strict=True)
     return [word for word, root, key in rows if root not in names and key not in names]
 
@@ -199,7 +199,7 @@ def move_sweeps(overrides: list[str], single: tuple[str, ...] = ()) -> list[str]
         UserError: a setting in `single` was given several values.
     """
     parsed = OverridesParser.create().parse_overrides(overrides)
-    several = [word for word, one in zip(overrides, parsed, strict=True) if one.is_sweep_override()]
+    several = [word for word, override in zip(overrides, parsed, strict=True) if override.is_sweep_override()]
     for name in split_sweeps(several)[0]:
         if name.split(".")[0] in single:
             raise UserError(f"{name} takes one value here, not several.")
@@ -210,12 +210,14 @@ def move_sweeps(overrides: list[str], single: tuple[str, ...] = ()) -> list[str]
 def split_sweeps(words: list[str]) -> tuple[list[str], list[list[str]]]:
     """The names of settings given several values, and for each its overrides, one per value."""
     parsed = OverridesParser.create().parse_overrides(list(words))
-    names = [one.key_or_group for one in parsed]
-    return names, [[f"{one.get_key_element()}={value}" for value in one.sweep_string_iterator()] for one in parsed]
+    names = [override.key_or_group for override in parsed]
+    return names, [
+        [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()] for override in parsed
+    ]
 
 
 def find_sweeps(overrides: list[str]) -> dict[str, list[str]]:
     """The settings given several values, each with its overrides, one per value."""
     parsed = OverridesParser.create().parse_overrides(overrides)
-    several = [word for word, one in zip(overrides, parsed, strict=True) if one.is_sweep_override()]
+    several = [word for word, override in zip(overrides, parsed, strict=True) if override.is_sweep_override()]
     return dict(zip(*split_sweeps(several), strict=True))

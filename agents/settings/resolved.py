@@ -19,7 +19,10 @@ from maexp.envs.config import GROUPS, PlannerConfig, RadarConfig
 from maexp.envs.importing.options import ImportOptions
 from maexp.envs.scenarios import Scenario, find_scenario
 
-PLANNER_LACKS = {"direct": [one.name for one in fields(PlannerConfig) if one.name != "name"], "dwa": ["replan_steps"]}
+PLANNER_LACKS = {
+    "direct": [field.name for field in fields(PlannerConfig) if field.name != "name"],
+    "dwa": ["replan_steps"],
+}
 
 
 def plain(cfg: DictConfig) -> dict:
@@ -59,7 +62,7 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
             settings["radar"] = asdict(read(RadarConfig, cfg.radar).completed(row))
             settings["scenario"] |= {"local_steps": played.local_steps, "macro_steps": played.macro_steps}
         else:
-            settings |= {name: asdict(one.checked()) for name, one in read_free_groups(cfg).items()}
+            settings |= {name: asdict(group.checked()) for name, group in read_free_groups(cfg).items()}
         if settings.get("checkpoint", "") is None:  # nobody who plays was trained with these settings
             settings |= dict.fromkeys(("algorithm", "tuning", "model"))
         else:
@@ -124,7 +127,7 @@ def _without_null(node: dict) -> dict:
 
 def _listed(value: Any) -> Any:
     """Tuples as lists: YAML has no others."""
-    return [_listed(one) for one in value] if isinstance(value, list | tuple) else value
+    return [_listed(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def flatten(node: dict, prefix: str = "") -> dict[str, Any]:

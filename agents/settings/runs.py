@@ -22,10 +22,10 @@ PLAYED = (*ENV, "num_envs", "num_robots", "seed", "num_threads")
 """Settings that matter to who only plays."""
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
 SOURCES = {
-    f"{group}.{one.name}": f"scenario.{source}"
+    f"{group}.{setting.name}": f"scenario.{source}"
     for group, kind in ENV_GROUPS.items()
-    for one in fields(kind)
-    if (source := one.metadata.get("scenario"))
+    for setting in fields(kind)
+    if (source := setting.metadata.get("scenario"))
 }
 """The settings of the scenario whose values others take; that of another name is called the same."""
 WHEELBASE = ("robot.length", "robot.width", "robot.radius", "robot.team")  # what it follows
@@ -87,14 +87,14 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
 
 
 def _is_set(name: str, words: list[str]) -> bool:
-    return any(name == one or name.startswith(f"{one}.") for one in set_names(words) if one not in GROUPS)
+    return any(name == prefix or name.startswith(f"{prefix}.") for prefix in set_names(words) if prefix not in GROUPS)
 
 
 def _chosen_anew(values: dict[str, Any], new: list[str]) -> list[str]:
     """The groups that the new words choose, and what the protocol of a new scenario sets; a scenario or planner that
     the run had already is no new choice."""
     had = {name: values.get(f"{name}.name") for name in ("scenario", "planner")}
-    chosen = [one for one in set_names(new) if one in GROUPS and (had.get(one) or "") != find_override(new, one)]
+    chosen = [name for name in set_names(new) if name in GROUPS and (had.get(name) or "") != find_override(new, name)]
     return chosen + groups_of_rules(find_override(new, "scenario") if "scenario" in chosen else None)
 
 
@@ -104,8 +104,10 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     place = find_override(new, "scenario.name") or find_override(new, "scenario") or values["scenario.name"]
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers
-    gone = [one for one in followers if SOURCES.get(one, f"scenario.{one.partition('.')[2]}") in names]
-    gone += [one for one in ROUND if one in followers and "robot.radius" in names]
+    gone = [
+        follower for follower in followers if SOURCES.get(follower, f"scenario.{follower.partition('.')[2]}") in names
+    ]
+    gone += [follower for follower in ROUND if follower in followers and "robot.radius" in names]
     gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*WHEELBASE} & {*names}))
     if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode
         gone += ["scenario.macro_steps"] * ("scenario.macro_steps" in followers)

@@ -61,9 +61,9 @@ def stored_choices() -> dict[str, dict[str, tuple[str, dict[str, Any]]]]:
 def groups_of_rules(name: str | None) -> list[str]:
     """Groups and settings outside `scenario` that choosing a scenario sets: those of its protocol."""
     rules = RULES.get(name, {})
-    chosen = [key for one in rules.get("defaults", ()) if isinstance(one, dict) for key in one]
-    others = [one for one in rules if one not in ("defaults", "scenario")]
-    return [one.removeprefix("override /") for one in chosen] + others
+    chosen = [key for default in rules.get("defaults", ()) if isinstance(default, dict) for key in default]
+    others = [key for key in rules if key not in ("defaults", "scenario")]
+    return [key.removeprefix("override /") for key in chosen] + others
 
 
 def _planner(name: str) -> dict[str, Any]:

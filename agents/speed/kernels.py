@@ -156,7 +156,7 @@ def measure_kernels(env: ExplorationEnv, cfg: BenchSettings) -> list[dict]:
         row = describe_point(env, cfg) | {"stage": stage, "kernel": kernel.lstrip("_"), "launches": len(mine)}
         for name, laps in (("in_place", in_place), ("alone", alone)):
             summed = [sum(together) for together in zip(*(laps[k] for k in mine), strict=False)]
-            row[f"{name}_us"] = {one: 1e6 * seconds for one, seconds in spread(summed).items()}
+            row[f"{name}_us"] = {figure: 1e6 * seconds for figure, seconds in spread(summed).items()}
         rows.append(row | {"robots": robots})
     return rows
 
@@ -167,7 +167,7 @@ def record_steps(env: ExplorationEnv, shard: Shard) -> list[Step]:
     stage = STAGES[0]
 
     def launch(kernel, dim, arguments):
-        arrays = [one for one in arguments if isinstance(one, wp.array) and one.ptr]
+        arrays = [argument for argument in arguments if isinstance(argument, wp.array) and argument.ptr]
         steps.append(Step(stage, kernel.key, RecordedLaunch(kernel, dim, arguments, shard.device), arrays))
 
     set_goals(launch, shard)
@@ -225,11 +225,11 @@ class Runner:
 
     def save(self, steps: list[Step]) -> list[tuple[wp.array, wp.array]]:
         """Every array that the launches change, and a copy of it; the arrays are as they were."""
-        arrays = {one.ptr: one for step in steps for one in step.arrays}
-        copies = [(one, wp.clone(one)) for one in arrays.values()]
+        arrays = {array.ptr: array for step in steps for array in step.arrays}
+        copies = [(array, wp.clone(array)) for array in arrays.values()]
         for step in steps:
             step.command.launch(self.stream)
-        changed = [(one, copy) for one, copy in copies if one.numpy().tobytes() != copy.numpy().tobytes()]
+        changed = [(array, copy) for array, copy in copies if array.numpy().tobytes() != copy.numpy().tobytes()]
         restore(changed)
         return changed
 
@@ -248,7 +248,7 @@ def load_baseline(path: str) -> dict:
     try:
         report = json.loads(Path(path).expanduser().read_text())
         rows = {tuple(row[name] for name in KEY): row["in_place_us"] for row in report["rows"]}
-        good = report["kind"] == "bench_kernels" and all({"median", "p10", "p90"} <= set(one) for one in rows.values())
+        good = report["kind"] == "bench_kernels" and all({"median", "p10", "p90"} <= set(row) for row in rows.values())
     except OSError as error:
         raise UserError(f"baseline={path} cannot be read ({error.strerror}): give a bench_kernels.json.") from error
     except (ValueError, KeyError, TypeError):
@@ -293,10 +293,10 @@ def print_ceilings(ceilings: dict[str, float], loading: dict[str, float], before
 
 def print_kernels(rows: list[dict], compared: bool) -> None:
     """The table of one point; times are per robot."""
-    one = rows[0]
+    row = rows[0]
     title = (
-        f"us per robot: scenario={one['scenario']}, {one['planner']}, {one['num_envs']} envs of {one['num_robots']} "
-        f"robots, radar {one['radar_range']:g} m"
+        f"us per robot: scenario={row['scenario']}, {row['planner']}, {row['num_envs']} envs of {row['num_robots']} "
+        f"robots, radar {row['radar_range']:g} m"
     )
     columns = ["kernel", "in place", "p10..p90", "alone"]
     cells = []
@@ -304,7 +304,7 @@ def print_kernels(rows: list[dict], compared: bool) -> None:
         mine = [row for row in rows if row["stage"] == stage]
         cells += [kernel_cells(row, compared) for row in mine]
         total = sum(row["in_place_us"]["median"] / row["robots"] for row in mine)
-        cells.append([TableCell(one, bold=True).terminal() for one in (f"= {stage}", f"{total:.3f}")])
+        cells.append([TableCell(text, bold=True).terminal() for text in (f"= {stage}", f"{total:.3f}")])
     if compared:
         columns.append("ratio")
         title += f"; ratio to the baseline, ! beyond {NOISE} and the spread"

@@ -77,7 +77,7 @@ def describe_point(env: ExplorationEnv, cfg: CommonSettings) -> dict[str, Any]:
         "planner": env.planner_config.name,
         "num_envs": env.num_envs,
         "num_robots": env.num_robots,
-        "radar_range": max(one.range for one in env.radar_configs),
+        "radar_range": max(radar.range for radar in env.radar_configs),
         "free_points": env.bank.max_free,
     }
 

@@ -69,7 +69,7 @@ class Trainee:
         return describe_point(self.env, cfg) | {
             "algorithm": cfg.algorithm.name,
             "model": _model_name(cfg),
-            "parameters": sum(one.numel() for network in networks for one in network.parameters()),
+            "parameters": sum(parameter.numel() for network in networks for parameter in network.parameters()),
             "macro_steps": steps,
             "iterations": len(laps),
             "seconds": seconds,
@@ -80,7 +80,7 @@ class Trainee:
 def _model_name(cfg: TrainSettings) -> str:
     """The name of these sizes."""
     sizes = replace(model_settings(cfg), action="regions")
-    return next((name for name, one in SIZES.items() if one == sizes), "own")
+    return next((name for name, size in SIZES.items() if size == sizes), "own")
 
 
 def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
@@ -107,9 +107,9 @@ def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> None:
 
 def print_rows(rows: list[dict]) -> None:
     """One line a point: median seconds of the parts and of the whole iteration."""
-    one = rows[0]
+    first = rows[0]
     title = (
-        f"seconds of a training iteration ({one['macro_steps']} macro steps of teams, scenario={one['scenario']}), "
+        f"seconds of a training iteration ({first['macro_steps']} macro steps of teams, scenario={first['scenario']}), "
         "robot-macro-steps/s"
     )
     columns = ["algorithm", "model", "N", "weights", *PARTS, "iteration", "robot-steps/s", "x slowest"]

@@ -24,13 +24,13 @@ NUM_ENVS = 16
 
 def sums(part: Part, maps: list[PointCloudMap], seed: int | None = None) -> dict[str, str]:
     """Number of each map in the scenario, or its name in the set -> checksum of its points."""
-    return {name: checksum(one) for name, one in zip(part.map_names(seed), maps, strict=True)}
+    return {name: checksum(world) for name, world in zip(part.map_names(seed), maps, strict=True)}
 
 
 def check_maps(suite: Suite, part: Part, maps: list[PointCloudMap]) -> None:
     """Raise UserError unless the maps have the points that were frozen."""
     found, wanted = sums(part, maps), suite.frozen["maps"][part.name]
-    wrong = [name for name, one in found.items() if wanted.get(name) != one]
+    wrong = [name for name, digest in found.items() if wanted.get(name) != digest]
     if not wrong and len(found) == len(wanted):
         return
     told = ", ".join(f"{part.scenario} {name}".strip() for name in wrong[:3])
@@ -56,7 +56,7 @@ def read_frozen(suite: Suite) -> dict[str, Results]:
             found[policy] = {}
             for name in suite.parts:
                 mine = [row for row in rows if (row["policy"], row["part"]) == (policy, name)]
-                episodes = {one: np.array([float(row[one] or "nan") for row in mine]) for one in suite.metrics}
+                episodes = {metric: np.array([float(row[metric] or "nan") for row in mine]) for metric in suite.metrics}
                 maps = np.array([row["map"] for row in mine])
                 found[policy][name] = to_result(suite, policy, name, episodes, maps)
                 if len(maps) != suite.episodes:
@@ -80,7 +80,9 @@ def play_rivals(suite: Suite, seed: int | None, advance: Callable[[int], None] =
             for first in range(0, suite.episodes, count):
                 batches.append(play_batch(suite, env, POLICIES[policy](env), first))
                 advance(len(batches[-1].decisions))
-            episodes = {one: np.concatenate([batch.metrics[one] for batch in batches]) for one in suite.metrics}
+            episodes = {
+                metric: np.concatenate([batch.metrics[metric] for batch in batches]) for metric in suite.metrics
+            }
             names = np.concatenate([batch.maps for batch in batches])
             results[name] = to_result(suite, policy, name, episodes, names)
     return {"results": found, "maps": points}
@@ -96,8 +98,8 @@ def freeze(suite: Suite, made: dict, advance: Callable[[int], None] = lambda cou
     write_text(suite.episodes_file, _csv(suite, played["results"]))
     scores = {}
     for policy, results in played["results"].items():
-        values = {part: one.episodes[suite.score] for part, one in results.items()}
-        scores[policy] = {"score": mean_of(values)} | {part: float(one.mean()) for part, one in values.items()}
+        values = {part: result.episodes[suite.score] for part, result in results.items()}
+        scores[policy] = {"score": mean_of(values)} | {part: float(value.mean()) for part, value in values.items()}
     frozen = {"scores": scores, "maps": played["maps"], "episodes": sha256(suite.episodes_file)}
     bare = Suite(suite.path, suite.content | {"frozen": frozen})
     frozen |= {"checksum": bare.checksum, "made": made}
@@ -113,8 +115,8 @@ def _csv(suite: Suite, played: dict[str, Results]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*COLUMNS, *suite.metrics])
     for policy, results in played.items():
-        for part, one in results.items():
-            for k, place in enumerate(one.maps):
-                values = (float(one.episodes[metric][k]) for metric in suite.metrics)
+        for part, result in results.items():
+            for k, place in enumerate(result.maps):
+                values = (float(result.episodes[metric][k]) for metric in suite.metrics)
                 writer.writerow([policy, part, place, *("" if np.isnan(value) else value for value in values)])
     return text.getvalue()

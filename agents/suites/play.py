@@ -62,7 +62,7 @@ def build_maps(part: Part, seed: int | None = None) -> list[PointCloudMap]:
 
 def _load_maps(part: Part) -> list[PointCloudMap]:
     part.check_fetched()
-    return [PointCloudMap.load(part.map_set.kept / one.map_place) for one in part.floors]
+    return [PointCloudMap.load(part.map_set.kept / floor.map_place) for floor in part.floors]
 
 
 @lru_cache(maxsize=16)
@@ -153,13 +153,13 @@ class Replay:
 
     def __init__(self, batch: Batch, num_envs: int, device: torch.device):
         rows = np.minimum(np.arange(num_envs), len(batch.decisions) - 1)
-        self.sent = {name: torch.from_numpy(one[rows]).to(device) for name, one in batch.sent.items()}
+        self.sent = {name: torch.from_numpy(array[rows]).to(device) for name, array in batch.sent.items()}
         self.decisions = torch.from_numpy(batch.decisions[rows].astype(np.int64)).to(device)
         self.step = 0
 
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
-        for name, one in self.sent.items():
-            state["agents", "action", name] = one[:, min(self.step, one.shape[1] - 1)]
+        for name, array in self.sent.items():
+            state["agents", "action", name] = array[:, min(self.step, array.shape[1] - 1)]
         state["lost"] = (self.step >= self.decisions).unsqueeze(-1)
         self.step += 1
         return state

@@ -54,7 +54,7 @@ def _describe_sources(suite: Suite) -> list[str]:
     sets = {part.map_set.name: part for part in suite.parts.values() if part.fetched}
     lines = []
     for part in sets.values():
-        sources = ", ".join({f"{one.source} ({one.licence})": None for one in part.floors})
+        sources = ", ".join({f"{floor.source} ({floor.licence})": None for floor in part.floors})
         lines.append(f"Maps to fetch, {part.map_set.fetch}: {sources}")
     return lines
 
@@ -64,10 +64,10 @@ def print_results(suite: Suite, results: dict[str, Any]) -> None:
     title = f"{results['policy']} on {suite.name}, version {suite.version}, checksum {suite.checksum[:16]}"
     reference, zero, name = results["reference"], results[RANDOM], suite.score
     cells = []
-    for part, one in results["parts"].items():
+    for part, figures in results["parts"].items():
         ends = (zero["parts"][part], reference["parts"][part])
-        score = score_cells(one[name], one["normalised"], reference["differences"][part], ends)
-        cells.append([part, *score, *_more(one)])
+        score = score_cells(figures[name], figures["normalised"], reference["differences"][part], ends)
+        cells.append([part, *score, *_more(figures)])
     score, ends = results["score"], (zero["score"], reference["score"])
     cells.append(["all", *score_cells(score, score["normalised"], reference["difference"][name], ends), "", ""])
     print_table(title, COLUMNS, cells)
@@ -110,7 +110,7 @@ def _evidence(suite: Suite, results: dict[str, Any]) -> Evidence:
     parts = results["episodes"].values()
     metrics = [{name: np.array(rows[name], dtype=np.float64) for name in suite.metrics} for rows in parts]
     copies = [label_copies(np.array(rows["map"]), own) for rows, own in zip(parts, metrics, strict=True)]
-    distinct, maps = sum(len(np.unique(one)) for one in copies), {place for rows in parts for place in rows["map"]}
+    distinct, maps = sum(len(np.unique(copy)) for copy in copies), {place for rows in parts for place in rows["map"]}
     return Evidence(results["policy"], sum(map(len, copies)), distinct, len(maps))
 
 

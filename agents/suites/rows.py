@@ -73,9 +73,9 @@ def make_row(
         )
     row: dict[str, Any] = {"format": FORMAT, "verified": check, "metric": suite.score}
     row |= {name: results[name] for name in KEPT}
-    row["reference"] = {name: one for name, one in results["reference"].items() if name != "differences"}
+    row["reference"] = {name: value for name, value in results["reference"].items() if name != "differences"}
     row["reference"]["difference"] = results["reference"]["difference"][suite.score]
-    row["parts"] = {part: _describe_part(suite, part, one, results) for part, one in results["parts"].items()}
+    row["parts"] = {part: _describe_part(suite, part, figures, results) for part, figures in results["parts"].items()}
     row["films"] = {part: make_film(suite, part, where) for part in suite.parts}
     return json.loads(json.dumps(_rounded(row)))
 
@@ -181,16 +181,16 @@ def _check_shape(value: Any, shape: Any, where: str) -> None:
     if isinstance(shape, dict):
         if not isinstance(value, dict) or not value:
             raise ValueError(f"{where} has no entries")
-        for name, one in shape.items():
+        for name, item in shape.items():
             for key in value if name == EACH else (name,):
                 if key not in value:
                     raise ValueError(f"{where}.{key} is missing")
-                _check_shape(value[key], one, f"{where}.{key}")
+                _check_shape(value[key], item, f"{where}.{key}")
     elif isinstance(shape, list):
         if not isinstance(value, list) or not value:
             raise ValueError(f"{where} is no list")
-        for one in value:
-            _check_shape(one, shape[0], where)
+        for item in value:
+            _check_shape(item, shape[0], where)
     elif not isinstance(value, shape) or (isinstance(value, bool) and shape is not bool):
         raise ValueError(f"{where} is of another kind")
 
@@ -202,13 +202,13 @@ def _check_numbers(row: dict[str, Any]) -> None:
     if not isinstance(row.get("note", ""), str):
         raise ValueError("note is of another kind")
     parts = row["parts"]
-    if not all(isinstance(one.get("metric", ""), str) for one in parts.values()):
+    if not all(isinstance(part.get("metric", ""), str) for part in parts.values()):
         raise ValueError("metric of a part is of another kind")
     if not set(parts) == set(row["films"]) == set(row["reference"]["parts"]):
         raise ValueError("parts, films and reference are not of the same parts")
-    if not all(row["metric"] in one and len(one["copies"]) == len(one["episodes"]) for one in parts.values()):
+    if not all(row["metric"] in part and len(part["copies"]) == len(part["episodes"]) for part in parts.values()):
         raise ValueError("a part has too few entries")
-    score = np.mean([np.mean(one["episodes"]) for one in parts.values()])
+    score = np.mean([np.mean(part["episodes"]) for part in parts.values()])
     if not abs(score - row["score"]["mean"]) < 1e-5:
         raise ValueError("its score does not follow from its episodes")
 
@@ -221,7 +221,7 @@ def find_rows(where: Path) -> list[Path]:
 def _rounded(value: Any) -> Any:
     """Six decimals are enough for a page."""
     if isinstance(value, dict):
-        return {name: _rounded(one) for name, one in value.items()}
+        return {name: _rounded(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_rounded(one) for one in value]
+        return [_rounded(item) for item in value]
     return round(value, 6) if isinstance(value, float) and value == value else value

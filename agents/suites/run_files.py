@@ -68,14 +68,14 @@ def _check_shapes(
         "maps": (episodes,),
         "reasons": (episodes,),
     } | {name: (episodes, most, robots, 2)[: 3 if name == "region" else 4] for name in sent}
-    for name, one in (arrays | sent).items():
-        if one.shape != wanted[name] or not episodes or not most:
-            raise ValueError(f"{name} has shape {one.shape}, not {wanted[name]}")
+    for name, array in (arrays | sent).items():
+        if array.shape != wanted[name] or not episodes or not most:
+            raise ValueError(f"{name} has shape {array.shape}, not {wanted[name]}")
     if metrics.shape != (episodes, count) or metrics.dtype != np.float64:
         raise ValueError(f"metrics has shape {metrics.shape}")
     if not ((0 <= arrays["decisions"]) & (arrays["decisions"] <= most)).all():
         raise ValueError("decisions are out of range")
-    if not all(np.isfinite(one).all() for one in sent.values()) or sent.get("region", np.zeros(1)).max() >= 64:
+    if not all(np.isfinite(value).all() for value in sent.values()) or sent.get("region", np.zeros(1)).max() >= 64:
         raise ValueError("an action is out of range")
 
 
@@ -83,7 +83,7 @@ def to_results(policy: str, suite: Suite, batches: dict[str, list[Batch]]) -> Re
     """Part -> its episodes."""
     found = {}
     for name, several in batches.items():
-        episodes = {one: np.concatenate([batch.metrics[one] for batch in several]) for one in suite.metrics}
+        episodes = {metric: np.concatenate([batch.metrics[metric] for batch in several]) for metric in suite.metrics}
         maps = np.concatenate([batch.maps for batch in several])
         found[name] = to_result(suite, policy, name, episodes, maps)
     return found
@@ -112,7 +112,7 @@ def describe_code() -> dict[str, Any]:
 
 def list_files(where: Path) -> dict[str, str]:
     """Name -> SHA-256 of the files of actions."""
-    return {f"{ACTIONS}/{one.name}": sha256(one) for one in sorted((where / ACTIONS).glob("*.npz"))}
+    return {f"{ACTIONS}/{path.name}": sha256(path) for path in sorted((where / ACTIONS).glob("*.npz"))}
 
 
 def describe_episodes(suite: Suite, batches: dict[str, list[Batch]]) -> dict[str, dict]:
@@ -121,7 +121,7 @@ def describe_episodes(suite: Suite, batches: dict[str, list[Batch]]) -> dict[str
     for name, several in batches.items():
         rows = {"map": [place for batch in several for place in batch.maps.tolist()]}
         rows["decisions"] = [count for batch in several for count in batch.decisions.tolist()]
-        rows |= {one: [x for batch in several for x in batch.metrics[one].tolist()] for one in suite.metrics}
+        rows |= {metric: [x for batch in several for x in batch.metrics[metric].tolist()] for metric in suite.metrics}
         why = [(batch.first + k, reason) for batch in several for k, reason in enumerate(batch.reasons.tolist())]
         found[name] = rows | {"lost": {str(number): reason for number, reason in why if reason}}
     return found
@@ -129,7 +129,7 @@ def describe_episodes(suite: Suite, batches: dict[str, list[Batch]]) -> dict[str
 
 def describe_decisions(batches: dict[str, list[Batch]]) -> dict[str, Any]:
     """Processor time that the decisions of a team took the policy [s]; no part of any score."""
-    several = [batch for one in batches.values() for batch in one]
+    several = [batch for part_batches in batches.values() for batch in part_batches]
     spent = [batch.seconds[k, :count] for batch in several for k, count in enumerate(batch.decisions)]
     seconds = np.concatenate(spent).astype(np.float64) if spent else np.zeros(0)
     if not len(seconds):
@@ -168,7 +168,7 @@ def dump(value: Any, indent: str = "") -> str:
     if not isinstance(value, dict) or not value:
         return json.dumps(without_nan(value))
     inner = indent + "  "
-    lines = [f"{inner}{json.dumps(str(name))}: {dump(one, inner)}" for name, one in value.items()]
+    lines = [f"{inner}{json.dumps(str(name))}: {dump(item, inner)}" for name, item in value.items()]
     return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
 
 

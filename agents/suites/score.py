@@ -38,8 +38,8 @@ def describe_score(scores: dict[str, str]) -> str:
         parts.setdefault(metric, []).append(part)
     told = [f"{metric}, {SCORED[metric]}" if metric in SCORED else metric for metric in parts]
     if len(parts) > 1:
-        told = [f"{one} ({', '.join(names)})" for one, names in zip(told, parts.values(), strict=True)]
-    return f"mean {'; '.join(told)}{', on average over the time' * any(one in SCORED for one in parts)}"
+        told = [f"{metric} ({', '.join(names)})" for metric, names in zip(told, parts.values(), strict=True)]
+    return f"mean {'; '.join(told)}{', on average over the time' * any(metric in SCORED for metric in parts)}"
 
 
 def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> dict[str, Any]:
@@ -50,37 +50,37 @@ def summarise_suite(suite: Suite, mine: Results, frozen: dict[str, Results]) -> 
         frozen: those of `random` and of the reference planner, by name
     """
     name, theirs, worst = suite.score, frozen[suite.reference], frozen[RANDOM]
-    own, zero, one = (_values(name, results) for results in (mine, worst, theirs))
-    ends = {part: (zero[part].mean(), one[part].mean()) for part in own}
+    own, zero, reference = (_values(name, results) for results in (mine, worst, theirs))
+    ends = {part: (zero[part].mean(), reference[part].mean()) for part in own}
     overall = mean_over_parts(own, mine)
-    copies = tuple({part: one.copies() for part, one in results.items()} for results in (mine, theirs))
+    copies = tuple({part: result.copies() for part, result in results.items()} for results in (mine, theirs))
     return {
-        "score": overall | {"normalised": place_between(overall["mean"], mean_of(zero), mean_of(one))},
+        "score": overall | {"normalised": place_between(overall["mean"], mean_of(zero), mean_of(reference))},
         "parts": {
             part: result.summary() | {"normalised": place_between(own[part].mean(), *ends[part])}
             for part, result in mine.items()
         },
-        RANDOM: {"score": mean_of(zero), "parts": {part: float(one.mean()) for part, one in zero.items()}},
+        RANDOM: {"score": mean_of(zero), "parts": {part: float(scores.mean()) for part, scores in zero.items()}},
         "reference": {
             "policy": suite.reference,
-            "score": mean_of(one),
-            "parts": {part: float(values.mean()) for part, values in one.items()},
+            "score": mean_of(reference),
+            "parts": {part: float(values.mean()) for part, values in reference.items()},
             "difference": {metric: subtract(mine, theirs, metric) for metric in dict.fromkeys((*suite.metrics, name))},
             "differences": {part: result.minus(theirs[part])[name] for part, result in mine.items()},
-            "improvement": improvement(own, one, copies),
+            "improvement": improvement(own, reference, copies),
         },
         "profile": {
             name: np.linspace(0.0, 1.0, LEVELS).round(3).tolist(),
             "policy": profile(own),
             RANDOM: profile(zero),
-            "reference": profile(one),
+            "reference": profile(reference),
         },
     }
 
 
 def mean_of(values: dict[str, np.ndarray]) -> float:
     """Mean over parts of the means of their episodes."""
-    return float(np.mean([one.mean() for one in values.values()]))
+    return float(np.mean([value.mean() for value in values.values()]))
 
 
 def mean_over_parts(values: dict[str, np.ndarray], *results: Results) -> dict[str, Any]:
@@ -90,44 +90,44 @@ def mean_over_parts(values: dict[str, np.ndarray], *results: Results) -> dict[st
         values: part -> a value for each episode
         results: what they are of: one's episodes, or those of two that played the same
     """
-    kept = {part: ~np.isnan(one) for part, one in values.items()}
-    have = {part: one for part, one in values.items() if kept[part].any()}
+    kept = {part: ~np.isnan(value) for part, value in values.items()}
+    have = {part: value for part, value in values.items() if kept[part].any()}
     if not have:
         return {"mean": np.nan, "ci95": [np.nan, np.nan], "n": 0}
     means, distinct = [], 0
-    for number, (part, one) in enumerate(have.items()):
+    for number, (part, value) in enumerate(have.items()):
         first, *others = (played[part] for played in results)
         copies = first.copies(*others)
         distinct += len(np.unique(copies[kept[part]]))
         weights = resample_weights(first.maps, copies=copies, seed=number)[:, kept[part]]
-        drawn = resampled_means(one[kept[part]], weights)
+        drawn = resampled_means(value[kept[part]], weights)
         means.append(np.resize(drawn, len(weights)))  # a resample without any value is left out: others stand for it
     ends = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
     ends = ends.tolist() if distinct >= LEAST_DISTINCT else [np.nan, np.nan]
-    middle = mean_of({part: one[kept[part]] for part, one in have.items()})
-    return {"mean": middle, "ci95": ends, "n": int(sum(one.sum() for one in kept.values()))}
+    middle = mean_of({part: value[kept[part]] for part, value in have.items()})
+    return {"mean": middle, "ci95": ends, "n": int(sum(value.sum() for value in kept.values()))}
 
 
 def subtract(mine: Results, theirs: Results, metric: str) -> dict[str, Any]:
     """`mean_over_parts` of the paired differences."""
-    pairs = {part: one.episodes[metric] - theirs[part].episodes[metric] for part, one in mine.items()}
+    pairs = {part: result.episodes[metric] - theirs[part].episodes[metric] for part, result in mine.items()}
     return mean_over_parts(pairs, mine, theirs)
 
 
-def place_between(value: float, zero: float, one: float) -> float | None:
+def place_between(value: float, zero: float, reference: float) -> float | None:
     """Where a score lies between that of `random` (0) and that of the reference (1); None where these are the same."""
-    return None if one == zero else float((value - zero) / (one - zero))
+    return None if reference == zero else float((value - zero) / (reference - zero))
 
 
 def profile(values: dict[str, np.ndarray]) -> list[float]:
     """Performance profile (Agarwal et al. 2021): the share of episodes above each level, every part counting alike."""
     levels = np.linspace(0.0, 1.0, LEVELS)
-    shares = [(one[:, None] > levels).mean(0) for one in values.values()]
+    shares = [(value[:, None] > levels).mean(0) for value in values.values()]
     return np.mean(shares, axis=0).round(6).tolist()
 
 
 def _values(metric: str, results: Results) -> dict[str, np.ndarray]:
-    return {part: one.episodes[metric] for part, one in results.items()}
+    return {part: result.episodes[metric] for part, result in results.items()}
 
 
 def score_cells(

@@ -20,14 +20,14 @@ MARK = "/*DATA*/"
 
 def write_site(where: Path, rows: list[dict[str, Any]]) -> list[Path]:
     """Write the page and the tables of rows; returns the files."""
-    tables = ["# Leaderboard", "", *(line for one in group(rows) for line in table(one))]
+    tables = ["# Leaderboard", "", *(line for suite_rows in group(rows) for line in table(suite_rows))]
     write_text(where / TABLES, "\n".join(tables))
     return [write_page(where, rows), where / TABLES]
 
 
 def write_page(where: Path, rows: list[dict[str, Any]]) -> Path:
     """Write the page of rows; returns it."""
-    data = json.dumps(without_nan([describe_suite(one) for one in group(rows)]), separators=(",", ":"))
+    data = json.dumps(without_nan([describe_suite(suite_rows) for suite_rows in group(rows)]), separators=(",", ":"))
     data = data.replace("<", "\\u003c")  # no name in it can end the script
     page = TEMPLATE.read_text().replace(MARK, f"const SUITES = {data}; const COLOURS = {json.dumps(COLOURS)};")
     write_text(where / PAGE, page)
@@ -46,7 +46,7 @@ def group(rows: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What the page knows of a suite: its rows, each with its profile, and who beats whom how often."""
     values, copies = (
-        [{part: np.array(one[name]) for part, one in row["parts"].items()} for row in rows]
+        [{part: np.array(figures[name]) for part, figures in row["parts"].items()} for row in rows]
         for name in ("episodes", "copies")
     )
     numbers, first = range(len(rows)), rows[0]
@@ -65,7 +65,7 @@ def describe_suite(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def scores_of(row: dict[str, Any]) -> dict[str, str]:
     """Part -> the metric that counts there."""
-    return {part: one.get("metric", row["metric"]) for part, one in row["parts"].items()}
+    return {part: figures.get("metric", row["metric"]) for part, figures in row["parts"].items()}
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

@@ -92,12 +92,12 @@ class Part:
     @property
     def floors(self) -> list[Entry]:
         """The maps of that split, in the order of the set."""
-        return [one for one in self.map_set.maps if one.split == self.fetched.partition("/")[2]]
+        return [floor for floor in self.map_set.maps if floor.split == self.fetched.partition("/")[2]]
 
     def check_fetched(self) -> None:
         """Raise MapsError unless all of them have been fetched."""
         where, floors = self.map_set.kept, self.floors
-        if missing := [one.name for one in floors if not (where / one.map_place).is_file()]:
+        if missing := [floor.name for floor in floors if not (where / floor.map_place).is_file()]:
             raise MapsError(
                 f"{self.name} plays maps of {self.fetched}, and {len(missing)} of {len(floors)} are not in "
                 f"{short(where)}: fetch them with {self.map_set.fetch}."
@@ -106,7 +106,7 @@ class Part:
     def map_names(self, seed: int | None = None) -> list[str]:
         """What tells its maps apart: numbers in the scenario, or names in the set."""
         if self.fetched:
-            return [one.name for one in self.floors]
+            return [floor.name for floor in self.floors]
         return [str(index) for index in self.indices(seed)]
 
 
@@ -199,7 +199,7 @@ class Suite:
 
 def suite_names() -> list[str]:
     """The suites that come with the package, the quick one first."""
-    return sorted((one.stem for one in FOLDER.glob("*.yaml")), key=lambda name: (name != "minival", name))
+    return sorted((path.stem for path in FOLDER.glob("*.yaml")), key=lambda name: (name != "minival", name))
 
 
 def load_suite(word: str) -> Suite:
@@ -227,9 +227,9 @@ def sha256(path: Path) -> str:
 def _plain(value: Any) -> Any:
     """For JSON: infinity as text, keys as text."""
     if isinstance(value, dict):
-        return {str(name): _plain(one) for name, one in value.items()}
+        return {str(name): _plain(item) for name, item in value.items()}
     if isinstance(value, list):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -298,7 +298,7 @@ def _check_group(path: Path, name: str, values: Any, kind: type) -> None:
     """Every value that a scenario would else fill in must be given: the table of scenarios may change."""
     from maexp.envs.config import supplied
 
-    _check_keys(path, f"{name}.", values, supplied(kind), [one.name for one in fields(kind)])
+    _check_keys(path, f"{name}.", values, supplied(kind), [field.name for field in fields(kind)])
 
 
 def _check_keys(path: Path, prefix: str, content: Any, needed, allowed=()) -> None:

@@ -46,7 +46,7 @@ def verify(where: Path, file: str | None = None, advance: Callable[[int], None] 
         report |= {name: stated[name] for name in ("suite", "policy")}
         same = {name: stated["run"]["machine"][name] for name in ("platform", "processor")}
         now = run_files.describe_machine()
-        report["same_platform"] = all(now[name] == one for name, one in same.items())
+        report["same_platform"] = all(now[name] == value for name, value in same.items())
         report["same_versions"] = run_files.describe_code()["versions"] == stated["run"]["versions"]
         if _same_suite(suite, stated["suite"], found):
             _check_files(where, stated["files"], found)
@@ -88,9 +88,9 @@ def _check_numbers(where: Path, suite: Suite, stated: dict, found: Findings, adv
     batches: dict[str, list[Batch]] = {}
     for name in suite.parts:
         batches[name] = _replay_part(where, suite, name, seed, stated, found, advance)
-    if not all(sum(len(one.decisions) for one in several) == suite.episodes for several in batches.values()):
+    if not all(sum(len(batch.decisions) for batch in several) == suite.episodes for several in batches.values()):
         return  # what is missing has been named, and no score follows from the rest
-    played = {_name_of(where, part, one) for part, several in batches.items() for one in several}
+    played = {_name_of(where, part, batch) for part, several in batches.items() for batch in several}
     for name in stated["files"]:
         if name not in played:
             found.add(name, "no episode of the suite is in it")

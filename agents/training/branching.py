@@ -120,7 +120,7 @@ class BranchPlayer:
         worth = torch.full(index.shape, torch.nan)
         teams = active.nonzero().squeeze(-1)
         for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
-            worth[some] = self._weigh(some, {name: one[some] for name, one in (mine | {"wanted": there}).items()})
+            worth[some] = self._weigh(some, {name: array[some] for name, array in (mine | {"wanted": there}).items()})
         return torch.where(there, index, -1), worth - worth[..., :1]
 
     def _offer(self, index: torch.Tensor, waits: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -217,7 +217,7 @@ def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfi
         td = step_mdp(td)
     if not found:
         raise UserError(f"every={config.every}: the episodes were over before any decision was branched at: lower it.")
-    return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+    return {name: np.concatenate([batch[name] for batch in found]) for name in found[0]}
 
 
 def describe(
@@ -237,7 +237,7 @@ def describe(
         "advantage": advantage,
         "map": env.simulation.tensors["map_id"].to(torch.int16),
     }
-    return {name: one[teams].numpy() for name, one in columns.items()} | {
+    return {name: column[teams].numpy() for name, column in columns.items()} | {
         "team": teams.to(torch.int16).numpy(),
         "decision": np.full(len(teams), step, np.int16),
     }
@@ -273,7 +273,7 @@ def _write_round(config: BranchingConfig, scenario: str, turn: int, place: Path)
         observation=ObservationConfig(pictures=False, targets=SHOWN),
     )
     found = play_round(env, BranchPlayer(env, config.candidates, config.horizon, seed), config)
-    write_file(place, lambda file: np.savez_compressed(file, names=np.array([one.name for one in maps]), **found))
+    write_file(place, lambda file: np.savez_compressed(file, names=np.array([world.name for world in maps]), **found))
     tried, seconds = int(np.isfinite(found["advantage"]).sum()), time.perf_counter() - begin
     log = place.parent / "costs.csv"
     lines = log.read_text() if log.exists() else "scenario,round,decisions,branches,seconds\n"
@@ -289,7 +289,7 @@ def read_config(words: list[str]) -> BranchingConfig:
     """
     try:
         given = OmegaConf.merge(OmegaConf.structured(BranchingConfig), OmegaConf.from_dotlist(words))
-        config = BranchingConfig(**{one.name: given[one.name] for one in fields(BranchingConfig)})
+        config = BranchingConfig(**{field.name: given[field.name] for field in fields(BranchingConfig)})
         check_settings(config, "branching")
         for name in config.scenarios:
             if find_scenario(name).build is None:

@@ -125,35 +125,35 @@ class Experience:
     def next(self) -> list[TensorDictBase]:
         """A batch [envs, steps] of every team size."""
         begin = time.perf_counter()
-        batches = [one.next() for one in self.collectors]
-        self.time(begin, [one.seconds for one in self.collectors])
+        batches = [collector.next() for collector in self.collectors]
+        self.time(begin, [collector.seconds for collector in self.collectors])
         return batches
 
     def time(self, begin: float, spent: Sequence[tuple[float, float]]) -> None:
         """Note where the time since `begin` went; `spent` holds seconds of batches and their policies."""
-        policy = sum(one for _, one in spent)
-        simulate = sum(one for one, _ in spent) - policy
+        policy = sum(seconds for _, seconds in spent)
+        simulate = sum(seconds for seconds, _ in spent) - policy
         self.seconds = {"wait": time.perf_counter() - begin, "policy": policy, "simulate": simulate}
 
     def update_policy_weights_(self) -> None:
         """Act with what was learned."""
-        for one in self.collectors:
-            one.update_policy_weights_()
+        for collector in self.collectors:
+            collector.update_policy_weights_()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next batches depend on, but for the policy and the random numbers."""
-        return {str(k): one.state_dict() for k, one in enumerate(self.collectors)}
+        return {str(k): collector.state_dict() for k, collector in enumerate(self.collectors)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where `state_dict` was called; ValueError where the state does not fit."""
-        for k, one in enumerate(self.collectors):
-            one.load_state_dict(state[str(k)])
+        for k, collector in enumerate(self.collectors):
+            collector.load_state_dict(state[str(k)])
         self.update_policy_weights_()
 
     def shutdown(self) -> None:
         """Free what the collectors hold."""
-        for one in self.collectors:
-            one.shutdown()
+        for collector in self.collectors:
+            collector.shutdown()
 
 
 class Stopwatch:
@@ -194,9 +194,9 @@ def batch_statistics(*batches: TensorDictBase, success_coverage: float = 0.95) -
     earned = [_earned(batch) for batch in batches]
     ends = [_ends(batch, success_coverage) for batch in batches]
     return {
-        **{name: sum(one[name] for one in earned) / max(decisions, 1) for name in earned[0]},
-        "episodes": sum(len(one["coverage"]) for one in ends),
-        **{name: torch.cat([one[name] for one in ends]).mean().item() for name in ends[0]},
+        **{name: sum(sums[name] for sums in earned) / max(decisions, 1) for name in earned[0]},
+        "episodes": sum(len(end["coverage"]) for end in ends),
+        **{name: torch.cat([end[name] for end in ends]).mean().item() for name in ends[0]},
     }
 
 

@@ -118,11 +118,12 @@ def take_weights(run: TrainingRun) -> bool:
 def widened(state: dict[str, torch.Tensor], like: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Weights of a policy that is told nothing of radios for one that is: the inputs that it has besides weigh 0."""
 
-    def widen(one: torch.Tensor, more: int) -> torch.Tensor:
-        return torch.nn.functional.pad(one, (0, more)) if more > 0 else one
+    def widen(tensor: torch.Tensor, more: int) -> torch.Tensor:
+        return torch.nn.functional.pad(tensor, (0, more)) if more > 0 else tensor
 
     return {
-        name: widen(one, like[name].shape[-1] - one.shape[-1]) if one.dim() == 2 else one for name, one in state.items()
+        name: widen(tensor, like[name].shape[-1] - tensor.shape[-1]) if tensor.dim() == 2 else tensor
+        for name, tensor in state.items()
     }
 
 
@@ -131,8 +132,8 @@ def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]
     cfg, device = run.cfg, choose_device(run.cfg, "train_device")
     with blame_input():
         envs = [
-            make_env(cfg, run.suite.train, one.num_robots, one.num_envs, device=device)
-            for one in divide_teams(cfg.num_envs, run.sizes)
+            make_env(cfg, run.suite.train, team.num_robots, team.num_envs, device=device)
+            for team in divide_teams(cfg.num_envs, run.sizes)
         ]
         teacher = find_player(cfg.warm_start, "warm_start")
         teachers = [teacher.make(env) for env in envs]
@@ -162,7 +163,7 @@ def imitate(learner: Learner, optimizer: torch.optim.Optimizer, steps: list[Tens
     policy, updater = learner.policy, learner.updater
     for parts in updater.minibatches(steps, updater.settings.minibatch_size):
         heads = [negative_log_likelihood(policy, part) for part in parts]
-        mean = {name: sum(one[name] for one in heads) / len(heads) for name in heads[0]}
+        mean = {name: sum(head[name] for head in heads) / len(heads) for name in heads[0]}
         loss = sum(mean.values())
         check_finite("the negative log-likelihood", loss)
         optimizer.zero_grad()

@@ -132,9 +132,9 @@ def tag(column: str) -> str:
 def compare(summary: dict[str, Any]) -> tuple[list[str], list[list[Any]]]:
     """The columns and rows of the table of a summary.json: a policy, and the means of its metrics."""
     policies = [name for name in summary["run"]["distinct_episodes"] if name in summary]
-    told = [name for name in COLUMNS if all(name in summary[one] for one in policies)]
-    metrics = [name for name in told if any(summary[one][name]["n"] for one in policies)]
-    return ["policy", *metrics], [[one, *(summary[one][name]["mean"] for name in metrics)] for one in policies]
+    told = [name for name in COLUMNS if all(name in summary[policy] for policy in policies)]
+    metrics = [name for name in told if any(summary[policy][name]["n"] for policy in policies)]
+    return ["policy", *metrics], [[policy, *(summary[policy][name]["mean"] for name in metrics)] for policy in policies]
 
 
 def log_results(folder: Path, settings: LoggerSettings, frames: int, config: dict) -> None:

@@ -220,13 +220,13 @@ def short_name(word: str) -> str:
 
 def check_planner(planner: str, players: Sequence[NamedPolicy]) -> None:
     """Raise UserError where policies that pick goals meet a planner that takes controls, or the other way round."""
-    goals = [one.name for one in players if one.direct is False]
+    goals = [player.name for player in players if player.direct is False]
     if goals and planner == "direct":
         raise UserError(
             f"planner=direct takes controls, and {', '.join(goals)} pick{'s' if len(goals) == 1 else ''} goals: "
             "use planner=dwa or wavefront."
         )
-    controls = [one.name for one in players if one.direct]
+    controls = [player.name for player in players if player.direct]
     if controls and planner != "direct":
         raise UserError(
             f"{', '.join(controls)} {'was' if len(controls) == 1 else 'were'} trained with planner=direct, and "
@@ -240,19 +240,19 @@ def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> Non
     Raises:
         UserError: they look at different things, or the settings show another number of targets.
     """
-    counts = {one.name: one.targets for one in players if one.targets is not None}
+    counts = {player.name: player.targets for player in players if player.targets is not None}
     if counts:
         counts |= {"observation.targets": cfg.observation.targets} if cfg.observation.targets else {}
         if len(set(counts.values())) > 1:
             told = ", ".join(f"{word} {count}" for word, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
         cfg.observation.targets = next(iter(counts.values()))
-    cfg.observation.radio = cfg.observation.radio or any(one.radio for one in players)
-    shown = {one.name: one.map for one in players if one.map is not None}
+    cfg.observation.radio = cfg.observation.radio or any(player.radio for player in players)
+    shown = {player.name: player.map for player in players if player.map is not None}
     if len(set(shown.values())) > 1:
         told = ", ".join(f"{word} {what}" for word, what in shown.items())
         raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
     if shown:
         cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True
-    elif not any(one.pictures for one in players):
+    elif not any(player.pictures for player in players):
         cfg.observation.pictures = False

@@ -44,24 +44,24 @@ def make_both(
     others = other_scenarios(cfg, words)
     if others and not alone:
         raise UserError(f"scenario.also={list(cfg.scenario.also)} needs collector=single.")
-    places = [(cfg, maps), *((one, load_maps(one.scenario).train) for one in others)]
+    places = [(cfg, maps), *((other, load_maps(other.scenario).train) for other in others)]
     sizes = team_sizes(cfg.num_robots)
     teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
     whole = words.collector.steps is None  # episodes, which differ in length from scenario to scenario
     envs = [
         make_env(
             *places[k // len(sizes)],
-            one.num_robots,
-            one.num_envs if alone else 1,
+            team.num_robots,
+            team.num_envs if alone else 1,
             device=here if alone else there,
-            first_env=one.first_env,
+            first_env=team.first_env,
         )
-        for k, one in enumerate(teams)
+        for k, team in enumerate(teams)
     ]
     set_steps(cfg, envs[0])
     steps = [env.macro_steps if whole else cfg.collector.steps for env in envs]
-    for env, one, length in zip(envs, teams, steps, strict=True):
-        check_batch_memory(env, length, one.num_envs)
+    for env, team, length in zip(envs, teams, steps, strict=True):
+        check_batch_memory(env, length, team.num_envs)
     like = envs[0] if envs[0].device == there else make_env(cfg, maps[:1], teams[0].num_robots, 1, device=there)
     learner = make_learner(cfg, like)
     if alone:
@@ -120,5 +120,7 @@ def describe_workers(cfg: TrainSettings) -> str:
     workers, backend = cfg.collector.workers, cfg.collector.backend
     if backend == "single":
         return "one process"
-    one, several = {"processes": ("worker process", "worker processes"), "ray": ("Ray worker", "Ray workers")}[backend]
-    return f"{workers} {one if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"
+    single, several = {"processes": ("worker process", "worker processes"), "ray": ("Ray worker", "Ray workers")}[
+        backend
+    ]
+    return f"{workers} {single if workers == 1 else several}{', one batch ahead' * cfg.collector.overlap}"

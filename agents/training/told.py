@@ -81,7 +81,7 @@ class ToldRollouts(Rollouts):
         if self.strategy is not None:
             for name, theirs in self.origin.strategy.state.items():
                 self.strategy.state[name][: len(rows)] = theirs[rows]
-        self.known, self.known_sum = (one.clone() for one in self._count())
+        self.known, self.known_sum = (count.clone() for count in self._count())
         self.left = (self.origin.macro_steps - state["macro_step"]) * self.origin.local_steps
 
     def _count(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -160,7 +160,7 @@ class TrainingRun:
     def batch_frames(self) -> int:
         """Macro steps of teams in one iteration."""
         if self.cfg.scenario.also:  # whose episodes differ in length
-            return sum(one.requested_frames_per_batch for one in self.experience.collectors)
+            return sum(collector.requested_frames_per_batch for collector in self.experience.collectors)
         return self.cfg.num_envs * self.cfg.collector.steps
 
     @property

@@ -69,7 +69,7 @@ class Validation:
     @property
     def best(self) -> dict[int, str]:
         """Team size -> the best classical planner."""
-        return {size: one.policy for size, one in self.rivals.items()}
+        return {size: rival.policy for size, rival in self.rivals.items()}
 
     @property
     def rival(self) -> str:
@@ -101,17 +101,17 @@ class Validation:
         """What the best planners did, as containers of tensors and text."""
         return {
             size: {
-                "policy": one.policy,
-                "episodes": {metric: torch.from_numpy(values) for metric, values in one.episodes.items()},
-                "maps": one.maps.tolist(),
-                "success_coverage": one.success_coverage,
+                "policy": rival.policy,
+                "episodes": {metric: torch.from_numpy(values) for metric, values in rival.episodes.items()},
+                "maps": rival.maps.tolist(),
+                "success_coverage": rival.success_coverage,
             }
-            for size, one in self._rivals.items()
+            for size, rival in self._rivals.items()
         }
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
         """What `state_dict` returned; the planners need not play."""
-        for size, one in state.items():
-            episodes = {metric: values.numpy() for metric, values in one["episodes"].items()}
-            maps, goal = np.array(one["maps"]), one["success_coverage"]
-            self._rivals[size] = EvaluationResult(one["policy"], size, episodes, 0.0, maps, success_coverage=goal)
+        for size, rival in state.items():
+            episodes = {metric: values.numpy() for metric, values in rival["episodes"].items()}
+            maps, goal = np.array(rival["maps"]), rival["success_coverage"]
+            self._rivals[size] = EvaluationResult(rival["policy"], size, episodes, 0.0, maps, success_coverage=goal)

@@ -152,7 +152,7 @@ class WorkerExperience(Experience):
         self.pending = [Call(group.collect) for group in self.groups]
 
     def _push(self, policy: torch.nn.Module | TensorDictBase) -> None:
-        self._wait([Call(one.update_policy_weights_, policy) for one in self.collectors])
+        self._wait([Call(collector.update_policy_weights_, policy) for collector in self.collectors])
 
     def _wait(self, calls: list[Call]) -> list[Any]:
         """The results, in the end; WorkerLost as soon as a worker is gone."""
@@ -270,7 +270,7 @@ class RayGroup(WorkerGroup):
     def __init__(self, collector: "RayCollector", name: str):
         super().__init__(collector, name)
         self.places = collector.get_distant_attr("place")
-        self.actors = [one._actor_id.hex() for one in collector.remote_collectors]
+        self.actors = [remote_collector._actor_id.hex() for remote_collector in collector.remote_collectors]
 
     def find_lost(self, error: BaseException | None = None) -> str | None:
         from ray.exceptions import RayActorError
@@ -305,12 +305,12 @@ def make_workers(
             start, given = start_processes, Path(folder, "maps")
             given.write_bytes(pickle.dumps(maps))
         groups = []
-        for one in teams:
-            shares = one.split(settings.workers)
-            rest = device, threads, choose_starts(cfg, one.num_robots)
+        for team in teams:
+            shares = team.split(settings.workers)
+            rest = device, threads, choose_starts(cfg, team.num_robots)
             factories = [WorkerEnv(OmegaConf.to_yaml(cfg), given, part, *rest) for part in shares]
-            name = "collector worker" if len(teams) == 1 else f"for teams of {one.num_robots}: collector worker"
-            groups.append(start(factories, policy_there, one.num_envs * settings.steps, name))
+            name = "collector worker" if len(teams) == 1 else f"for teams of {team.num_robots}: collector worker"
+            groups.append(start(factories, policy_there, team.num_envs * settings.steps, name))
     return WorkerExperience(groups, policy, settings.overlap)
 
 

@@ -89,8 +89,8 @@ def in_a_process(name, suite):
 @contextmanager
 def at_a_socket(name, suite):
     """The same behind TCP; its process belongs to the one that listens."""
-    with socket.create_server(("127.0.0.1", 0)) as one:
-        address = f"127.0.0.1:{one.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = f"127.0.0.1:{listener.getsockname()[1]}"
     command = [sys.executable, "-m", "maexp.agents.policies.connection", address, f"process:{name}"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -155,7 +155,7 @@ def main(name="cost_utility", *ways):
     for way in ways or WAYS:
         batches, rows = measure(way, name, suite, maps)
         first = batches if first is None else first
-        cells = ["-" if np.isnan(one) else f"{1e3 * one:.1f}" for one in np.median(rows, axis=0)]
+        cells = ["-" if np.isnan(seconds) else f"{1e3 * seconds:.1f}" for seconds in np.median(rows, axis=0)]
         told = "" if batches is first else compare(batches, first)
         print(f"| {way} | {' | '.join(cells)} | {told} |", flush=True)
 

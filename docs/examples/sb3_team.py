@@ -11,7 +11,7 @@ def make(env):
     def choose(tensordict):
         seen = tensordict["agents", "observation"].flatten(0, 1)  # robots of all teams, one after the other
         robots = {name: seen[key].numpy().astype(model.observation_space[name].dtype) for name, key in names.items()}
-        robots = {name: one.reshape(-1, *model.observation_space[name].shape) for name, one in robots.items()}
+        robots = {name: robot.reshape(-1, *model.observation_space[name].shape) for name, robot in robots.items()}
         chosen, _ = model.predict(robots, action_masks=robots["action_mask"].astype(bool), deterministic=True)
         tensordict["agents", "action", "target"] = torch.as_tensor(chosen).view(env.num_envs, env.num_robots)
         return tensordict

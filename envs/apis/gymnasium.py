@@ -189,5 +189,5 @@ def _mode(mode: AutoresetMode | str) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError as error:
-        known = ", ".join(one.value for one in AutoresetMode)
+        known = ", ".join(mode.value for mode in AutoresetMode)
         raise ValueError(f"autoreset_mode={mode!r} is unknown: choose one of {known}") from error

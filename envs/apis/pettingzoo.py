@@ -66,7 +66,7 @@ class TeamParallelEnv(ParallelEnv):
         if self._pictures:
             self.state_space = observation_space(spec["team"], 1)["map"]
         else:
-            numbers = sum(spaces.flatdim(one) for one in self.observation_spaces.values()) + 1
+            numbers = sum(spaces.flatdim(space) for space in self.observation_spaces.values()) + 1
             self.state_space = spaces.Box(-np.inf, np.inf, (numbers,), np.float32)
         self._now: TensorDictBase | None = None  # what the team sees
 
@@ -144,10 +144,10 @@ class TeamParallelEnv(ParallelEnv):
             idle = 0 if isinstance(space, spaces.Discrete) else np.zeros(2)
         given = {name: actions.get(name, idle) for name in self.possible_agents}
         if isinstance(space, spaces.Dict):
-            for name, one in given.items():
-                if not isinstance(one, dict) or not {"region", "offset"} <= set(one):
-                    raise ValueError(f"the action of {name} is {one!r}: give a dict of region and offset")
-            together: Any = {key: _stacked(key, [one[key] for one in given.values()]) for key in space}
+            for name, action in given.items():
+                if not isinstance(action, dict) or not {"region", "offset"} <= set(action):
+                    raise ValueError(f"the action of {name} is {action!r}: give a dict of region and offset")
+            together: Any = {key: _stacked(key, [action[key] for action in given.values()]) for key in space}
         else:
             together = _stacked("action", list(given.values()))
         return to_action(together, self._kind, self._targets, self.env)
@@ -175,6 +175,6 @@ class TeamParallelEnv(ParallelEnv):
 def _stacked(name: str, values: list) -> np.ndarray:
     """One array [1, N, ...] of the robots' values."""
     try:
-        return np.stack([np.asarray(one) for one in values])[None]
+        return np.stack([np.asarray(value) for value in values])[None]
     except ValueError as error:
         raise ValueError(f"{name} has a different shape for different agents: {values}") from error

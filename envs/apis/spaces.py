@@ -58,14 +58,16 @@ def settle(action: str | None, settings: dict[str, Any]) -> tuple[str, dict[str,
 
 def named(observation: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """What a robot sees, or its spec, under the names that other projects expect."""
-    return {MASK if kind == "targets" and name == "targets_mask" else name: one for name, one in observation.items()}
+    return {
+        MASK if kind == "targets" and name == "targets_mask" else name: value for name, value in observation.items()
+    }
 
 
 def observation_space(spec: Mapping[str, TensorSpec], lead: int) -> spaces.Dict:
     """The space of one observation: ``spec`` without its first ``lead`` dimensions."""
     inner = {
-        name: observation_space(one, lead) if isinstance(one, Composite) else _leaf(one, lead)
-        for name, one in spec.items()
+        name: observation_space(part, lead) if isinstance(part, Composite) else _leaf(part, lead)
+        for name, part in spec.items()
     }
     return spaces.Dict(inner)
 
@@ -83,10 +85,10 @@ def _leaf(spec: TensorSpec, lead: int) -> spaces.Space:
 def to_numpy(values: Mapping[str, torch.Tensor] | TensorDictBase, space: spaces.Dict) -> dict:
     """``values`` in the shapes and types of ``space``."""
     return {
-        name: to_numpy(values[name], one)
-        if isinstance(one, spaces.Dict)
-        else values[name].cpu().numpy().reshape(one.shape).astype(one.dtype, copy=False)
-        for name, one in space.items()
+        name: to_numpy(values[name], part)
+        if isinstance(part, spaces.Dict)
+        else values[name].cpu().numpy().reshape(part.shape).astype(part.dtype, copy=False)
+        for name, part in space.items()
     }
 
 
@@ -116,7 +118,7 @@ def to_action(actions, kind: str, targets: int, env: ExplorationEnv) -> TensorDi
             raise ValueError(f"the action is {type(actions).__name__}: give a dict of region and offset")
         region, offset = _choice("region", actions["region"], shape), actions["offset"]
         parts = {"region": region, "offset": _box("offset", offset, (*shape, 2))}
-    tensors = {name: torch.as_tensor(one, device=env.device) for name, one in parts.items()}
+    tensors = {name: torch.as_tensor(part, device=env.device) for name, part in parts.items()}
     inner = TensorDict(tensors, batch_size=shape, device=env.device)
     return TensorDict({"agents": {"action": inner}}, batch_size=shape[:1], device=env.device)
 

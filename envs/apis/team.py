@@ -51,7 +51,7 @@ class TeamEnv(gymnasium.Env):
     def step(self, action) -> tuple[dict, float, bool, bool, dict]:
         """One decision of the team: observation, reward (the sum over robots), terminated, truncated, info."""
         if isinstance(action, dict):
-            actions: Any = {name: np.asarray(one)[None] for name, one in action.items()}
+            actions: Any = {name: np.asarray(value)[None] for name, value in action.items()}
         else:
             actions = np.asarray(action)[None]
         observation, reward, terminated, truncated, info = self.teams.step(actions)

@@ -88,7 +88,7 @@ class CommConfig(Group):
         """A signal must be able to arrive, and a delay be one; a place becomes a tuple."""
         super().checked()
         if 0.0 < self.delay and not self.message_steps:
-            raise ValueError(f"comm.delay={self.delay:g} is less than half a step of {STEP:g} s: use 0 or {STEP:g}")
+            raise ValueError(f"comm.delay={self.delay:g} is less than half a step of {DT:g} s: use 0 or {DT:g}")
         if self.signal and self.threshold >= self.power - LOSS:
             raise ValueError(
                 f"comm.threshold={self.threshold:g} dBm is out of reach: of comm.power={self.power:g} dBm "

@@ -81,7 +81,7 @@ class EnvSettings:
             ValueError: a value of a group is out of its range (named).
         """
         robots, radars = (
-            tuple(one.completed(scenario) for one in per_robot(name, getattr(self, name), kind, self.num_robots))
+            tuple(config.completed(scenario) for config in per_robot(name, getattr(self, name), kind, self.num_robots))
             for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
         )
         others = {name: kind for name, kind in GROUPS.items() if name not in ("robot", "radar")}
@@ -91,7 +91,7 @@ class EnvSettings:
         if not macro_steps and maps:
             team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
             macro_steps = default_macro_steps(maps, scenario, team, local_steps)
-        groups = {name: one.completed(scenario) for name, one in groups.items()}
+        groups = {name: group.completed(scenario) for name, group in groups.items()}
         steps: dict[str, Any] = {"local_steps": local_steps, "macro_steps": macro_steps}
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
@@ -107,7 +107,7 @@ class EnvSettings:
 
 
 GROUPS: dict[str, type[Group]] = {
-    one.name: type(one.default) for one in fields(EnvSettings) if isinstance(one.default, Group)
+    field.name: type(field.default) for field in fields(EnvSettings) if isinstance(field.default, Group)
 }
 """The groups of settings by their names."""
 DONE = words_of(EnvSettings, "done")

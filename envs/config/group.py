@@ -19,8 +19,10 @@ class Group:
         Raises:
             ValueError: a value is out of its range (named).
         """
-        names = {one.name: one.metadata.get("scenario") for one in fields(self) if getattr(self, one.name) is None}
-        return replace(self, **{one: getattr(scenario, name) for one, name in names.items() if name}).checked()
+        names = {
+            field.name: field.metadata.get("scenario") for field in fields(self) if getattr(self, field.name) is None
+        }
+        return replace(self, **{setting: getattr(scenario, name) for setting, name in names.items() if name}).checked()
 
     def checked(self) -> Self:
         """Itself, if every value is in its range and the values go together; else ValueError."""
@@ -31,4 +33,4 @@ class Group:
 def supplied(kind: type[Group]) -> list[str]:
     """Settings of a robot, radar or planner that are None by default and that a scenario, any one, fills in."""
     filled = kind().completed(SCENARIOS["maze"])
-    return [one.name for one in fields(kind) if one.default is None and getattr(filled, one.name) is not None]
+    return [field.name for field in fields(kind) if field.default is None and getattr(filled, field.name) is not None]

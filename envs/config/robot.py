@@ -53,7 +53,7 @@ class RobotConfig(Group):
 
     def _check_radius(self, radius: float) -> None:
         """It is one, and agrees with what else is said of the body."""
-        metadata = {one.name: one.metadata for one in fields(self)}["radius"]
+        metadata = {field.name: field.metadata for field in fields(self)}["radius"]
         check_value("robot.radius", radius, kinds(RobotConfig)["radius"], metadata)
         for name in BODY:
             value, round_one = getattr(self, name), radius if name == "collision_threshold" else 2 * radius

@@ -28,7 +28,7 @@ def to_grid(path: Path, message, options: ImportOptions) -> Grid:
         raise MapError(f"{path}: the grid's resolution={cell:g} must be between 0.0001 and 100 m a cell")
     corner = (float(info.origin.position.x), float(info.origin.position.y))
     yaw = read_yaw(info.origin.orientation)
-    if not all(abs(one) <= MAX_ORIGIN for one in (*corner, yaw)):
+    if not all(abs(coordinate) <= MAX_ORIGIN for coordinate in (*corner, yaw)):
         raise MapError(f"{path}: the grid's origin={corner} with yaw {yaw:g} is no place; record it again")
     occupied = OCCUPIED if options.occupied_threshold is None else options.occupied_threshold
     free = FREE_BELOW if options.free_threshold is None else options.free_threshold

@@ -79,19 +79,19 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _choose_topic(path: Path, bag, options: ImportOptions):
     """The connection to read: the one asked for, the only grid, or else the only cloud."""
-    held = {one.topic: one for one in bag.connections if one.msgcount}
-    usable = {topic: one for topic, one in held.items() if one.msgtype in (GRID, CLOUD)}
+    held = {connection.topic: connection for connection in bag.connections if connection.msgcount}
+    usable = {topic: connection for topic, connection in held.items() if connection.msgtype in (GRID, CLOUD)}
     if options.topic is not None:
         wanted = usable.get(options.topic) or usable.get(f"/{options.topic}")
         if wanted is None:
             raise MapError(f"importing.topic={options.topic!r} of {path} holds no map; {_list(usable) or _list(held)}")
         return wanted
-    grids = [one for one in usable.values() if one.msgtype == GRID]
+    grids = [connection for connection in usable.values() if connection.msgtype == GRID]
     for kind in (grids, list(usable.values())):
         if len(kind) == 1:
             return kind[0]
         if kind:
-            named = {one.topic: one for one in kind}
+            named = {connection.topic: connection for connection in kind}
             raise MapError(
                 f"{path} has {len(kind)} topics that could be the map; choose one with topic=NAME (on the command line "
                 f"importing.topic=NAME); {_list(named)}"
@@ -100,7 +100,9 @@ def _choose_topic(path: Path, bag, options: ImportOptions):
 
 
 def _list(connections: dict) -> str:
-    told = [f"{topic} ({one.msgcount} x {one.msgtype})" for topic, one in sorted(connections.items())]
+    told = [
+        f"{topic} ({connection.msgcount} x {connection.msgtype})" for topic, connection in sorted(connections.items())
+    ]
     return f"it has {', '.join(told[:20])}{' ...' if len(told) > 20 else ''}" if told else ""
 
 
@@ -129,7 +131,7 @@ def _last_grid(path: Path, bag, chosen, options: ImportOptions, report: ImportRe
 def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportReport) -> Cloud:
     """Every cloud of a topic, in the frame that tf calls fixed, one point a voxel."""
     tree = TfTree()
-    for message in _messages(bag, [one for one in bag.connections if one.msgtype == TF]):
+    for message in _messages(bag, [connection for connection in bag.connections if connection.msgtype == TF]):
         tree.add(message)
     voxel = min(options.voxel or VOXEL, VOXEL)
     kept, added, count, lost, frame = np.empty((0, 3)), [], 0, 0, ""

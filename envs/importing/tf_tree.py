@@ -19,15 +19,15 @@ class TfTree:
 
     def add(self, message) -> None:
         """The transforms of a message, from parent to child."""
-        for one in message.transforms:
-            shift, turn, stamp = one.transform.translation, one.transform.rotation, one.header.stamp
+        for transform in message.transforms:
+            shift, turn, stamp = transform.transform.translation, transform.transform.rotation, transform.header.stamp
             entry = (
-                _bare(one.header.frame_id),
+                _bare(transform.header.frame_id),
                 stamp.sec + 1e-9 * stamp.nanosec,
                 (shift.x, shift.y, shift.z),
                 (turn.x, turn.y, turn.z, turn.w),
             )
-            self._listed.setdefault(_bare(one.child_frame_id), []).append(entry)
+            self._listed.setdefault(_bare(transform.child_frame_id), []).append(entry)
             self._tracks.clear()
 
     def find(self, frame: str, time: float) -> tuple[str, np.ndarray, np.ndarray] | None:
@@ -58,8 +58,8 @@ class _Track:
 
     def __init__(self, entries: list[tuple[str, float, tuple, tuple]]):
         self.parent = entries[-1][0]
-        entries = [one for one in entries if one[0] == self.parent]
-        times, first = np.unique([one[1] for one in entries], return_index=True)
+        entries = [entry for entry in entries if entry[0] == self.parent]
+        times, first = np.unique([entry[1] for entry in entries], return_index=True)
         self.times = times
         self.shifts = np.array([entries[i][2] for i in first], dtype=np.float64)
         turns = np.array([entries[i][3] for i in first], dtype=np.float64)

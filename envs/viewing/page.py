@@ -234,12 +234,12 @@ class Page:
         self.status = gui.add_markdown("")
         if not self.episodes:
             return
-        names = [f"{k}: {one.map.name}, {one.policy}" for k, one in enumerate(self.episodes)]
+        names = [f"{k}: {episode.map.name}, {episode.policy}" for k, episode in enumerate(self.episodes)]
         self.play = gui.add_button("Play")
         self.time = gui.add_slider("time [s]", 0.0, 1.0, 0.1, 0.0)
         self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="2x")
         self.team = gui.add_dropdown("episode", names, initial_value=names[0])
-        fewest = min(one.num_robots for one in self.episodes)
+        fewest = min(episode.num_robots for episode in self.episodes)
         robots = [TEAM, *[f"robot {i}" for i in range(fewest)]]
         chosen = robots[0 if seen_by is None else 1 + seen_by]
         self.robot = gui.add_dropdown("explored by", robots, initial_value=chosen)

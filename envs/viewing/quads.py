@@ -35,7 +35,7 @@ class Quads:
     @classmethod
     def join(cls, parts: list[Quads]) -> Quads:
         """All of `parts`."""
-        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
     def pick(self, chosen: np.ndarray) -> Quads:
         """Those of a mask or of indices."""

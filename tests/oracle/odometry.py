@@ -38,7 +38,7 @@ class Walker:
         """Centre and heading that the robot believes, its reference point being at (x, y): on the map."""
         heading += self.error[2]
         at = (x + self.error[0] + offset * math.cos(heading), y + self.error[1] + offset * math.sin(heading))
-        return tuple(min(max(one, a), b) for one, a, b in zip(at, low, high, strict=True)), heading
+        return tuple(min(max(coordinate, a), b) for coordinate, a, b in zip(at, low, high, strict=True)), heading
 
 
 def seen_from(true, believed, place) -> tuple[float, float]:

@@ -42,7 +42,7 @@ def watch(tracker, needless: np.ndarray, over: torch.Tensor) -> None:
             at = {i: points[e, i, chosen[e, i]] for i in placed}
             for i in placed:
                 free = points[e, i][preference[e, i] > -torch.inf]
-                spare = (torch.stack([(free - one).norm(dim=-1) for one in at.values()]).amin(0) >= 2 * body).any()
+                spare = (torch.stack([(free - place).norm(dim=-1) for place in at.values()]).amin(0) >= 2 * body).any()
                 close = [hears[e, i, j] and (at[i] - at[j]).norm() < 2 * body for j in placed if j < i]
                 needless[e] += spare * sum(map(bool, close))
         return chosen, waits
@@ -85,7 +85,7 @@ def main(policy: str, episodes: int, scenarios: list[str]) -> None:
             factor = 100.0 if metric in PERCENT else 1.0
             low, high = (np.nan if end is None else factor * end for end in apart[metric]["ci95"])
             told = f"{factor * apart[metric]['mean']:+.2f} [{low:+.2f}, {high:+.2f}]"
-            values = " | ".join(f"{factor * one[metric]['mean']:.2f}" for one in (old, new))
+            values = " | ".join(f"{factor * summary[metric]['mean']:.2f}" for summary in (old, new))
             print(f"| {name} | {values} | {told} |", flush=True)
 
 

@@ -42,7 +42,7 @@ class TruthNearby(Beliefs):
     def _guess(self, count: int) -> None:
         place = self.place[:count].tolist()
         for world, m in enumerate(place):
-            width, height, margin = (int(getattr(self.sizes, one)[m]) for one in ("width", "height", "margin"))
+            width, height, margin = (int(getattr(self.sizes, name)[m]) for name in ("width", "height", "margin"))
             inner = (height - 2 * margin, width - 2 * margin)
             known = self.known[world, : math.prod(inner)].view(inner).numpy()
             known, truth = np.pad(known, margin), np.pad(self.truth[m], margin)

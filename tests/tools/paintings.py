@@ -22,8 +22,8 @@ def seconds(work, *arguments) -> float:
 
 
 def paint_all(grids, launch) -> None:
-    for one in grids:
-        one.paint(launch)
+    for grid in grids:
+        grid.paint(launch)
 
 
 def measure(scenario: str) -> list[dict[str, float]]:
@@ -37,10 +37,10 @@ def measure(scenario: str) -> list[dict[str, float]]:
         row = {"policy": seconds(paint_all, [nav.known_grids], nav.launch)}
         row["planner"] = seconds(paint_all, drivers, nav.launch)
         row["looking"] = seconds(paint_all, drivers, nav.launch)
-        known = np.concatenate([one.known.numpy() for one in drivers])
+        known = np.concatenate([driver.known.numpy() for driver in drivers])
         assert (known == nav.known_grids.known.numpy()).all(), "the planner and the policy know different maps"
-        for one in (nav.known_grids, *drivers):
-            one.news_count.fill_(-1)  # masks follow the list of the last painting, which was in vain
+        for grids in (nav.known_grids, *drivers):
+            grids.news_count.fill_(-1)  # masks follow the list of the last painting, which was in vain
         begin = time.process_time()
         td = env.step_and_maybe_reset(policy(td))[1]
         rows.append(row | {"all": time.process_time() - begin})
@@ -49,9 +49,9 @@ def measure(scenario: str) -> list[dict[str, float]]:
 
 def show(scenario: str, rows: list[dict[str, float]]) -> None:
     parts = {
-        "painting for the policy": [one["policy"] / one["all"] for one in rows],
-        "for the planner at the same moment": [one["planner"] / one["all"] for one in rows],
-        "of which what is new": [(one["planner"] - one["looking"]) / one["all"] for one in rows],
+        "painting for the policy": [row["policy"] / row["all"] for row in rows],
+        "for the planner at the same moment": [row["planner"] / row["all"] for row in rows],
+        "of which what is new": [(row["planner"] - row["looking"]) / row["all"] for row in rows],
     }
     for name, shares in parts.items():
         half = 1.96 * statistics.stdev(shares) / len(shares) ** 0.5

@@ -24,16 +24,18 @@ def statements(source: str) -> Iterator[str]:
     """Every statement, without what stands in its bodies."""
     nodes = list(ast.walk(ast.parse(source)))
     docstrings = {
-        id(one.body[0]) for one in nodes if isinstance(one, DOCUMENTED) and ast.get_docstring(one) is not None
+        id(node.body[0]) for node in nodes if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None
     }
-    for one in [node for node in nodes if isinstance(node, ast.stmt) and id(node) not in docstrings]:
-        fields = [(name, part) for name, part in ast.iter_fields(one) if name not in BODIES]
-        yield ast.dump(type(one)(**dict(fields)))
+    for node in [node for node in nodes if isinstance(node, ast.stmt) and id(node) not in docstrings]:
+        fields = [(name, part) for name, part in ast.iter_fields(node) if name not in BODIES]
+        yield ast.dump(type(node)(**dict(fields)))
 
 
 def read(commit: str) -> dict[str, Counter[str]]:
     """File -> its statements."""
-    paths = [one for one in git("ls-tree", "-r", "--name-only", commit, *FOLDERS).splitlines() if one.endswith(".py")]
+    paths = [
+        path for path in git("ls-tree", "-r", "--name-only", commit, *FOLDERS).splitlines() if path.endswith(".py")
+    ]
     return {path: Counter(statements(git("show", f"{commit}:{path}"))) for path in paths}
 
 
@@ -42,7 +44,7 @@ def folder(path: str) -> str:
 
 
 def total(files: dict[str, Counter[str]]) -> int:
-    return sum(one.total() for one in files.values())
+    return sum(file.total() for file in files.values())
 
 
 def show(files: dict[str, Counter[str]]) -> None:
@@ -62,12 +64,12 @@ def compare(first: str, second: str) -> None:
     kept = (old & new).total()
     print(f"{first}: {old.total():,}; {second}: {new.total():,}")
     print(f"stand still {kept:,}, gone or rewritten {old.total() - kept:,}, new or rewritten {new.total() - kept:,}")
-    known = {path: one for path, one in after.items() if path in was}
+    known = {path: count for path, count in after.items() if path in was}
     print(
         f"in {len(known)} files that stood there: {sum(before[was[path]].total() for path in known):,}", end=" before, "
     )
-    gone = {path: one for path, one in before.items() if path not in was.values()}
-    fresh = {path: one for path, one in after.items() if path not in was}
+    gone = {path: count for path, count in before.items() if path not in was.values()}
+    fresh = {path: count for path, count in after.items() if path not in was}
     moved = (sum(fresh.values(), Counter()) & old).total()
     print(f"{total(known):,} now; in {len(gone)} files that went: {total(gone):,}")
     print(f"in {len(fresh)} files that came: {total(fresh):,}, of which {moved:,} stood somewhere before:")

@@ -43,13 +43,13 @@ def make_trainer(*overrides: str) -> Callable[[], dict]:
     from maexp.agents.settings.compose import compose_config
     from maexp.agents.speed.train import Trainee
 
-    one = Trainee.build(compose_config("train", list(overrides)))
-    share = MACRO_STEPS / (one.env.num_envs * one.cfg.collector.steps)
+    trainee = Trainee.build(compose_config("train", list(overrides)))
+    share = MACRO_STEPS / (trainee.env.num_envs * trainee.cfg.collector.steps)
 
     def turn() -> dict[str, float]:
         begin = time.process_time()
-        one.iterate()
-        laps = one.laps[-1] | {"processor": time.process_time() - begin}
+        trainee.iterate()
+        laps = trainee.laps[-1] | {"processor": time.process_time() - begin}
         return {f"{name} [s]": share * seconds for name, seconds in laps.items()}
 
     return turn
@@ -57,7 +57,9 @@ def make_trainer(*overrides: str) -> Callable[[], dict]:
 
 def serve(kind: str, settings: list[str]) -> None:
     """A turn for every line that comes in, after one that warms up."""
-    turn = make_stepper(**dict(one.split("=") for one in settings)) if kind == "steps" else make_trainer(*settings)
+    turn = (
+        make_stepper(**dict(setting.split("=") for setting in settings)) if kind == "steps" else make_trainer(*settings)
+    )
     turn()
     for _ in range(TURNS):
         print("ready", flush=True)

@@ -12,8 +12,8 @@ from maexp.envs.fields import setting
 DriveSettings = make_dataclass(
     "DriveSettings",
     [
-        (one.name, Any, setting(None if one.default == () else one.default, f"team: {one.metadata['help']}"))
-        for one in fields(DriverSettings)
+        (field.name, Any, setting(None if field.default == () else field.default, f"team: {field.metadata['help']}"))
+        for field in fields(DriverSettings)
     ],
 )
 

@@ -54,7 +54,7 @@ class Graph:
         free = (grid == 0) & ~grown(wall, int(np.ceil(radius)))
         self.nodes = np.concatenate([starts, self._spread(free, step)])
         i, j = pairs_within(self.nodes, self.nodes, NEAR * reach)
-        i, j = (one[i != j] for one in (i, j))
+        i, j = (ends[i != j] for ends in (i, j))
         clear = sees(grown(grid == 0) & ~wall, self.nodes[i], self.nodes[j])
         i, j = i[clear], j[clear]
         self.ways = np.full((len(self.nodes),) * 2, np.inf)
@@ -103,10 +103,10 @@ def describe(graph, robot, others, picked, visited, reach, shared):
     """
     ways = np.minimum(graph.distances(robot) / reach, FAR)
     away = (graph.nodes - graph.nodes[robot]) / reach
-    theirs = np.min([graph.distances(one) for one in others] or [np.full(len(ways), np.inf)], 0) / reach
+    theirs = np.min([graph.distances(mate) for mate in others] or [np.full(len(ways), np.inf)], 0) / reach
     goals = np.where(np.isnan(graph.goals), graph.nodes, graph.goals)
-    taken = np.min([np.hypot(*(goals - one).T) for one in picked] or [np.full(len(ways), np.inf)], 0) / reach
-    been = np.min([np.hypot(*(graph.nodes - one).T) for one in visited], 0) / reach
+    taken = np.min([np.hypot(*(goals - goal).T) for goal in picked] or [np.full(len(ways), np.inf)], 0) / reach
+    been = np.min([np.hypot(*(graph.nodes - place).T) for place in visited], 0) / reach
     columns = [
         away / 3,
         np.hypot(*away.T) / 3,
@@ -151,8 +151,8 @@ class Network:
     def _attend(self, name, x, y, edges):
         """Of x to those of y that `edges` [len(x), len(y)] allow."""
         q, k, v = (
-            self._linear(f"{name}.{one}", z).reshape(len(z), HEADS, -1).swapaxes(0, 1)
-            for one, z in (("q", x), ("k", y), ("v", y))
+            self._linear(f"{name}.{projection}", z).reshape(len(z), HEADS, -1).swapaxes(0, 1)
+            for projection, z in (("q", x), ("k", y), ("v", y))
         )
         score = np.where(edges, q @ k.swapaxes(1, 2) / np.sqrt(WIDTH / HEADS), -np.inf)
         weight = np.exp(score - score.max(-1, keepdims=True))

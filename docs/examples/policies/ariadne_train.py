@@ -31,7 +31,7 @@ class Attention(nn.Module):
         self.q, self.k, self.v, self.out = (nn.Linear(WIDTH, WIDTH) for _ in range(4))
 
     def forward(self, x, y, edges):
-        q, k, v = (one.unflatten(-1, (HEADS, -1)).transpose(1, 2) for one in (self.q(x), self.k(y), self.v(y)))
+        q, k, v = (tensor.unflatten(-1, (HEADS, -1)).transpose(1, 2) for tensor in (self.q(x), self.k(y), self.v(y)))
         heard = nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=edges.unsqueeze(1))
         return self.out(heard.transpose(1, 2).flatten(2))
 

@@ -75,7 +75,7 @@ class Greedy:
             distance = np.hypot(*(points - own).T).min()
             if length >= self.shortest:
                 options.append((POTENTIAL * distance - GAIN * length, distance, points.mean(0)))
-        for _, distance, centre in sorted(options, key=lambda one: one[0]):
+        for _, distance, centre in sorted(options, key=lambda option: option[0]):
             if self.is_worth(robot, centre, distance, observation["time"]):
                 return free[np.hypot(*(free - centre).T).argmin()]
         return np.nan

@@ -82,7 +82,7 @@ def plan(scene, fades):
         reverse_parts(ways, tours, costs)
         for stop in stops.tolist():
             robot = next(robot for robot, tour in enumerate(tours) if stop in tour)
-            tours[robot] = [one for one in tours[robot] if one != stop]
+            tours[robot] = [other for other in tours[robot] if other != stop]
             costs[robot] = ways.cost(robot, tours[robot])
             insert(ways, tours, costs, stop)
         if ways.whole(costs) > before - 1e-9:

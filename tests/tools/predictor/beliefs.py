@@ -102,8 +102,8 @@ def plan_files(folder: str, split_name: str) -> list[Path]:
         UserError: there are none.
     """
     groups: dict[Path, list[Path]] = {}
-    for one in sorted(Path(folder).rglob("*.yaml")):
-        groups.setdefault(one.parent, []).append(one)
+    for path in sorted(Path(folder).rglob("*.yaml")):
+        groups.setdefault(path.parent, []).append(path)
     if not groups:
         raise UserError(f"plans={folder} holds no map_server yaml: give a folder of plans, or leave it out.")
     chosen = []
@@ -161,11 +161,11 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
             when[(known == state) & (when == NEVER)] = decision
         td = step_mdp(env.step(td))
         decision, done = decision + 1, bool(td["done"].all())
-    grids = [build_nav_grid(one) for one in env.maps]
+    grids = [build_nav_grid(world) for world in env.maps]
     episodes = []
     for k, grid in enumerate(grids[m] for m in place):
         size, cells = (grid.height, grid.width), grid.height * grid.width
-        when = [one[k, :cells].numpy().reshape(size).copy() for one in (free_at, wall_at)]
+        when = [steps[k, :cells].numpy().reshape(size).copy() for steps in (free_at, wall_at)]
         episodes.append(BeliefEpisode(*when, open_cells(grid).reshape(size), decision, row.radar_range / grid.cell))
     return episodes
 
@@ -173,9 +173,9 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
 def save_episodes(path: Path, episodes: list[BeliefEpisode]) -> None:
     """One compressed file, whole or not there."""
     arrays = {
-        f"{k}/{one.name}": getattr(episode, one.name)
+        f"{k}/{field.name}": getattr(episode, field.name)
         for k, episode in enumerate(episodes)
-        for one in fields(BeliefEpisode)
+        for field in fields(BeliefEpisode)
     }
     write_file(path, lambda file: np.savez_compressed(file, **arrays))
 
@@ -184,11 +184,13 @@ def load_episodes(path: Path) -> list[BeliefEpisode]:
     """What `save_episodes` wrote."""
     with np.load(path, allow_pickle=False) as file:
         count = 1 + max(int(name.split("/")[0]) for name in file.files)
-        names = [one.name for one in fields(BeliefEpisode)]
+        names = [field.name for field in fields(BeliefEpisode)]
         values = [{name: file[f"{k}/{name}"] for name in names} for k in range(count)]
     return [
-        until_covered(BeliefEpisode(**{name: one[name] if one[name].ndim else one[name].item() for name in names}))
-        for one in values
+        until_covered(
+            BeliefEpisode(**{name: value[name] if value[name].ndim else value[name].item() for name in names})
+        )
+        for value in values
     ]
 
 
@@ -241,12 +243,12 @@ def write_batch(config: BeliefConfig, name: str, sources: list, first: int) -> N
     missing = [k for k, name in enumerate(names) if not name.exists()]
     if not missing:
         return
-    maps = [import_plan(one) if scenario == PLANS else make_map(scenario, one) for one in sources]
+    maps = [import_plan(source) if scenario == PLANS else make_map(scenario, source) for source in sources]
     for k in missing:
         begin = time.perf_counter()
         episodes = play_maps(maps, TEAMS[k % len(TEAMS)], config.seed + first + 10_007 * k, config.departures)
         save_episodes(names[k], episodes)
-        decisions = sum(one.decisions for one in episodes)
+        decisions = sum(episode.decisions for episode in episodes)
         print(f"{names[k].name}: {decisions} beliefs in {time.perf_counter() - begin:.1f} s", flush=True)
 
 

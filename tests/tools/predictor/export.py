@@ -104,7 +104,7 @@ def export_predictor(config: ExportConfig) -> None:
         "by_distance": count_tables(load_groups(Path(config.train)))["distance"].round(4).tolist(),
         "trained": saved["config"] | {"steps_done": saved["step"]},
         "opset": OPSET,
-        "versions": {one: metadata.version(one) for one in PACKAGES},
+        "versions": {package: metadata.version(package) for package in PACKAGES},
         "commit": find_commit(),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }

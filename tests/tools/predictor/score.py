@@ -68,28 +68,28 @@ class Unknown:
 def look_at(episodes: list[BeliefEpisode], moments: int, guess: Callable[[np.ndarray], np.ndarray] | None) -> Unknown:
     """Unknown cells near known free ground at some decisions of every episode, ground around the maps included."""
     parts = []
-    for one in episodes:
-        margin = math.ceil(BAND * one.reach) + 1
-        truth = np.pad(one.truth, margin)
+    for episode in episodes:
+        margin = math.ceil(BAND * episode.reach) + 1
+        truth = np.pad(episode.truth, margin)
         for k in range(moments):
-            known = np.pad(one.known(int((k + 0.5) / moments * one.decisions)), margin)
-            counts = matters(known, BAND * one.reach)
+            known = np.pad(episode.known(int((k + 0.5) / moments * episode.decisions)), margin)
+            counts = matters(known, BAND * episode.reach)
             if counts.any():
                 away = ndimage.distance_transform_edt(known != FREE)[counts].astype(np.float32)
                 y, x = ndimage.distance_transform_edt(known == UNKNOWN, return_distances=False, return_indices=True)
                 wall = known[y[counts], x[counts]] == OBSTACLE
                 chance = guess(known)[counts] if guess else np.empty(0, np.float32)
-                parts.append((truth[counts], away, wall, away / np.float32(one.reach), chance))
-    return Unknown(*(np.concatenate(one) for one in zip(*parts, strict=True)))
+                parts.append((truth[counts], away, wall, away / np.float32(episode.reach), chance))
+    return Unknown(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def count_free(cells: list[Unknown], groups: Callable[[Unknown], np.ndarray], size: int) -> np.ndarray:
     """Share of free cells in each group, float64 [size]; every scenario counts alike."""
     free, total = np.ones(size), np.full(size, 2.0)
-    for one in cells:
-        number = groups(one)
+    for cell in cells:
+        number = groups(cell)
         scale = 1e6 / len(number)
-        free += scale * np.bincount(number, one.free, size)
+        free += scale * np.bincount(number, cell.free, size)
         total += scale * np.bincount(number, minlength=size)
     return free / total
 
@@ -106,9 +106,9 @@ def by_nearest(cells: Unknown) -> np.ndarray:
 
 def count_tables(groups: dict[str, list[BeliefEpisode]]) -> dict[str, np.ndarray]:
     """Histograms of training maps: what a cell is where nothing, or only what is near it, is looked at."""
-    seen = [look_at(one[:: max(1, len(one) // COUNTED)], 2, None) for one in groups.values()]
+    seen = [look_at(group[:: max(1, len(group) // COUNTED)], 2, None) for group in groups.values()]
     return {
-        "constant": count_free(seen, lambda one: np.zeros(len(one.free), int), 1),
+        "constant": count_free(seen, lambda cells: np.zeros(len(cells.free), int), 1),
         "distance": count_free(seen, by_distance, MOST_DISTANCE + 1),
         "nearest": count_free(seen, by_nearest, 2 * (MOST_DISTANCE + 1)),
     }
@@ -140,18 +140,18 @@ def judge_samples(
     radar range of a frontier cell lies within the middle 80 % of the samples, `width` how wide those are as a share of
     the unknown cells there.
     """
-    rng, found = np.random.default_rng(0), {str(one): [] for one in ("truth", *lengths)}
-    for one in episodes:
-        margin = math.ceil(BAND * one.reach) + 1
-        truth = np.pad(one.truth, margin)
+    rng, found = np.random.default_rng(0), {str(name): [] for name in ("truth", *lengths)}
+    for episode in episodes:
+        margin = math.ceil(BAND * episode.reach) + 1
+        truth = np.pad(episode.truth, margin)
         for k in range(moments):
-            known = np.pad(one.known(int((k + 0.5) / moments * one.decisions)), margin)
+            known = np.pad(episode.known(int((k + 0.5) / moments * episode.decisions)), margin)
             frontier = np.argwhere((known == FREE) & ndimage.binary_dilation(known == UNKNOWN))
             if not len(frontier):
                 continue
             y, x = frontier[rng.integers(len(frontier))]
             rows, columns = np.ogrid[: known.shape[0], : known.shape[1]]
-            disc = (known == UNKNOWN) & ((rows - y) ** 2 + (columns - x) ** 2 <= one.reach**2)
+            disc = (known == UNKNOWN) & ((rows - y) ** 2 + (columns - x) ** 2 <= episode.reach**2)
             pairs = disc[:, 1:] & disc[:, :-1]
             found["truth"].append((share_alike(truth, pairs), math.nan, math.nan))
             chance = torch.from_numpy(guess(known))[None]
@@ -188,11 +188,11 @@ def score(config: ScoreConfig) -> dict[str, dict[str, dict[str, float]]]:
             "nearest": tables["nearest"][by_nearest(cells)],
             "network": cells.guess,
         }
-        found[name] = {way: judge(cells.free, one, cells.ranges) for way, one in guesses.items()}
+        found[name] = {way: judge(cells.free, guessed, cells.ranges) for way, guessed in guesses.items()}
         found[name]["cells"] = {"count": len(cells.free), "free": float(cells.free.mean())}
         found[name]["samples"] = judge_samples(episodes, guess, 2, LENGTHS)
     found["mean"] = mean_figures(list(found.values()))
-    found["tables"] = {name: [round(float(one), 4) for one in table] for name, table in tables.items()}
+    found["tables"] = {name: [round(float(chance), 4) for chance in table] for name, table in tables.items()}
     return found
 
 
@@ -201,29 +201,30 @@ def mean_figures(scores: list[dict]) -> dict:
     first = scores[0]
     if not isinstance(first, dict):
         return float(np.nanmean(scores)) if np.isfinite(scores).any() else math.nan
-    return {name: mean_figures([one[name] for one in scores]) for name in first}
+    return {name: mean_figures([figures[name] for figures in scores]) for name in first}
 
 
 def print_scores(found: dict) -> None:
     """Tables in Markdown: of guesses, and of samples."""
-    scores = {name: one for name, one in found.items() if name != "tables"}
+    scores = {name: figures for name, figures in found.items() if name != "tables"}
     guesses = {
-        name: {way: row for way, row in one.items() if way not in ("cells", "samples")} for name, one in scores.items()
+        name: {way: row for way, row in figures.items() if way not in ("cells", "samples")}
+        for name, figures in scores.items()
     }
     print_table("guess", guesses)
     print()
-    print_table("length", {name: one["samples"] for name, one in scores.items()})
+    print_table("length", {name: figures["samples"] for name, figures in scores.items()})
 
 
 def print_table(what: str, tables: dict[str, dict[str, dict[str, float]]]) -> None:
     """A line for each scenario and guess."""
     columns = list(next(iter(tables["mean"].values())))
     rows = [
-        [scenario, way, *(fixed(3)(figures[one]) for one in columns)]
+        [scenario, way, *(fixed(3)(figures[column]) for column in columns)]
         for scenario, ways in tables.items()
         for way, figures in ways.items()
     ]
-    print("\n".join(markdown_table(["scenario", what, *(one.replace("_", " ") for one in columns)], rows)))
+    print("\n".join(markdown_table(["scenario", what, *(column.replace("_", " ") for column in columns)], rows)))
 
 
 def main(config: ScoreConfig) -> None:

@@ -74,7 +74,7 @@ def draw_crops(groups: dict[str, list[BeliefEpisode]], count: int, side: int, rn
         crop = cut_around(known, episode, side, rng)
         if crop is not None:
             drawn.append(turn(crop, int(rng.integers(8))))
-    known, truth, counts = (torch.from_numpy(np.stack(one)) for one in zip(*drawn, strict=True))
+    known, truth, counts = (torch.from_numpy(np.stack(crops)) for crops in zip(*drawn, strict=True))
     return Crops(known, truth, counts)
 
 
@@ -84,7 +84,7 @@ def cut_around(known: np.ndarray, episode: BeliefEpisode, side: int, rng: np.ran
     if not len(frontier):
         return None
     corner = frontier[rng.integers(len(frontier))] - side // 2 + rng.integers(-side // 8, side // 8 + 1, 2)
-    known, truth = (cut(one, corner, side) for one in (known, episode.truth))
+    known, truth = (cut(grid, corner, side) for grid in (known, episode.truth))
     counts = matters(known, BAND * episode.reach)
     counts[:EDGE] = counts[-EDGE:] = False
     counts[:, :EDGE] = counts[:, -EDGE:] = False
@@ -110,8 +110,8 @@ def matters(known: np.ndarray, band: float) -> np.ndarray:
 
 def turn(grids: tuple[np.ndarray, ...], number: int) -> list[np.ndarray]:
     """One of the eight symmetries of a square."""
-    turned = [np.rot90(one, number % 4) for one in grids]
-    return [np.ascontiguousarray(one.T if number >= 4 else one) for one in turned]
+    turned = [np.rot90(grid, number % 4) for grid in grids]
+    return [np.ascontiguousarray(grid.T if number >= 4 else grid) for grid in turned]
 
 
 def rate(step: int, config: PredictorConfig) -> float:
@@ -198,7 +198,7 @@ def save(config: PredictorConfig, net: MapPredictor, optimizer: torch.optim.Opti
         "rows": rows,
     }
     write_file(Path(config.out) / CHECKPOINT, lambda file: torch.save(content, file))
-    lines = ["step,log_loss", *(f"{one},{loss:.6f}" for one, loss in rows)]
+    lines = ["step,log_loss", *(f"{step},{loss:.6f}" for step, loss in rows)]
     write_text(Path(config.out) / LOG, "\n".join(lines) + "\n")
 
 

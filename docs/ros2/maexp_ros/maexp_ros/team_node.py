@@ -51,7 +51,7 @@ class TeamNode(Node):
             self.create_subscription(OccupancyGrid, topic, partial(driver.take_map, topic), latched(1))
         for robot in (None, *driver.driven):
             place = "" if robot is None else f"/{robot}"
-            moving, still = (partial(driver.take_frames, robot=robot, still=one) for one in (False, True))
+            moving, still = (partial(driver.take_frames, robot=robot, still=fixed) for fixed in (False, True))
             self.create_subscription(TFMessage, f"{place}/tf", moving, QoSProfile(depth=100))
             self.create_subscription(TFMessage, f"{place}/tf_static", still, latched(100))
         for robot in driver.driven:
