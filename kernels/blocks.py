@@ -12,7 +12,7 @@ from maexp.kernels.constants import MARGIN_CELLS, UNREACHED
 from maexp.kernels.frontier import is_frontier
 from maexp.kernels.known_grid import NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.passable import has_wall
+from maexp.kernels.native import has_wall
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.wavefront import PathSearch
 

@@ -24,134 +24,15 @@ import torch
 import warp as wp
 
 from maexp.kernels.arrays import Field, make_arrays
-from maexp.kernels.constants import BLOCKED, DIAGONAL, STRAIGHT, TIGHT, TIGHT_FACTOR, UNREACHED
+from maexp.kernels.constants import UNREACHED
 from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.native import search_from
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
 
 
-BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
-LAST_BUCKET = BUCKETS - 1
-
 SKIP = -2  # as the stop of a search: leave its distances as they are
-
-
-# In C++: half the time of the same in Warp's Python, most of which goes to looking at eight neighbours. Rows of cells
-# have no gaps. Warp's debug mode does not look at pointers, but it heeds `assert`.
-SEARCH = f"""
-    const int cells = w * h;
-    const wp::uint8* state = &wp::index(passable, row, 0);
-    int* label = &wp::index(distance, item, 0);
-    int* labelled = &wp::index(touched, item, 0);
-    int* after = &wp::index(next, place, 0);
-    int* before = &wp::index(previous, place, 0);
-    assert(cells <= passable.shape[1] && cells <= distance.shape[1]);
-    assert(cells <= next.shape[1] && cells <= previous.shape[1]);
-    assert(labelled[0] >= 0 && labelled[1] < distance.shape[1]);
-
-    auto search = [&](auto left)  // the least that may be left from a cell to the goal
-    {{
-        int bucket[{BUCKETS}];
-        int waiting = 0, key = {UNREACHED}, limit = 2147483646, lowest = cells, highest = -1;
-
-        auto lower = [&](int cell, int x, int y, int value)  // and move the cell to the bucket of its key
-        {{
-            assert(x >= 0 && x < w && y >= 0 && y < h && cell == y * w + x);
-            const int old = label[cell];
-            if (value >= old) return;
-            label[cell] = value;
-            const int rest = left(x, y);
-            if (old < {UNREACHED})
-            {{
-                const int ahead = after[cell], behind = before[cell];
-                if (behind < 0) bucket[((old + rest) >> 1) & {LAST_BUCKET}] = ahead; else after[behind] = ahead;
-                if (ahead >= 0) before[ahead] = behind;
-            }}
-            else ++waiting;
-            int& head = bucket[((value + rest) >> 1) & {LAST_BUCKET}];
-            after[cell] = head;
-            before[cell] = -1;
-            if (head >= 0) before[head] = cell;
-            head = cell;
-        }};
-        auto visit = [&](int cell, int x, int y, int value, int weight)
-        {{
-            lower(cell, x, y, value + (state[cell] == {TIGHT} ? {TIGHT_FACTOR} * weight : weight));
-        }};
-
-        for (int k = 0; k < {BUCKETS}; ++k) bucket[k] = -1;
-        for (int k = 0; k < sources.shape[1]; ++k)
-        {{
-            const int source = wp::index(sources, item, k);
-            if (source < 0 || source >= cells || state[source] == {BLOCKED}) continue;
-            const int y = source / w, x = source - y * w;
-            lower(source, x, y, 0);
-            key = wp::min(key, left(x, y));
-            lowest = wp::min(lowest, source);
-            highest = wp::max(highest, source);
-        }}
-        while (waiting > 0 && key <= limit)
-        {{
-            int& head = bucket[(key >> 1) & {LAST_BUCKET}];
-            const int cell = head;
-            if (cell < 0) {{ key += 2; continue; }}
-            const int d = label[cell], y = cell / w, x = cell - y * w;
-            head = after[cell];
-            if (head >= 0) before[head] = -1;
-            --waiting;
-            lowest = wp::min(lowest, cell);
-            highest = wp::max(highest, cell);
-            if (cell == goal) limit = d;
-            const bool east = x + 1 < w && state[cell + 1] != {BLOCKED}, west = x > 0 && state[cell - 1] != {BLOCKED};
-            if (east) visit(cell + 1, x + 1, y, d, {STRAIGHT});
-            if (west) visit(cell - 1, x - 1, y, d, {STRAIGHT});
-            auto pass = [&](int beside, int v)
-            {{
-                if (state[beside] == {BLOCKED}) return;
-                visit(beside, x, v, d, {STRAIGHT});
-                if (east && state[beside + 1] != {BLOCKED}) visit(beside + 1, x + 1, v, d, {DIAGONAL});
-                if (west && state[beside - 1] != {BLOCKED}) visit(beside - 1, x - 1, v, d, {DIAGONAL});
-            }};
-            if (y + 1 < h) pass(cell + w, y + 1);
-            if (y > 0) pass(cell - w, y - 1);
-        }}
-        // Labels lie at most one row and one column beyond the cells that were left.
-        labelled[0] = wp::max(lowest - w - 1, 0);
-        labelled[1] = wp::min(highest + w + 1, cells - 1);
-    }};
-
-    for (int cell = labelled[0]; cell <= labelled[1]; ++cell) label[cell] = {UNREACHED};
-    if (goal < 0) search([](int, int) {{ return 0; }});
-    else
-    {{
-        const int goal_y = goal / w, goal_x = goal - goal_y * w;
-        search([=](int x, int y)
-        {{
-            const int dx = wp::abs(x - goal_x), dy = wp::abs(y - goal_y);
-            return {STRAIGHT} * wp::max(dx, dy) + {DIAGONAL - STRAIGHT} * wp::min(dx, dy);
-        }});
-    }}
-"""
-
-
-@wp.func_native(SEARCH)
-def search_from(
-    passable: wp.array2d(dtype=wp.uint8),
-    row: int,
-    sources: wp.array2d(dtype=wp.int32),
-    item: int,
-    goal: int,
-    place: int,
-    w: int,
-    h: int,
-    next: wp.array2d(dtype=wp.int32),
-    previous: wp.array2d(dtype=wp.int32),
-    touched: wp.array2d(dtype=wp.int32),
-    distance: wp.array2d(dtype=wp.int32),
-):
-    """Distances of all cells, or of the ways to `goal`; those of the search before are cleared."""
-    ...
 
 
 @wp.kernel

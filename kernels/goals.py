@@ -7,30 +7,11 @@ batch.
 import warp as wp
 
 from maexp.kernels.known_grid import NavGrids, nav_center
+from maexp.kernels.native import keyed_uniform
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import REGIONS
 
 wp.set_module_options(MODULE_OPTIONS)
-
-# The finaliser of splitmix64 (Steele et al. 2014); in C++, for Warp's constants end below 2^63.
-UNIFORM = """
-    const wp::int32 parts[5] = {seed, env_id, episode, macro_step, index};
-    wp::uint64 key = 0;
-    for (int k = 0; k < 5; ++k)
-    {
-        key += (wp::uint64)(wp::int64)parts[k] + 0x9E3779B97F4A7C15ull;
-        key = (key ^ (key >> 30)) * 0xBF58476D1CE4E5B9ull;
-        key = (key ^ (key >> 27)) * 0x94D049BB133111EBull;
-        key = key ^ (key >> 31);
-    }
-    return (key >> 40) / 16777216.0f;
-"""
-
-
-@wp.func_native(UNIFORM)
-def keyed_uniform(seed: int, env_id: int, episode: int, macro_step: int, index: int) -> float:
-    """A number in [0, 1)."""
-    ...
 
 
 @wp.kernel

@@ -19,6 +19,7 @@ import warp as wp
 from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import Launch, lanes_on, launch_named
+from maexp.kernels.native import next_news
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
@@ -95,42 +96,6 @@ def enter_cell(
         slot = wp.atomic_add(news_count, row, 1)
         if slot < news.shape[1]:
             news[row, slot] = cell
-
-
-# In C++: nearly all points are looked at in vain.
-NEXT_NEWS = """
-    const int* flag = &wp::index(flags, e, word, 0);
-    const wp::uint8* done = &wp::index(painted, row, shift);
-    int found = 0, point = start;
-    assert(end <= flags.shape[2] && shift + end <= painted.shape[1]);
-    for (; point < end; point += lanes)
-    {
-        int seen = flag[point];
-        for (int k = 1; k < words; ++k) seen |= wp::index(flags, e, word + k, point);
-        if ((seen & mask) == 0) continue;
-        ++found;
-        if (done[point] == 0) break;
-    }
-    return wp::vec2i(point, found);
-"""
-
-
-@wp.func_native(NEXT_NEWS)
-def next_news(
-    flags: wp.array3d(dtype=wp.int32),
-    e: int,
-    word: int,
-    words: int,
-    mask: int,
-    painted: wp.array2d(dtype=wp.uint8),
-    row: int,
-    shift: int,
-    start: int,
-    end: int,
-    lanes: int,
-) -> wp.vec2i:
-    """The next point from `start` on that is known and not yet painted, and how many known ones were met up to it."""
-    ...
 
 
 @wp.kernel

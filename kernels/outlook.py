@@ -7,8 +7,9 @@ import math
 
 import warp as wp
 
-from maexp.kernels.constants import OBSTACLE, RAYS, UNKNOWN
+from maexp.kernels.constants import RAYS
 from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.native import see_cells
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
@@ -33,68 +34,6 @@ def _spread_rays(
     part[ray, step] = wp.vec3(share, moment[0], moment[1])
 
 
-# In C++, like `geodesic.SEARCH`: half the time. It relies on rows of cells without gaps.
-LOOK_FROM = f"""
-    const wp::uint8* state = &wp::index(known, row, 0);
-    float weight[3] = {{}};
-    weight[{UNKNOWN}] = 1.0f;
-    const int x = cell % w, y = cell / w;
-    const bool inside = x >= reach && x + reach < w && y >= reach && y + reach < h;
-    int low_x = x, low_y = y, high_x = x, high_y = y;
-    float total = 0.0f, moment_x = 0.0f, moment_y = 0.0f;
-    for (int ray = 0; ray < {RAYS}; ++ray)
-    {{
-        const wp::vec2i* to = &wp::index(ray_cell, ray, 0);
-        const wp::vec3* part = &wp::index(ray_part, ray, 0);
-        int u = x, v = y;
-        for (int step = 1; step <= reach; ++step)
-        {{
-            const int next_u = x + to[step][0], next_v = y + to[step][1];
-            if (!inside && (next_u < 0 || next_u >= w || next_v < 0 || next_v >= h)) break;
-            // Not between two walls that touch at a corner either; of a straight step these are its two ends.
-            const int there = state[next_v * w + next_u], left = state[next_v * w + u], right = state[v * w + next_u];
-            u = next_u;
-            v = next_v;
-            if (there == {OBSTACLE} || (left == {OBSTACLE} & right == {OBSTACLE})) break;
-            // Products with 1 and 0 are exact, and quicker than a branch that nobody can foresee.
-            const float counts = weight[there], share = counts * part[step][0];
-            const float far_x = counts * part[step][1], far_y = counts * part[step][2];
-            total += share;
-            moment_x += far_x;
-            moment_y += far_y;
-        }}
-        low_x = u < low_x ? u : low_x;
-        low_y = v < low_y ? v : low_y;
-        high_x = u > high_x ? u : high_x;
-        high_y = v > high_y ? v : high_y;
-    }}
-    wp::vec_t<5, wp::float64> found;
-    found[0] = total;
-    found[1] = moment_x;
-    found[2] = moment_y;
-    found[3] = low_y * w + low_x;
-    found[4] = high_y * w + high_x;
-    return found;
-"""
-
-found_from = wp.types.vector(length=5, dtype=wp.float64)
-
-
-@wp.func_native(LOOK_FROM)
-def look(
-    known: wp.array2d(dtype=wp.uint8),
-    row: int,
-    cell: int,
-    w: int,
-    h: int,
-    reach: int,
-    ray_cell: wp.array2d(dtype=wp.vec2i),
-    ray_part: wp.array2d(dtype=wp.vec3),
-) -> found_from:
-    """Unknown cells in sight, the sum of the ways there, and the corners of what was looked at."""
-    ...
-
-
 @wp.func
 def look_from(
     grids: NavGrids,
@@ -112,7 +51,7 @@ def look_from(
     of its circle that falls to one ray.
     """
     reach = int(wp.min(radius / grids.cell[m], float(ray_cell.shape[1] - 1)))  # no ray is longer
-    found = look(known, row, cell, grids.width[m], grids.height[m], reach, ray_cell, ray_part)
+    found = see_cells(known, row, cell, grids.width[m], grids.height[m], reach, ray_cell, ray_part)
     total = wp.float32(found[0])
     middle = wp.vec2(wp.float32(found[1]), wp.float32(found[2])) * (grids.cell[m] / wp.max(total, 1.0e-6))
     return total, middle, int(found[3]), int(found[4])

@@ -10,6 +10,7 @@ import warp as wp
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids, nav_center, wall_words
 from maexp.kernels.launches import Launch
+from maexp.kernels.native import nearest_wall
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import point_xy
@@ -24,7 +25,6 @@ SLACK = 0.5  # waypoints lie farther than that by this share of the spare gap, w
 SLACK_GAP = 2.0  # spare gap from which on the whole share counts, in collision thresholds
 SLACK_TIME = 0.5  # the gap that counts is the least of those here and where the robot is so much later [s]
 SAMPLES = 6  # intervals between the places ahead where the gap is measured
-LOOK_CELLS = 5  # how far the nearest obstacle is looked for, in cells
 AHEAD = 2.0  # the part of the path that the clearance is fitted to, in clearances around the robot
 FIT = 0.95  # share of its narrowest gap that DWA still keeps
 LEAST = 1.1  # the clearance never falls below so many collision thresholds
@@ -54,47 +54,6 @@ def clear_ahead(
                 free = 0.5 * free
             room = wp.min(room, free)
     return wp.max(room, 0.0)
-
-
-# In C++: from the place's own row outwards, until rows lie farther than what was found. In each row of the bitmap the
-# obstacles next to the place, one to either side, are the nearest. The least root is that of the least square.
-NEAREST_WALL = f"""
-    const int x = (int)wp::floor(p[0]), y = (int)wp::floor(p[1]);
-    const int first = wp::max(x - {LOOK_CELLS}, 0), last = wp::min(x + {LOOK_CELLS}, w - 1);
-    if (first > last) return {LOOK_CELLS}.0f;
-    const int begin = wp::max(x, 0), low = first / 32, shift = first % 32, more = last / 32 - low;
-    const unsigned window = (1u << (last - first + 1)) - 1u, below = (1u << (begin - first)) - 1u;
-    const int* word = &wp::index(walls, row, low);
-    assert((h - 1) * words + low + more < walls.shape[1]);
-    float nearest = {LOOK_CELLS * LOOK_CELLS}.0f;
-    auto look = [&](int v)  // at a row; whether those beyond it may be nearer
-    {{
-        const float dy = (float)v + 0.5f - p[1];
-        if (dy * dy >= nearest) return false;
-        if (v < 0 || v >= h) return true;
-        unsigned bits = unsigned(word[v * words]) >> shift;
-        if (more) bits |= unsigned(word[v * words + 1]) << (32 - shift);
-        bits &= window;
-        if (bits == 0u) return true;
-        const unsigned right = bits >> (begin - first);
-        unsigned left = bits & below;
-        left |= left >> 1; left |= left >> 2; left |= left >> 4;  // down from its highest bit, of {LOOK_CELLS} at most
-        const int behind = left ? first + wp::bit_count(left) - 1 : -{4 * LOOK_CELLS};
-        const int ahead = begin + wp::bit_count((right & (0u - right)) - 1u);  // 32 cells away where there is none
-        const wp::vec2 a((float)ahead + 0.5f - p[0], dy), b((float)behind + 0.5f - p[0], dy);
-        nearest = wp::min(nearest, wp::min(wp::dot(a, a), wp::dot(b, b)));
-        return true;
-    }};
-    for (int k = 0; k <= {LOOK_CELLS} && look(y - k); ++k);
-    for (int k = 1; k <= {LOOK_CELLS} && look(y + k); ++k);
-    return wp::sqrt(nearest);
-"""
-
-
-@wp.func_native(NEAREST_WALL)
-def nearest_wall(walls: wp.array2d(dtype=wp.int32), row: int, p: wp.vec2, w: int, h: int, words: int) -> float:
-    """Distance in cells from a place to the nearest obstacle cell's centre, `LOOK_CELLS` at most."""
-    ...
 
 
 @wp.func

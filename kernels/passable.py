@@ -11,6 +11,7 @@ from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import BLOCKED, FREE, OBSTACLE, TIGHT, UNKNOWN
 from maexp.kernels.known_grid import KnownGrids, NavGrids, wall_words
 from maexp.kernels.launches import Launch, launch_named
+from maexp.kernels.native import has_wall
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
@@ -64,23 +65,6 @@ def half_chord(gap: int, radius: float, most: int) -> int:
     while half >= 0 and float(gap * gap + half * half) >= square:
         half -= 1
     return half
-
-
-HAS_WALL = """
-    const wp::uint32* words = (const wp::uint32*)&wp::index(walls, row, line);
-    const int low = first / 32, high = last / 32;
-    const wp::uint32 from = ~0u << (first % 32), to = ~0u >> (31 - last % 32);
-    if (low == high) return (words[low] & from & to) != 0;
-    wp::uint32 found = (words[low] & from) | (words[high] & to);
-    for (int word = low + 1; word < high; ++word) found |= words[word];
-    return found != 0;
-"""
-
-
-@wp.func_native(HAS_WALL)
-def has_wall(walls: wp.array2d(dtype=wp.int32), row: int, line: int, first: int, last: int) -> bool:
-    """Whether a row of cells, whose words begin at `line`, holds a known obstacle from `first` to `last`."""
-    ...
 
 
 @wp.func
