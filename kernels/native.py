@@ -17,9 +17,6 @@ from maexp.kernels.constants import (
     UNKNOWN,
     UNREACHED,
 )
-from maexp.kernels.startup import MODULE_OPTIONS
-
-wp.set_module_options(MODULE_OPTIONS)
 
 BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
 LAST_BUCKET = BUCKETS - 1

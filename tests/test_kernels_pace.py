@@ -11,6 +11,7 @@ from maexp.kernels import outlook, pace, stopping
 from maexp.kernels.constants import FREE, OBSTACLE, RAYS, UNKNOWN
 from maexp.kernels.dynamics import ACKERMANN, DIFFERENTIAL, Robots
 from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.native import LOOK_CELLS
 from maexp.kernels.ways import PATH_CELLS
 
 pytestmark = pytest.mark.kernels
@@ -83,7 +84,7 @@ class World:
     def constants(self, e: int, i: int) -> dict:
         names = ("creep", "headroom", "brake", "slack", "slack_gap", "slack_time", "samples", "ahead", "fit", "least")
         return {name: getattr(pace, name.upper()) for name in names} | {
-            "look": pace.LOOK_CELLS,
+            "look": LOOK_CELLS,
             "lead": LEAD,
             "accel": self.accel[e, i],
             "threshold": self.threshold[e, i],
@@ -289,8 +290,8 @@ def test_the_nearest_obstacle_is_one_of_the_grid_alone(m, share):
     launch(_measure, len(places), [nav_grids(), m, walls, array(places * CELL[m] + ORIGIN[m], wp.vec2)], [got])
     centres = np.argwhere(bits)[:, ::-1] + 0.5
     gaps = np.linalg.norm(places[:, None] - centres[None], axis=-1)
-    near = (np.abs(np.floor(places)[:, None] + 0.5 - centres[None]) <= pace.LOOK_CELLS).all(-1)
-    want = np.where(near, gaps, pace.LOOK_CELLS).min(axis=1, initial=pace.LOOK_CELLS)
+    near = (np.abs(np.floor(places)[:, None] + 0.5 - centres[None]) <= LOOK_CELLS).all(-1)
+    want = np.where(near, gaps, LOOK_CELLS).min(axis=1, initial=LOOK_CELLS)
     np.testing.assert_allclose(got.numpy() / CELL[m], want, atol=1e-4)
 
 
