@@ -38,21 +38,24 @@ class Radio:
 
 
 @wp.func
-def count_blocked(grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin: int, a: wp.vec2, b: wp.vec2) -> int:
+def count_blocked(
+    grids: NavGrids, m: int, open: wp.array(dtype=wp.uint8), begin: int, a: wp.vec2, b: wp.vec2, nudge: float
+) -> int:
     """Cells of the map's grid along a line that are no free ground; those of the grid start at `begin`.
 
     The line is cut in as many equal pieces as it crosses columns of cells, or rows if those are more; the middle of
-    each stands for a cell; one on an edge, as of lines between middles of cells, counts with the greater cell. So the
-    line there and the line back count the same.
+    each stands for a cell. A `NUDGE` lets those on an edge, as of lines between middles of cells, count with the
+    greater cell, so that the line there and the line back count the same. Where pairs are in order anyway it is 0, and
+    published episodes keep their bits.
     """
     along = (b - a) / grids.cell[m]
-    pieces = wp.max(int(wp.ceil(wp.max(wp.abs(along[0]), wp.abs(along[1])) - NUDGE)), 1)
+    pieces = wp.max(int(wp.ceil(wp.max(wp.abs(along[0]), wp.abs(along[1])) - nudge)), 1)
     start = (a - grids.origin[m]) / grids.cell[m]
     blocked = int(0)
     for k in range(pieces):
         at = start + along * ((float(k) + 0.5) / float(pieces))
-        x = int(wp.floor(at[0] + NUDGE))
-        y = int(wp.floor(at[1] + NUDGE))
+        x = int(wp.floor(at[0] + nudge))
+        y = int(wp.floor(at[1] + nudge))
         inside = x >= 0 and y >= 0 and x < grids.width[m] and y < grids.height[m]
         if not inside:
             blocked += 1
@@ -87,7 +90,7 @@ def _measure_signals(
 ):
     """Received power without fading, on the first map [dBm]."""
     k = wp.tid()
-    blocked = float(count_blocked(grids, 0, open, 0, senders[k], receivers[k])) * (grids.cell[0] / radio.cell)
+    blocked = float(count_blocked(grids, 0, open, 0, senders[k], receivers[k], NUDGE)) * (grids.cell[0] / radio.cell)
     clear = wp.length(receivers[k] - senders[k]) / radio.cell - blocked
     power[k] = received_power(radio, blocked, clear, 0.0, 0.0)
 
@@ -110,7 +113,7 @@ def _count_known_blocked(
     """Cells along the lines from a team's sender to places of its robots that are not known to be free ground."""
     e, i, k = wp.tid()
     begin = (e * rows + wp.min(i, rows - 1)) * cells
-    blocked[e, i, k] = count_blocked(grids, map_id[e], open, begin, senders[e], receivers[e, i, k])
+    blocked[e, i, k] = count_blocked(grids, map_id[e], open, begin, senders[e], receivers[e, i, k], NUDGE)
 
 
 @wp.func
@@ -157,7 +160,9 @@ def _receive_signals(
             high = wp.max(i, other)
             a = point_xy(radio_at(e, low, center, base))
             b = point_xy(radio_at(e, high, center, base))
-            blocked = float(count_blocked(grids, m, open, grids.cell_begin[m], a, b)) * (grids.cell[m] / radio.cell)
+            blocked = float(count_blocked(grids, m, open, grids.cell_begin[m], a, b, 0.0)) * (
+                grids.cell[m] / radio.cell
+            )
             clear = wp.length(b - a) / radio.cell - blocked
             key = FADING_KEY + 2 * (low * radios + high)
             through = float(0.0)
