@@ -58,7 +58,7 @@ class Strategy:
         self.has_base, self.robots = env.comm_config.has_base, n
         comm = env.comm_config
         self.fades = comm.noise > 0.0 or comm.loss > 0.0  # links come and go: one moment says little
-        self.asks = self.fades or comm.messages  # who is connected may not know all
+        self.asks = comm.messages  # who is connected may not know all
         self.reach = max(radar.range for radar in env.radar_configs)
         self.drive = env.simulation.robot_tensors["max_speed"] * (PACE * DT * env.local_steps)  # of a decision [m]
 
