@@ -9,6 +9,7 @@ import json
 import math
 import sys
 from dataclasses import dataclass, field, fields
+from itertools import product
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -63,6 +64,9 @@ METRICS = (
     "collisions",
 )
 """Columns of the table."""
+COMPARED = (("coverage_auc", "perfect"), ("base_coverage_auc", "base"), ("coverage_auc", ""), ("base_coverage_auc", ""))
+"""Columns of paired differences in a metric, where there is something to compare: to that condition with the same
+policy, or to the first policy under the same condition."""
 PLAN, TABLE, FORMAT = "conditions.json", "conditions.md", "maexp-conditions-1"
 
 
@@ -154,54 +158,29 @@ def table(title: str, found: dict[str, dict[str, EvaluationResult]]) -> str:
     played = {name for row in found.values() for result in row.values() for name in result.episodes}
     shown = [MEASURES[name] for name in METRICS if name in played]
     policies = list(dict.fromkeys(policy for row in found.values() for policy in row))
-    columns = [column for column in COMPARED if column.makes_sense(found, policies)]
-    heads = ["condition", "policy", *(column.head(policies) for column in columns)]
-    heads += [f"{measure.column} [{measure.unit}]" for measure in shown]
-    rows = []
-    for condition, row in found.items():
-        for policy, result in row.items():
-            apart = [column.write(found, policies, condition, policy) for column in columns]
-            summary = result.summary()
-            rows.append([condition, f"`{policy}`", *apart, *(_mean(measure, summary) for measure in shown)])
-    return "\n".join([f"**{title}**", "", *markdown_table(heads, rows)])
+    rows = [(condition, policy) for condition, row in found.items() for policy in row]
+    columns = {}
+    for metric, to in COMPARED:
+        cells = [_compare(found, metric, row, (to, row[1]) if to else (row[0], policies[0])) for row in rows]
+        if any(cells):
+            columns[f"{MEASURES[metric].column}, minus {to or f'`{policies[0]}`'} [points]"] = cells
+    heads = ["condition", "policy", *columns, *(f"{measure.column} [{measure.unit}]" for measure in shown)]
+    lines = []
+    for (condition, policy), *apart in zip(rows, *columns.values(), strict=True):
+        summary = found[condition][policy].summary()
+        lines.append([condition, f"`{policy}`", *apart, *(_mean(measure, summary) for measure in shown)])
+    return "\n".join([f"**{title}**", "", *markdown_table(heads, lines)])
 
 
-@dataclass(frozen=True)
-class Compared:
-    """A column of paired differences in a metric: to another condition with the same policy, or to the first policy
-    under the same condition."""
-
-    metric: str
-    to: str = ""  # name of the condition; "": to the first policy
-
-    def head(self, policies: list[str]) -> str:
-        return f"{MEASURES[self.metric].column}, minus {self.to or f'`{policies[0]}`'} [points]"
-
-    def makes_sense(self, found: dict[str, dict[str, EvaluationResult]], policies: list[str]) -> bool:
-        """Whether there is anything to write."""
-        return any(self.write(found, policies, condition, policy) for condition in found for policy in policies)
-
-    def write(
-        self, found: dict[str, dict[str, EvaluationResult]], policies: list[str], condition: str, policy: str
-    ) -> str:
-        """Mean and interval; "" where there is nothing to compare with."""
-        mine = found[condition].get(policy)
-        beside = (self.to, policy) if self.to else (condition, policies[0])
-        other = found.get(beside[0], {}).get(beside[1])
-        if mine is None or other is None or mine is other:
-            return ""
-        if self.metric not in mine.episodes or self.metric not in other.episodes:
-            return ""
-        return MEASURES[self.metric].difference(mine.minus(other)[self.metric])
-
-
-COMPARED = (
-    Compared("coverage_auc", "perfect"),
-    Compared("base_coverage_auc", "base"),
-    Compared("coverage_auc"),
-    Compared("base_coverage_auc"),
-)
-"""Columns of differences, where there is something to compare."""
+def _compare(
+    found: dict[str, dict[str, EvaluationResult]], metric: str, row: tuple[str, str], beside: tuple[str, str]
+) -> str:
+    """Mean and interval of a paired difference between two (condition, policy); "" where there is nothing to compare
+    with."""
+    mine, other = (found.get(condition, {}).get(policy) for condition, policy in (row, beside))
+    if row == beside or mine is None or other is None or metric not in mine.episodes.keys() & other.episodes.keys():
+        return ""
+    return MEASURES[metric].difference(mine.minus(other)[metric])
 
 
 def _mean(measure: Measure, summary: dict[str, dict]) -> str:
@@ -273,12 +252,11 @@ def main(words: list[str]) -> int:
         Path(config.out).mkdir(parents=True, exist_ok=True)
         with lock(Path(config.out), "conditions"):
             keep_plan(config)
-            for scenario in config.places:
-                for team in config.teams:
-                    for condition in config.conditions:
-                        for policy in config.policies:
-                            play(config, scenario, team, condition, policy)
-                            write_table(config)
+            try:
+                for row in product(config.places, config.teams, config.conditions, config.policies):
+                    play(config, *row)
+            finally:  # of all that is done, however it ends
+                write_table(config)
     except UserError as error:
         print(f"conditions: {error}", file=sys.stderr)
         return 2

@@ -2,6 +2,9 @@
 
 import os
 import random
+import time
+
+import numpy as np
 
 QUICK = {"stands": 0.2, "limit": 0.5, "answer": 20.0}
 """Of `Serving`: nobody waits for long [s]."""
@@ -16,3 +19,18 @@ def surroundings() -> dict[str, str]:
     """Environment variables of a process that is to be alone with those that get the same."""
     domain = random.Random(os.urandom(8)).randrange(100, 230)
     return {"CYCLONEDDS_URI": LOOPBACK, "ROS_DOMAIN_ID": str(domain), "OMP_NUM_THREADS": "1"}
+
+
+def publish_robot(wire, name: str, values: np.ndarray, place: tuple[float, float, float]) -> None:
+    """What a robot of nobody's simulation publishes: its map, [60, 60] of cells of 0.1 m, and its pose on that."""
+    from maexp.agents.ros2.convert import transform  # needs DDS
+
+    now = int(time.time())
+    message = wire.writer(f"/{name}/map").make()
+    message.header.frame_id, message.header.stamp.sec = "map", now
+    message.info.resolution, message.info.width, message.info.height = 0.1, 60, 60
+    message.info.origin.orientation.w = 1.0
+    message.data = values.ravel().tolist()
+    wire.writer(f"/{name}/map").write(message)
+    frames = wire.writer(f"/{name}/tf")
+    frames.write(frames.make(transforms=[transform("map", "base_link", now * 10**9, place)]))

@@ -11,14 +11,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from loopback import surroundings
+from loopback import publish_robot, surroundings
 
 pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED: DDS is not tested")
 from small_suite import make_small_suite
 
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.ros2.convert import transform
 from maexp.agents.ros2.dds import Wire
 from maexp.agents.ros2.robot import Ros2Robot
 from maexp.agents.runtime import RobotPlanner, Word
@@ -124,21 +123,12 @@ class Places:
         self.cut = 30  # columns that a has seen
 
     def publish(self) -> None:
-        now = int(time.time())
         for k, name in enumerate("ab"):
-            message = self.wire.writer(f"/{name}/map").make()
-            message.header.frame_id, message.header.stamp.sec = "map", now
-            message.info.resolution, message.info.width, message.info.height = 0.1, 60, 60
-            message.info.origin.orientation.w = 1.0
             values = np.full((60, 60), -1)
             values[5:40, 5:50] = 0
             hidden = slice(self.cut, None) if name == "a" else slice(None, self.cut)
             values[:, hidden] = -1
-            message.data = values.ravel().tolist()
-            self.wire.writer(f"/{name}/map").write(message)
-            frames = self.wire.writer(f"/{name}/tf")
-            place = (1.5 + 3.0 * k, 1.5, 0.0)
-            frames.write(frames.make(transforms=[transform("map", "base_link", now * 10**9, place)]))
+            publish_robot(self.wire, name, values, (1.5 + 3.0 * k, 1.5, 0.0))
 
 
 def robot(name: str, **changes) -> Ros2Robot:

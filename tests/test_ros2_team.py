@@ -4,11 +4,11 @@ import time
 
 import numpy as np
 import pytest
+from loopback import publish_robot
 
 pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED: DDS is not tested")
 
 from maexp.agents.errors import UserError
-from maexp.agents.ros2.convert import transform
 from maexp.agents.ros2.dds import EPISODE, Wire
 from maexp.agents.ros2.goal_sending import (
     CANCELED,
@@ -37,18 +37,10 @@ class Publishers:
         self.goals = {name: self.wire.reader(f"/{name}/goal_pose") for name in "ab"}
 
     def publish(self) -> None:
-        now = int(time.time())
+        values = np.full((60, 60), -1)
+        values[5:40, 5:40] = 0
         for name in "ab":
-            message = self.wire.writer(f"/{name}/map").make()
-            message.header.frame_id, message.header.stamp.sec = "map", now
-            message.info.resolution, message.info.width, message.info.height = 0.1, 60, 60
-            message.info.origin.orientation.w = 1.0
-            values = np.full((60, 60), -1)
-            values[5:40, 5:40] = 0
-            message.data = values.ravel().tolist()
-            self.wire.writer(f"/{name}/map").write(message)
-            frames = self.wire.writer(f"/{name}/tf")
-            frames.write(frames.make(transforms=[transform("map", "base_link", now * 10**9, (1.0, 1.5, 0.0))]))
+            publish_robot(self.wire, name, values, (1.0, 1.5, 0.0))
 
 
 def step_until(made: Ros2Team, done, seconds: float = 60.0, again=None) -> None:
