@@ -2,11 +2,13 @@
 
 Every condition is an evaluation of its own (`maexp evaluate`) below `out`, of the same episodes. A command that was
 stopped goes on where it was when it is given again; more conditions, scenarios, teams or policies may join. Maps of
-one's own are played as a scenario with a name: `own.floors=a.yaml,b.yaml`.
+one's own are played as a scenario with a name: `own.floors=a.yaml,b.yaml`. A policy may need settings of its own, which
+those of a condition override: `words.lookahead='lookahead.rollout_policy=universal'`.
 """
 
 import json
 import math
+import shlex
 import sys
 from dataclasses import dataclass, field, fields
 from itertools import product
@@ -82,6 +84,7 @@ class ConditionsConfig:
     policies: list[str] = setting(
         ["cost_utility", "hungarian", "universal"], "each as `maexp evaluate policy=` takes it"
     )
+    words: dict[str, str] = field(default_factory=dict)  # name of a policy -> words of `maexp evaluate` that it needs
     episodes: int = setting(64, "of each condition, scenario, size and policy; of own maps shared out", low=1)
     num_envs: int = setting(32, "teams at once", low=1)
     seed: int = setting(0, "of maps, starts and everything else", low=0)
@@ -114,6 +117,7 @@ def play(config: ConditionsConfig, scenario: str, team: int, condition: str, pol
             f"seed={config.seed}",
             "num_threads=1",
             f"hydra.run.dir={quote(str(where))}",
+            *shlex.split(config.words.get(where.name, "")),
             *CONDITIONS[condition],
         ]
     print(f"{scenario}, {team} robots: {condition}, {policy}", flush=True)
@@ -203,6 +207,7 @@ def read_config(words: list[str]) -> ConditionsConfig:
             if not values[name] and not (name == "scenarios" and values["own"]):
                 raise ValueError(f"{name}=[] is empty: name at least one.")
         check_own(values["own"], values["scenarios"])
+        check_words(values["words"], [Path(policy).name for policy in values["policies"]])
         chosen = {next(iter(CONDITIONS)), *values["conditions"]}
         values["conditions"] = [name for name in CONDITIONS if name in chosen]
         config = ConditionsConfig(**values)
@@ -222,8 +227,21 @@ def check_own(own: dict[str, str], scenarios: list[str]) -> None:
                 raise ValueError(f"own.{name} names {file}, and there is no such file.")
 
 
+def check_words(words: dict[str, str], policies: list[str]) -> None:
+    """Raise ValueError for words of a policy that is not played, or that are none."""
+    for name, text in words.items():
+        if name not in policies:
+            raise ValueError(f"words.{name} is of no policy that is played: policies={','.join(policies)}.")
+        try:
+            wrong = [word for word in shlex.split(text) if "=" not in word]
+        except ValueError as error:  # a quotation mark without its partner
+            raise ValueError(f"words.{name}={text}: {error}.") from error
+        if wrong:
+            raise ValueError(f"words.{name}: {wrong[0]} is no word of `maexp evaluate`, as {name}='a.b=1 c.d=2'.")
+
+
 def keep_plan(config: ConditionsConfig) -> None:
-    """Write down what the folder's evaluations have in common, or see that it is still the same.
+    """Write down what the folder's evaluations have in common, and policies' words, or see that they are the same.
 
     Raises:
         UserError: it is not.
@@ -231,18 +249,18 @@ def keep_plan(config: ConditionsConfig) -> None:
     wanted = {"format": FORMAT} | {
         setting.name: getattr(config, setting.name) for setting in fields(config) if setting.name in KEPT
     }
+    words = {Path(policy).name: config.words.get(Path(policy).name, "") for policy in config.policies}
     path = Path(config.out) / PLAN
-    if not path.exists():
-        write_json(path, wanted)
-        return
     try:
-        there = json.loads(path.read_text())
+        there = json.loads(path.read_text()) if path.exists() else wanted
     except ValueError:
         there = {}
-    for name, value in wanted.items():
-        if there.get(name) != value:
-            was = f"was played with {name}={there.get(name)}, not {value}"
-            raise UserError(f"out={config.out} {was}: take another folder.")
+    given = there.get("words", {})
+    differ = {name: (there.get(name), value) for name, value in wanted.items() if there.get(name) != value}
+    differ |= {f"words.{name}": (given[name], text) for name, text in words.items() if given.get(name, text) != text}
+    for name, (was, value) in differ.items():
+        raise UserError(f"out={config.out} was played with {name}={was}, not {value}: take another folder.")
+    write_json(path, wanted | {"words": given | words})
 
 
 def main(words: list[str]) -> int:

@@ -93,6 +93,9 @@ def test_differences_are_paired_and_to_what_the_head_says():
         ("own.maze=x.yaml", "own.maze cannot be a scenario's name"),
         ("own.floors=gone.yaml", "own.floors names gone.yaml, and there is no such file"),
         ("weather=fog", "weather"),
+        ("words.x='comm.range=9'", "words.x is of no policy that is played: policies=cost_utility,hungarian,universal"),
+        ("words.universal=fast", "words.universal: fast is no word of `maexp evaluate`"),
+        ("words.universal=a='b", "No closing quotation"),
     ],
 )
 def test_bad_words_are_named(word, told, tmp_path, capsys):
@@ -109,3 +112,19 @@ def test_maps_of_ones_own_share_the_episodes(tmp_path):
     found = load_baseline(str(tmp_path / "it" / "mine" / "robots_2" / "perfect" / "random")).results["random", 2]
     assert sorted(found.maps) == ["maze_small_0"] * 2 + ["maze_small_1"] * 2, "half of three, rounded up"
     assert "**mine, 2 robots**" in (tmp_path / "it" / "conditions.md").read_text()
+
+
+def test_a_policy_has_words_of_its_own_and_the_condition_overrides_them(tmp_path, monkeypatch, capsys):
+    played = []
+    monkeypatch.setattr(cli, "main", lambda argv: played.append(argv) or 0)
+    words = [f"out={tmp_path}/it", *WORDS, "policies=[some/searching,cost_utility]", "conditions=[range]"]
+    own = "words.searching=comm.range=90 lookahead.horizon=2"
+    assert conditions.main([*words, own]) == 0
+    search, plain = played[2:]
+    assert search.index("comm.range=90") < search.index("comm.range=8"), "the last one counts"
+    assert "lookahead.horizon=2" in search and "lookahead.horizon=2" not in plain
+    assert conditions.main([*words, own.replace("90", "80")]) == 2
+    told = "was played with words.searching=comm.range=90 lookahead.horizon=2, not comm.range=80 lookahead.horizon=2"
+    assert told in capsys.readouterr().err
+    assert conditions.main([*words, "policies=[cost_utility,random]"]) == 0, "more policies may join"
+    assert conditions.main(words) == 2, "with none they are others, too"
