@@ -11,7 +11,7 @@ import warp as wp
 from maexp.kernels.geometry import segment_distance
 from maexp.kernels.launches import Launch, lanes_on
 from maexp.kernels.messages import pass_messages
-from maexp.kernels.native import keyed_uniform
+from maexp.kernels.native import keyed_uniform, next_untold
 from maexp.kernels.radio import radio_at, receive_signals
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -249,38 +249,34 @@ def _share_points(
     knows = known[e]
     tells = told[e]
     sent = int(0)
-    for j in range(lane, seen.shape[2], lanes):
-        anyone = int(0)
+    j = next_untold(seen, known, hears, e, lane, lanes)
+    while j < seen.shape[2]:
         for w in range(words):
-            own = sees[w, j] | knows[w, j]
-            if own != 0:
-                anyone = 1
-        if anyone != 0:
-            for w in range(words):
-                tells[w, j] = sees[w, j] | knows[w, j]
-            heard = int(0)
-            for w in range(words):
-                result = tells[w, j]
-                missing = ~wp.uint32(result)
-                if w == words - 1:
-                    missing = missing & last
-                while missing != wp.uint32(0):  # those who do not know it yet
-                    below = missing - wp.uint32(1)
-                    bit = int(wp.bit_count(below & ~missing))
-                    for v in range(words):
-                        if (hears[e, w * ROBOTS_PER_WORD + bit, v] & tells[v, j]) != 0:
-                            result = result | (1 << bit)
-                            heard = 1
-                    missing = missing & below
-                news = wp.uint32(result & ~knows[w, j])
-                knows[w, j] = result
-                while weighed != 0 and news != wp.uint32(0):
-                    below = news - wp.uint32(1)
-                    radio = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~news))
-                    wp.atomic_add(known_weight, e, radio, maps.free_weight[maps.free_begin[map_id[e]] + j])
-                    news = news & below
-            if heard != 0:
-                sent += count_tellers(e, j, last, hears, tells)
+            tells[w, j] = sees[w, j] | knows[w, j]
+        heard = int(0)
+        for w in range(words):
+            result = tells[w, j]
+            missing = ~wp.uint32(result)
+            if w == words - 1:
+                missing = missing & last
+            while missing != wp.uint32(0):  # those who do not know it yet
+                below = missing - wp.uint32(1)
+                bit = int(wp.bit_count(below & ~missing))
+                for v in range(words):
+                    if (hears[e, w * ROBOTS_PER_WORD + bit, v] & tells[v, j]) != 0:
+                        result = result | (1 << bit)
+                        heard = 1
+                missing = missing & below
+            news = wp.uint32(result & ~knows[w, j])
+            knows[w, j] = result
+            while weighed != 0 and news != wp.uint32(0):
+                below = news - wp.uint32(1)
+                radio = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~news))
+                wp.atomic_add(known_weight, e, radio, maps.free_weight[maps.free_begin[map_id[e]] + j])
+                news = news & below
+        if heard != 0:
+            sent += count_tellers(e, j, last, hears, tells)
+        j = next_untold(seen, known, hears, e, j + lanes, lanes)
     wp.atomic_add(cells_sent, e, wp.int64(sent))
 
 

@@ -20,6 +20,8 @@ from maexp.kernels.constants import (
 
 BUCKETS = 64  # more than half the most that a step may add to a key, and a power of two
 LAST_BUCKET = BUCKETS - 1
+UNTOLD_BLOCK = 64  # points of which it is asked at once whether one is news
+TELLING_WORDS = 8  # of radios, among whom news is looked for; of others all may be some
 LOOK_CELLS = 5  # how far the nearest obstacle is looked for, in cells
 
 
@@ -315,4 +317,75 @@ def next_news(
     lanes: int,
 ) -> wp.vec2i:
     """The next point from `start` on that is known and not yet painted, and how many known ones were met up to it."""
+    ...
+
+
+# Nearly all points are looked at in vain, too: those who hear each other know the same of them.
+NEXT_UNTOLD = f"""
+    const int words = seen.shape[1], radios = hears.shape[1], points = seen.shape[2];
+    const int counted = words < {TELLING_WORDS} ? words : {TELLING_WORDS};
+    wp::uint32 listening[{TELLING_WORDS}], telling[{TELLING_WORDS}];  // who hears others, and who is heard by others
+    for (int w = 0; w < counted; ++w) listening[w] = telling[w] = 0;
+    for (int i = 0; i < radios && i < 32 * {TELLING_WORDS}; ++i)
+    {{
+        for (int v = 0; v < words; ++v)
+        {{
+            const wp::uint32 others = (wp::uint32)wp::index(hears, e, i, v) & ~(v == i / 32 ? 1u << (i % 32) : 0u);
+            if (v < counted) telling[v] |= others;
+            if (others != 0) listening[i / 32] |= 1u << (i % 32);
+        }}
+    }}
+    const int* sees = &wp::index(seen, e, 0, 0);
+    const int* knows = &wp::index(known, e, 0, 0);
+    int point = start, single = start;
+    for (; point < points; point += lanes)
+    {{
+        if (words == 1 && lanes == 1 && point >= single)  // without branches, many at once
+        {{
+            const wp::uint32 tells = telling[0], listens = listening[0];
+            for (; point + {UNTOLD_BLOCK} <= points; point += {UNTOLD_BLOCK})
+            {{
+                wp::uint32 some = 0;
+                for (int k = point; k < point + {UNTOLD_BLOCK}; ++k)
+                {{
+                    const wp::uint32 before = knows[k], now = before | sees[k];
+                    some |= (now & ~before) | ((now & tells) != 0 ? ~now & listens : 0u);
+                }}
+                if (some != 0) break;
+            }}
+            if (point >= points) break;
+            single = point + {UNTOLD_BLOCK};
+        }}
+        wp::uint32 any = 0, news = 0, told = 0, lacking = 0;
+        for (int w = 0; w < words; ++w)
+        {{
+            const wp::uint32 before = knows[w * points + point], now = before | sees[w * points + point];
+            any |= now;
+            news |= now & ~before;
+            told |= w < {TELLING_WORDS} ? now & telling[w] : now;
+            lacking |= w < {TELLING_WORDS} ? ~now & listening[w] : ~now;
+        }}
+        if (news != 0) break;
+        if (any == 0 || told == 0 || lacking == 0) continue;
+        if (words > 1) break;
+        bool hear = false;
+        for (int i = 0; i < radios; ++i)
+            hear = hear || ((lacking >> i & 1u) != 0 && (any & (wp::uint32)wp::index(hears, e, i, 0)) != 0);
+        if (hear) break;
+    }}
+    return point;
+"""
+
+
+@wp.func_native(NEXT_UNTOLD)
+def next_untold(
+    seen: wp.array3d(dtype=wp.int32),
+    known: wp.array3d(dtype=wp.int32),
+    hears: wp.array3d(dtype=wp.int32),
+    e: int,
+    start: int,
+    lanes: int,
+) -> int:
+    """The next point from `start` on that somebody has seen and not entered into its map, or may hear of now, in steps
+    of `lanes`; the number of points or more: there is none."""
     ...

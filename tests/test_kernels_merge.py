@@ -5,11 +5,16 @@ import math
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from oracle import team
 from worlds import room
 
 import maexp.kernels as mk
 from maexp.envs import CommConfig, ExplorationEnv, RadarConfig, RobotConfig
+from maexp.kernels.api import _pack
+from maexp.kernels.launches import launch_named, launch_on
+from maexp.kernels.merge import _share_points
+from maexp.kernels.types import Maps
 
 pytestmark = pytest.mark.kernels
 
@@ -69,6 +74,50 @@ def test_one_exchange_is_one_hop():
     assert once.astype(int).tolist() == [[1, 0, 0, 0], [1, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1]]
     thrice = merge(merge(merge(seen, chain), chain), chain)[0]
     assert thrice[3].all() and not thrice[0, 1:].any()  # news travels one way only
+
+
+@pytest.mark.parametrize("lanes", [1, 7])
+@pytest.mark.parametrize(("robots", "points"), [(3, 63), (4, 64), (4, 65), (5, 1000), (32, 200), (40, 130), (300, 70)])
+def test_what_is_known_already_is_passed_over(robots, points, lanes):
+    """Teams in parts, whose members know the same, and a little that is new: against the definition, with what is told.
+
+    Of 300 robots, radios after the first 256 are looked at in another way.
+    """
+    rng = np.random.default_rng(robots)
+    envs = 6
+    group = rng.integers(0, 3, (envs, robots)) + 3 * (np.arange(robots) >= 256)
+    hears = group[:, :, None] == group[:, None, :]
+    hears[0] = np.eye(robots, dtype=bool)  # nobody hears anybody
+    hears[1] &= rng.random((robots, robots)) < 0.7  # not all both ways
+    hears[3] = np.eye(robots, dtype=bool)
+    hears[3, 0, -1] = True  # the first hears only the last
+    hears[:, range(robots), range(robots)] = True
+    part = rng.random((envs, 6, points)) < 0.5
+    known = np.take_along_axis(part, group[:, :, None], 1)
+    known[2] = rng.random((robots, points)) < 0.5  # nor the same
+    seen = (known & (rng.random(known.shape) < 0.5)) | (rng.random(known.shape) < 0.3 / points)
+    knew = known | seen
+    lacks = hears[:, :, :, None] & ~knew[:, :, None] & knew[:, None]  # [env, listener, teller, point]
+    words = [_pack(torch.from_numpy(flags), 1) for flags in (seen, known)]
+    told, sent = torch.zeros_like(words[0]), torch.zeros(envs, dtype=torch.int64)
+    active = torch.ones(envs, dtype=torch.int32)
+    values = {
+        "active": wp.from_torch(active),
+        "hears": wp.from_torch(_pack(torch.from_numpy(hears), 2)),
+        "seen": wp.from_torch(words[0]),
+        "known": wp.from_torch(words[1]),
+        "told": wp.from_torch(told),
+        "cells_sent": wp.from_torch(sent),
+        "known_weight": wp.from_torch(torch.zeros(envs, robots, dtype=torch.int32)),
+        "maps": Maps(),
+        "map_id": wp.from_torch(active),
+        "weighed": 0,
+        "lanes": lanes,
+    }
+    launch_named(launch_on(told.device), _share_points, (envs, lanes), values)
+    got = mk.unpack_flags(words[1], robots).numpy()
+    np.testing.assert_array_equal(got, knew | lacks.any(2))
+    np.testing.assert_array_equal(sent.numpy(), lacks.any(1).sum((1, 2)))
 
 
 @pytest.mark.parametrize("size", SIZES)
