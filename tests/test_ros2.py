@@ -171,7 +171,7 @@ class StandIn:
     def __init__(self, **parameters):
         self.parameters, self.now, self.told = parameters, 100.0, []
         self.topics, self.sent, self.published, self.cancelled = {}, [], [], []
-        self.told_mates = {}
+        self.told_mates, self.watched = {}, 0
         self.waiting, self.ready, self.accepts = [], True, True
 
     def place(self, name: str, x: float, y: float, yaw: float = 0.0) -> None:
@@ -195,7 +195,7 @@ class StandIn:
 
             def create_publisher(self, kind, topic, depth):
                 kept = ros.published if topic == "~/markers" else ros.told_mates.setdefault(topic, [])
-                return SimpleNamespace(publish=kept.append)
+                return SimpleNamespace(publish=kept.append, get_subscription_count=lambda: ros.watched)
 
             def create_timer(self, period, call):
                 ros.timer = (period, call)
@@ -246,6 +246,8 @@ class StandIn:
             "rclpy": module(init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None),
             "rclpy.action": module(ActionClient=self.action_class()),
             "rclpy.node": module(Node=self.node_class()),
+            "rclpy.publisher": module(Publisher=object),
+            "rclpy.time": module(Time=lambda nanoseconds: Moment(nanoseconds / 1e9)),
             "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
             "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
@@ -319,8 +321,14 @@ def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypa
     ros.topics["/b/maexp/map"](passed_on(shown))
     ros.topics["/b/maexp/word"](passed_on(others.told_mates["/b/maexp/word"][-1]))
     node.decide()
-    known = frames.read_map(ros.told_mates["/a/maexp/map"][-1])
-    assert np.array_equal(known.values, floor())
+    own, heard = (ros.told_mates[f"/a/maexp/{topic}"][-1] for topic in ("map", "heard/b/map"))
+    assert np.array_equal(frames.read_map(own).values, half) and own.header.stamp.sec == 100
+    assert np.array_equal(frames.read_map(heard).values, floor())
+    assert not ros.told_mates["/a/maexp/known"], "nobody looks on"
+    ros.watched = 1
+    node.decide()
+    assert np.array_equal(frames.read_map(ros.told_mates["/a/maexp/known"][-1]).values, floor())
+    assert len(ros.told_mates["/a/maexp/heard/b/map"]) == 1, "nothing new"
     assert node.driver.planner.heard["b"].pose == pytest.approx((1.0, 4.0, 0.0))
     assert [name for name, _ in ros.sent + others.sent] == ["/a/navigate_to_pose", "/b/navigate_to_pose"]
     ros.topics["/b/maexp/word"](SimpleNamespace(data="nonsense"))

@@ -28,7 +28,7 @@ from maexp.agents.runtime.robot_driver import RobotDriver
 from maexp.agents.runtime.words import read_word, write_word
 
 MEMORY = Memory((1.0, 0.1 + 0.2), 3.0, 4.5, False, True, {"b": Contact(0.25, (1.0, 2.0), 3.0, 1.5)})
-WORD = Word("a", (1.0, 2.0 / 3.0, -0.5), 0.25, 1764057600.123456789, None, MEMORY)
+WORD = Word("a", (1.0, 2.0 / 3.0, -0.5), 0.25, 1764057600.123456789, memory=MEMORY)
 SETTINGS = {"robots": ("a", "b"), "radar_range": 3.0, "robot_radius": (0.2,), "offsets": (0.0,) * 6, "period": 0.2}
 
 

@@ -310,7 +310,7 @@ def test_the_base_station_is_heard_as_mates_are(folder):
     known = OccupancyGrid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
     call = (world.grid(), CELL, (0.0, 0.0), (3.0, 3.0))
     assert robot.plan(*call, now=0.0, share=True).tells.all()
-    robot.hear(Word(STATION, (1.0, 1.0, 0.0), 0.0, 0.5, known))
+    robot.hear(Word(STATION, (1.0, 1.0, 0.0), 0.0, 0.5, {"b": (0.4, known)}))
     plan = robot.plan(*call, now=1.0, share=True)
     book = robot.team.book
     assert plan.done and not plan.tells.any() and book.memories["a"].linked and book.crew == {"a"}

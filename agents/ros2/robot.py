@@ -8,9 +8,10 @@ from typing import Any
 
 from maexp.agents.errors import UserError
 from maexp.agents.ros2.convert import SECOND, fill_map
-from maexp.agents.ros2.dds import Wire
+from maexp.agents.ros2.dds import Wire, Writer
 from maexp.agents.ros2.team import Ros2Team
-from maexp.agents.runtime.robot_driver import RobotDriver
+from maexp.agents.runtime.frames import OccupancyGrid
+from maexp.agents.runtime.robot_driver import RobotDriver, map_topic
 from maexp.agents.runtime.words import write_word
 
 LISTEN = 1.0  # seconds by the wall that mates are waited for in an arena, whose clock stands meanwhile
@@ -19,8 +20,10 @@ LISTEN = 1.0  # seconds by the wall that mates are waited for in an arena, whose
 class Ros2Robot(Ros2Team):
     """A `RobotDriver` on DDS.
 
-    Before each decision it publishes what it knows on /NAME/maexp/map, and its pose on /NAME/maexp/word. Mates are
-    heard as long as their words come. In an arena it waits for those that it has heard at the decision before.
+    Before each decision it publishes its map on /NAME/maexp/map, those of its mates that are new to it on
+    /NAME/maexp/heard/MATE/map, and its pose on /NAME/maexp/word; to who looks on, what it plans on, on
+    /NAME/maexp/known. Mates are heard as long as their words come. In an arena it waits for those that it has heard at
+    the decision before.
 
     Args:
         listen: how long [s by the wall].
@@ -34,8 +37,9 @@ class Ros2Robot(Ros2Team):
         self.listen = listen
         places = {name: f"/{name}/maexp" for name in (driver.name, *driver.mates)}
         self.words = {name: wire.reader(f"{places[name]}/word") for name in driver.mates}
-        self.grids = {name: wire.reader(f"{places[name]}/map") for name in driver.mates}
-        self.says, self.shows = (wire.writer(f"{places[driver.name]}/{topic}") for topic in ("word", "map"))
+        self.grids = {topic: (source, wire.reader(topic)) for topic, source in driver.map_topics().items()}
+        self.says, self.shows = (wire.writer(f"{places[driver.name]}/{topic}") for topic in ("word", "known"))
+        self.maps_out = {name: wire.writer(map_topic(driver.name, name)) for name in (driver.name, *driver.mates)}
         self.told: float | None = None  # time of the last word [s]
         self.since = 0.0  # when it was told [s by the wall]
         self.near = set(driver.mates)  # who is waited for
@@ -47,13 +51,13 @@ class Ros2Robot(Ros2Team):
 
     def _take_others(self) -> None:
         super()._take_others()
-        for name, reader in self.grids.items():
-            for message in reader.take():
-                self._hear(f"/{name}/maexp/map", self.driver.take_known, name, message)
-        for name, reader in self.words.items():
+        for name, reader in self.words.items():  # first: the maps that belong to them have come before
             for message in reader.take():
                 if self._hear(f"/{name}/maexp/word", self.driver.take_word, name, message.data):
                     self.near.add(name)
+        for topic, (source, reader) in self.grids.items():
+            for message in reader.take():
+                self._hear(topic, self.driver.take_known, source, message)
 
     def _hear(self, topic: str, take: Callable, name: str, what: Any) -> Any:
         """What the driver makes of what a mate has told; nonsense is noted."""
@@ -89,15 +93,23 @@ class Ros2Robot(Ros2Team):
         """What this robot knows, and where it is."""
         self.told, self.since = now, time.monotonic()
         try:
-            known = self.driver.known([])
+            own = self.driver.tell_own(now)
+            known = self.driver.known([]) if self.shows.matched else None
         except ValueError as error:
             raise UserError(f"{error}.") from error
+        if own is not None:
+            self._write_map(self.maps_out[self.driver.name], *own)
         if known is not None:
-            message, frame = self.shows.make(), self.driver.settings.global_frame
-            fill_map(message, frame, round(now * SECOND), known.values, known.resolution, known.origin)
-            self.shows.write(message)
+            self._write_map(self.shows, now, known)
+        for source, message in self.driver.pass_on(now).items():
+            self.maps_out[source].write(message)
         if (word := self.driver.word(now)) is not None:
             self.says.write(self.says.make(data=write_word(word)))
+
+    def _write_map(self, writer: Writer, time: float, grid: OccupancyGrid) -> None:
+        message, frame = writer.make(), self.driver.settings.global_frame
+        fill_map(message, frame, round(time * SECOND), grid.values, grid.resolution, grid.origin)
+        writer.write(message)
 
 
 def make_team(driver, wire: Wire, answer: float, tell: Callable[[str], None], goals: str) -> Ros2Team:

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from .driver import DriverSettings, TeamDriver
-from .frames import OccupancyGrid, Pose, merge_grids, read_map, read_time, span
+import numpy as np
+
+from .driver import Decision, DriverSettings, TeamDriver
+from .frames import OccupancyGrid, Pose, is_newer, merge_grids, read_map, read_time, span
 from .grid import MAX_CELLS
 from .planner import Plan
 from .robot import RobotPlanner, Word
 from .words import FURTHEST, read_word
 
 FINEST = 1e-3  # edge of a cell of a map that is read [m]
+
+
+@dataclass(frozen=True)
+class Told:
+    """A mate's own map in the team's frame, and the message that it came by, to be passed on."""
+
+    grid: OccupancyGrid
+    message: Any
+
+
+def map_topic(speaker: str, source: str) -> str:
+    """Where a robot tells the own map of a robot, itself or another."""
+    return f"/{speaker}/maexp/{'' if speaker == source else f'heard/{source}/'}map"
 
 
 class RobotDriver(TeamDriver):
@@ -34,13 +49,15 @@ class RobotDriver(TeamDriver):
         self.name = settings.only
         self.mates = tuple(name for name in settings.robots if name != settings.only)
         self.words: dict[str, Word] = {}  # the last of each mate
-        self.told: dict[str, tuple[float, OccupancyGrid]] = {}  # what it knows, in the team's frame, and since when [s]
+        self.told: dict[str, tuple[float, Told]] = {}  # of each mate the newest map, and since when it is so [s]
         super().__init__(settings)
 
     def begin(self, episode: dict[str, Any] | None = None, now: float | None = None) -> None:
         """As `TeamDriver.begin`: what mates have told before an arena's episode is forgotten; who was faster may have
         told of it already."""
         super().begin(episode, now)
+        self.shown: tuple[float, OccupancyGrid] | None = None  # this robot's map, and since when it is so [s]
+        self.passed: dict[str, float] = {}  # times of the maps that were passed on
         for word in self.words.values():
             self.hear(word)
 
@@ -70,12 +87,23 @@ class RobotDriver(TeamDriver):
             raise ValueError(f"a word of {word.name!r} came")
         return self.hear(word)
 
-    def take_known(self, name: str, message) -> None:
-        """What came on a mate's /NAME/maexp/map, a nav_msgs/OccupancyGrid in the team's frame.
+    def map_topics(self) -> dict[str, str]:
+        """Where mates tell maps, their own and those that they have heard; the names of the robots that made these."""
+        return {map_topic(speaker, source): source for speaker in self.mates for source in self.mates}
+
+    def take_known(self, source: str, message) -> None:
+        """What came on one of `map_topics`, a nav_msgs/OccupancyGrid in the team's frame.
+
+        One that is not newer than the last of that robot changes nothing.
 
         Raises:
-            ValueError: it is in another frame, none, or larger than is planned on.
+            ValueError: it is of no mate, in another frame, none, or larger than is planned on.
         """
+        if source not in self.mates:
+            raise ValueError(f"a map of {source} came, who is no mate")
+        time = read_time(message.header.stamp)
+        if not is_newer((time,), self.told.get(source), False):
+            return
         frame = message.header.frame_id.lstrip("/")
         if frame != self._root:
             raise ValueError(f"a map in the frame {frame} is not known")
@@ -87,7 +115,7 @@ class RobotDriver(TeamDriver):
             raise ValueError(
                 f"a map of {grid.values.size:,} cells: more than none, and at most {MAX_CELLS:,}, are read"
             )
-        self.told[name] = read_time(message.header.stamp), grid
+        self.told[source] = time, Told(grid, message)
 
     def has_heard(self, name: str, now: float) -> bool:
         """Whether a mate has spoken at `now` [s] or since."""
@@ -103,7 +131,37 @@ class RobotDriver(TeamDriver):
         if pose is None:
             return None
         memory = None if (said := self.planner.word()) is None else said.memory
-        return Word(self.name, tuple(map(float, pose)), self.speeds.get(self.name, 0.0), now, None, memory)
+        return Word(self.name, tuple(map(float, pose)), self.speeds.get(self.name, 0.0), now, memory=memory)
+
+    def tell_own(self, now: float) -> tuple[float, OccupancyGrid] | None:
+        """This robot's own map in the team's frame, to be told at `now` [s], and since when it is so; None: not known.
+
+        Raises:
+            ValueError: where it lies in the team's frame is not known.
+        """
+        grid = super()._merge([])
+        if grid is None:
+            return None
+        if self.shown is None or now < self.shown[0] or not _are_same(grid, self.shown[1]):
+            self.shown = now, grid
+        return self.shown
+
+    def pass_on(self, now: float) -> dict[str, Any]:
+        """The messages with maps of mates that are newer than those that were passed on before, by the mates' names."""
+        found = {}
+        for source, (time, told) in self.told.items():
+            if self._counts(time) and time <= now + self.settings.memory and time != self.passed.get(source):
+                found[source], self.passed[source] = told.message, time
+        return found
+
+    def decide(self, now: float) -> Decision:
+        """As `TeamDriver.decide`. A map that claims to be of later would hide what comes next: it is forgotten."""
+        latest = now + self.settings.memory
+        later = [source for source, (time, _) in self.told.items() if time > latest]
+        self.told = {source: told for source, told in self.told.items() if source not in later}
+        decision = super().decide(now)
+        decision.notes.extend(f"the map of {source} is left out: its time has not come yet" for source in later)
+        return decision
 
     def known(self, notes: list[str]) -> OccupancyGrid | None:
         """What this robot knows, in the team's frame: its own map, and those that it has heard; None: nothing yet.
@@ -115,13 +173,13 @@ class RobotDriver(TeamDriver):
         if own is None:
             return None
         grids = [own]
-        for name, (time, grid) in self.told.items():
+        for name, (time, told) in self.told.items():
             if not self._counts(time):
                 continue
-            if span([*grids, grid])[2].astype(float).prod() > MAX_CELLS:
+            if span([*grids, told.grid])[2].astype(float).prod() > MAX_CELLS:
                 notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
                 continue
-            grids.append(grid)
+            grids.append(told.grid)
         return merge_grids(grids)
 
     _merge = known
@@ -139,3 +197,8 @@ class RobotDriver(TeamDriver):
     def _plan(self, grid: tuple, poses: dict[str, Pose | None], time_left: float, now: float) -> Plan:
         speed = self.speeds.get(self.name, 0.0)
         return self.planner.plan(*grid, poses[self.name], speed=speed, time_left=time_left, now=self._since(now))
+
+
+def _are_same(grid: OccupancyGrid, other: OccupancyGrid) -> bool:
+    alike = (grid.resolution, grid.origin) == (other.resolution, other.origin)
+    return alike and np.array_equal(grid.values, other.values)

@@ -1,4 +1,4 @@
-"""What robots tell each other of themselves, as text: a `Word` without its map, in JSON."""
+"""What robots tell each other of themselves, as text: a `Word` without maps, in JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ def read_word(text: str) -> Word:
         found = json.loads(text)
         pose = _numbers(found["pose"], 3)
         memory = None if found["memory"] is None else _read_memory(found["memory"])
-        return Word(_name(found["name"]), pose, _number(found["speed"]), _number(found["time"], 1e12), None, memory)
+        time = _number(found["time"], 1e12)
+        return Word(_name(found["name"]), pose, _number(found["speed"]), time, memory=memory)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
         raise ValueError("what came is no word of a robot") from None
 
