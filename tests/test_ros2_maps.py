@@ -13,7 +13,8 @@ from maexp.agents.ros2.dds import Wire
 from maexp.agents.ros2.robot import Ros2Robot
 from maexp.agents.runtime.driver import DriverSettings
 from maexp.agents.runtime.frames import OccupancyGrid, fill_grid, read_map, read_time
-from maexp.agents.runtime.robot_driver import RobotDriver, map_topic
+from maexp.agents.runtime.radio_driver import map_topic
+from maexp.agents.runtime.robot_driver import RobotDriver
 
 NAMES = ("a", "b", "c")
 SETTINGS = {"robots": NAMES, "radar_range": 3.0, "robot_radius": (0.2,), "offsets": (0.0,) * 9, "period": 0.2}
@@ -108,12 +109,10 @@ def test_maps_that_make_no_sense_change_nothing():
         with pytest.raises(ValueError, match=why):
             driver.take_known(source, what)
     assert list(driver.told) == ["c"] and driver.told["c"][1].message is good
-    assert driver.map_topics() == {
-        "/b/maexp/map": "b",
-        "/b/maexp/heard/c/map": "c",
-        "/c/maexp/heard/b/map": "b",
-        "/c/maexp/map": "c",
-    }
+    own = {"/b/maexp/map": "b", "/c/maexp/map": "c"}
+    heard = {"/b/maexp/heard/c/map": "c", "/c/maexp/heard/b/map": "b"}
+    base = {"/base_station/maexp/heard/b/map": "b", "/base_station/maexp/heard/c/map": "c"}
+    assert driver.map_topics() == own | heard | base
 
 
 def test_a_map_of_later_neither_counts_nor_stays():

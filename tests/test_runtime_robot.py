@@ -169,12 +169,35 @@ def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
     assert not planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=0.0, share=True).done
 
 
+def test_who_is_connected_over_others(monkeypatch):
+    """In a line, a hears of d by b and c; once d is silent, that its last word goes round connects it with nobody."""
+    each = {name: RobotPlanner(name, **SETTINGS) for name in "abcd"}
+    world, found = World(), {name: [] for name in each}
+    for name, planner in each.items():
+        plan = planner.team.plan
+
+        def note(*call, name=name, plan=plan, **more):
+            found[name].append("".join(sorted(more["connected"][name])))
+            return plan(*call, **more)
+
+        monkeypatch.setattr(planner.team, "plan", note)
+    for now in range(9):
+        for planner in each.values():
+            planner.plan(world.grid(), CELL, (0.0, 0.0), AT, now=float(now))
+        for teller, listener in ("ab", "ba", "bc", "cb", "cd", "dc"):
+            if now < 4 or teller != "d":
+                each[listener].hear(each[teller].word())
+    assert found["a"] == ["", "b", "bc"] + ["bcd"] * 4 + ["bc"] * 2
+    assert found["c"] == ["", "bd"] + ["abd"] * 3 + ["ab"] * 4
+    assert each["a"].word().hears == {"b": 7.0, "c": 6.0, "d": 3.0}
+
+
 def test_a_word_from_the_future_does_not_stay():
     world, planner = World(), RobotPlanner("a", memory=5.0, **SETTINGS)
     grid = OccupancyGrid(np.full((4, 4), 100), CELL, (0.0, 0.0, 0.0))
     planner.hear(word("b", (9.0, 9.0), 1e9, grid))
     planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=1.0)
-    assert not planner.grids
+    assert not planner.grids and not planner.beats.times
     planner.hear(word("b", world.at[1], 2.0))
     assert planner.heard["b"].time == 2.0
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from .beats import Beats
 from .contacts import BASE, Memory, read_names
 from .frames import Maps, OccupancyGrid, is_newer, merge_grids
 from .planner import Plan, TeamPlanner
@@ -25,6 +26,7 @@ class Word:
         grids: its own map and those that it has heard, by the names of the robots that made them, each with the time of
             that robot's clock at which it was so [s]; none: the caller merges grids.
         memory: what it knows of radios; None: its policy does not look at that.
+        hears: whom it has heard of not long ago, from themselves or over others, and the times of their last words [s].
     """
 
     name: Hashable
@@ -33,6 +35,7 @@ class Word:
     time: float
     grids: Maps = field(default_factory=dict)
     memory: Memory | None = None
+    hears: Mapping[Any, float] = field(default_factory=dict)
 
 
 class RobotPlanner:
@@ -67,14 +70,13 @@ class RobotPlanner:
         self.team = TeamPlanner(policy, **settings)
         self.heard: dict[Hashable, Word] = {}
         self.grids: dict[Hashable, tuple[float, OccupancyGrid]] = {}  # of each mate the newest, whoever told it
+        self.beats = Beats()
         self._word: Word | None = None
-        self._lately: set[Hashable] = set()  # heard since the last plan
 
     def reset(self) -> None:
         """Forget the past: mates, their maps, what was given up."""
         self.team.reset()
-        self.heard, self.grids, self._word = {}, {}, None
-        self._lately = set()
+        self.heard, self.grids, self.beats, self._word = {}, {}, Beats(), None
 
     def hear(self, word: Word) -> None:
         """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last,
@@ -91,7 +93,8 @@ class RobotPlanner:
         last = self.heard.get(word.name)
         if last is None or word.time >= last.time:
             self.heard[word.name] = word
-            self._lately.add(word.name)
+            self.beats.hear(word.name, word.time)
+            self.beats.hear_of({name: time for name, time in word.hears.items() if name != self.name})
 
     def word(self) -> Word | None:
         """What this robot tells others: of its last plan's pose and grids; None before the first."""
@@ -120,7 +123,8 @@ class RobotPlanner:
             share: whether it plans on this grid and all that were heard together, and its word holds them; else the
                 caller merges them.
             connected: names of those that it is connected with now over any number of others, "base_station" for that;
-                None: those heard since the last plan. Only policies trained with ``observation.radio=true`` look at it.
+                None: those of whom words came since the last plan, from themselves or over others. Only policies that
+                were trained with ``observation.radio=true`` look at it.
             more: other arguments of `TeamPlanner.plan`.
 
         Raises:
@@ -136,20 +140,22 @@ class RobotPlanner:
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
-        links = {self.name: set(self._lately if connected is None else read_names("connected", connected))}
-        self._lately.clear()
+        lately = self.beats.take_lately()
+        links = {self.name: lately if connected is None else set(read_names("connected", connected))}
         self._take_memories()
         plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, connected=links, **more)
         if pose is not None:
             knows = None if self.team.book is None else self.team.book.memories.get(self.name)
             grids = {self.name: (now, own), **self.grids} if share else {}
-            self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows)
+            hears = self.beats.tell(now - self.memory)
+            self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows, hears)
         return _row(plan, names.index(self.name))
 
     def _forget_later(self, time: float) -> None:
         """What claims to be of later than that [s] would hide what comes next."""
         self.heard = {name: word for name, word in self.heard.items() if word.time <= time}
         self.grids = {name: told for name, told in self.grids.items() if told[0] <= time}
+        self.beats.forget_later(time)
 
     def _take_memories(self) -> None:
         """What mates have told of radios takes the place of what was guessed of them."""

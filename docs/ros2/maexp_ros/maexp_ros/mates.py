@@ -1,4 +1,4 @@
-"""What the node of one robot tells its mates, and hears of them. All thinking is in maexp.agents.runtime."""
+"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.runtime."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rclpy.time import Time
 from std_msgs.msg import String
 
 from maexp.agents.runtime.frames import fill_grid
-from maexp.agents.runtime.robot_driver import RobotDriver, map_topic
+from maexp.agents.runtime.radio_driver import RadioDriver, map_topic
 from maexp.agents.runtime.words import write_word
 
 
 class Mates:
-    """Topics /NAME/maexp/... of all robots of a team."""
+    """Topics /NAME/maexp/... of all robots of a team, and of the base station."""
 
-    def __init__(self, node: Node, driver: RobotDriver, latched: QoSProfile):
+    def __init__(self, node: Node, driver: RadioDriver, latched: QoSProfile):
         self.node, self.driver = node, driver
-        for name in driver.mates:
+        for name in driver.speakers:
             topic = f"/{name}/maexp/word"
             take = partial(self._take, topic, lambda message, name=name: driver.take_word(name, message.data))
             node.create_subscription(String, topic, take, QoSProfile(depth=1))
@@ -43,7 +43,7 @@ class Mates:
             self.node.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=10.0)
 
     def tell(self, now) -> None:
-        """What this robot has seen and heard, and where it is, at a rclpy.time.Time; to who looks on, what it plans on.
+        """What it has seen and heard, and where it is, at a rclpy.time.Time; to who looks on, all that in one map.
 
         Raises:
             ValueError: where its map lies in the team's frame is not known.
