@@ -11,7 +11,8 @@ import pytest
 import yaml
 from paths import ROOT
 
-from maexp.agents.runtime import TeamPlanner, frames
+from maexp.agents.runtime import TeamPlanner, Word, frames
+from maexp.agents.runtime.words import read_word, write_word
 from maexp.envs.quaternions import read_yaw
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
@@ -171,7 +172,7 @@ class StandIn:
     def __init__(self, **parameters):
         self.parameters, self.now, self.told = parameters, 100.0, []
         self.topics, self.sent, self.published, self.cancelled = {}, [], [], []
-        self.told_mates = {}
+        self.told_mates, self.watched = {}, 0
         self.waiting, self.ready, self.accepts = [], True, True
 
     def place(self, name: str, x: float, y: float, yaw: float = 0.0) -> None:
@@ -195,7 +196,7 @@ class StandIn:
 
             def create_publisher(self, kind, topic, depth):
                 kept = ros.published if topic == "~/markers" else ros.told_mates.setdefault(topic, [])
-                return SimpleNamespace(publish=kept.append)
+                return SimpleNamespace(publish=kept.append, get_subscription_count=lambda: ros.watched)
 
             def create_timer(self, period, call):
                 ros.timer = (period, call)
@@ -246,6 +247,8 @@ class StandIn:
             "rclpy": module(init=lambda: None, spin=lambda node: None, try_shutdown=lambda: None),
             "rclpy.action": module(ActionClient=self.action_class()),
             "rclpy.node": module(Node=self.node_class()),
+            "rclpy.publisher": module(Publisher=object),
+            "rclpy.time": module(Time=lambda nanoseconds: Moment(nanoseconds / 1e9)),
             "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
             "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
@@ -294,18 +297,37 @@ def test_the_node_sends_goals(team):
     assert len(ros.sent) == 2 * before  # nav2 ended them: sent anew
 
 
+def node_of(name: str, monkeypatch, **parameters):
+    """The node of one radio of two robots, and what it sees of ROS."""
+    maps = ["/a/map", "/b/map"]
+    ros = StandIn(robots=["a", "b"], only=name, radar_range=3.0, robot_radius=[0.2], map_topics=maps, **parameters)
+    ros.parameters["offsets"] = [0.0] * 6
+    for module, stand_in in ros.modules().items():
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    for module in [name for name in sys.modules if name.startswith("maexp_ros.")]:
+        del sys.modules[module]
+    return importlib.import_module("maexp_ros.team_node").TeamNode(), ros
+
+
+def test_a_node_of_the_base_station_hears_and_passes_on(conversion, monkeypatch):
+    node, ros = node_of("base_station", monkeypatch, **{"comm.base_station": [1.0, 2.0]})
+    assert not node.clients_of and "/a/map" not in ros.topics
+    ros.watched = 1
+    node.decide()
+    assert not ros.told_mates["/base_station/maexp/known"]
+    ros.topics["/a/maexp/map"](passed_on(grid(floor(), 0.1)))
+    ros.topics["/a/maexp/word"](SimpleNamespace(data=write_word(Word("a", (1.0, 1.5, 0.0), 0.0, 100.0))))
+    node.decide()
+    for topic in ("known", "heard/a/map"):
+        shown = ros.told_mates[f"/base_station/maexp/{topic}"][-1]
+        shown.data = np.array(shown.data, np.int8)
+        assert np.array_equal(frames.read_map(passed_on(shown)).values, floor())
+    word = read_word(ros.told_mates["/base_station/maexp/word"][-1].data)
+    assert word == Word("base_station", (1.0, 2.0, 0.0), 0.0, 100.0, hears={"a": 100.0}) and not ros.told
+
+
 def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypatch):
-    seen = {}
-    for name in ("a", "b"):
-        maps = ["/a/map", "/b/map"]
-        ros = StandIn(robots=["a", "b"], only=name, radar_range=3.0, robot_radius=[0.2], map_topics=maps)
-        ros.parameters["offsets"] = [0.0] * 6
-        for module, stand_in in ros.modules().items():
-            monkeypatch.setitem(sys.modules, module, stand_in)
-        for module in [name for name in sys.modules if name.startswith("maexp_ros.")]:
-            del sys.modules[module]
-        seen[name] = importlib.import_module("maexp_ros.team_node").TeamNode(), ros
-    (node, ros), (other, others) = seen["a"], seen["b"]
+    (node, ros), (other, others) = (node_of(name, monkeypatch) for name in "ab")
     assert "/b/map" not in ros.topics and "/b/odom" not in ros.topics and list(node.clients_of) == ["a"]
     half = floor()
     half[:, 30:] = -1
@@ -319,8 +341,14 @@ def test_a_node_of_one_robot_tells_its_mates_and_hears_them(conversion, monkeypa
     ros.topics["/b/maexp/map"](passed_on(shown))
     ros.topics["/b/maexp/word"](passed_on(others.told_mates["/b/maexp/word"][-1]))
     node.decide()
-    known = frames.read_map(ros.told_mates["/a/maexp/map"][-1])
-    assert np.array_equal(known.values, floor())
+    own, heard = (ros.told_mates[f"/a/maexp/{topic}"][-1] for topic in ("map", "heard/b/map"))
+    assert np.array_equal(frames.read_map(own).values, half) and own.header.stamp.sec == 100
+    assert np.array_equal(frames.read_map(heard).values, floor())
+    assert not ros.told_mates["/a/maexp/known"], "nobody looks on"
+    ros.watched = 1
+    node.decide()
+    assert np.array_equal(frames.read_map(ros.told_mates["/a/maexp/known"][-1]).values, floor())
+    assert len(ros.told_mates["/a/maexp/heard/b/map"]) == 1, "nothing new"
     assert node.driver.planner.heard["b"].pose == pytest.approx((1.0, 4.0, 0.0))
     assert [name for name, _ in ros.sent + others.sent] == ["/a/navigate_to_pose", "/b/navigate_to_pose"]
     ros.topics["/b/maexp/word"](SimpleNamespace(data="nonsense"))
@@ -394,6 +422,7 @@ def test_the_package_is_whole():
 def test_parameters_are_those_of_the_file(team):
     module = sys.modules["maexp_ros.team_node"]
     written = yaml.safe_load((PACKAGE / "config" / "team.yaml").read_text())["team"]["ros__parameters"]
+    written |= {f"comm.{name}": value for name, value in written.pop("comm").items()}
     assert set(written) == set(module.PARAMETERS)
     assert {name: type(value) for name, value in written.items()} == {
         name: type(value) for name, value in module.PARAMETERS.items()

@@ -28,7 +28,8 @@ from maexp.agents.runtime.robot_driver import RobotDriver
 from maexp.agents.runtime.words import read_word, write_word
 
 MEMORY = Memory((1.0, 0.1 + 0.2), 3.0, 4.5, False, True, {"b": Contact(0.25, (1.0, 2.0), 3.0, 1.5)})
-WORD = Word("a", (1.0, 2.0 / 3.0, -0.5), 0.25, 1764057600.123456789, None, MEMORY)
+TIME = 1764057600.123456789
+WORD = Word("a", (1.0, 2.0 / 3.0, -0.5), 0.25, TIME, memory=MEMORY, hears={"b": TIME - 0.1})
 SETTINGS = {"robots": ("a", "b"), "radar_range": 3.0, "robot_radius": (0.2,), "offsets": (0.0,) * 6, "period": 0.2}
 
 
@@ -51,6 +52,9 @@ def test_words_are_told_to_the_last_bit():
         {"speed": "fast"},
         {"time": True},
         {"name": 3},
+        {"hears": ["b"]},
+        {"hears": {"b": "lately"}},
+        {"hears": {"b": float("inf")}},
         {"memory": {}},
         {"memory": {"at": [0, 0], "driven": 0, "known": 0, "linked": 1, "tells": False, "met": {}}},
         {"memory": {"at": [0, 0], "driven": 0, "known": 0, "linked": False, "tells": False, "met": {"b": 3}}},

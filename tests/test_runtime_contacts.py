@@ -9,11 +9,10 @@ import torch
 from runtime_cases import moment
 from test_contacts import ACTION, BASE, COUNT, HERE, PLACE, TELL, make
 from test_runtime_watch import CELL, SETTINGS, World
+from told_policy import export_told, make_told_policy
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents import ModelConfig, make_policy
 from maexp.agents.networks.actor import TARGETS, TARGETS_MASK
-from maexp.agents.policies.export import export_policy, find_chooser
 from maexp.agents.runtime import RobotPlanner, TeamPlanner, Word
 from maexp.agents.runtime.contacts import BASE as STATION
 from maexp.agents.runtime.contacts import Memory, count_blocked, read_comm
@@ -31,7 +30,6 @@ RADIOS = {
 EXACT = ("tells", "base_since", "base_linked", "base_far", "mates_since", "mates_far")
 ROUGH = {"untold": 0.06, "mates_untold": 0.06, "base_way": 0.12, "base_spare": 0.03}
 """Areas count cells here and points there, odometers the straight line from decision to decision."""
-MUCH = 0.3  # of the feature `untold`
 OTHERS = (
     "travel",
     "nearness",
@@ -49,27 +47,12 @@ OTHERS = (
 
 @pytest.fixture(scope="module")
 def policy():
-    """Goes to tell once the base station lacks `MUCH`; else what an untrained one chooses, with some noise."""
-    torch.manual_seed(5)
-    made = make_policy(make(2, 1, PLACE, comm=HERE), ModelConfig(action="targets"))
-    chooser, names = find_chooser(made), feature_names(True)
-    with torch.no_grad():
-        for weight in chooser.parameters():
-            weight.copy_(0.01 * torch.randn(weight.shape) + (1.0 if weight is chooser.encoder.merge[0].weight else 0.0))
-        first, last = chooser.encoder.inputs[0], chooser.encoder.inputs[2]
-        first.weight[0, names.index("tells")], first.weight[0, names.index("untold")] = 10.0, 10.0
-        first.bias[0] = -10.0 * (1.0 + MUCH)
-        last.weight[0, 0] = chooser.encoder.merge[1].weight[0, 0] = chooser.head.weight[0, 0] = 1.0
-    return made
+    return make_told_policy()
 
 
 @pytest.fixture(scope="module")
 def folder(policy, tmp_path_factory):
-    for name in ("onnx", "onnxscript", "onnxruntime", "safetensors"):
-        pytest.importorskip(name, reason=f"THE EXTRA maexp[export] IS NOT INSTALLED ({name}): folders are not tested")
-    where = tmp_path_factory.mktemp("policies") / "told"
-    export_policy(policy, make(2, 1, PLACE, comm=HERE), where, "told", "", {})
-    return where
+    return export_told(policy, tmp_path_factory.mktemp("policies") / "told")
 
 
 class Robots:
@@ -135,7 +118,7 @@ def test_features_are_those_of_the_env(kind, folder):
             if seen is None:
                 continue
             scene, ours = seen
-            row, there = sorted([k, *robots.planners[k]._lately, *mates_of(env, k)]).index(k), td[TARGETS][0, k].numpy()
+            row, there = sorted([k, *mates_of(env, k)]).index(k), td[TARGETS][0, k].numpy()
             mask, features = td[TARGETS_MASK][0, k].numpy(), ours.features[row]
             pairs = match(env, k, scene, ours.target[row], ours.mask[row], mask)
             news = abs(float(env.strategy.known[0, k] - env.strategy.state["told"][0, k, 2]))
@@ -310,7 +293,7 @@ def test_the_base_station_is_heard_as_mates_are(folder):
     known = OccupancyGrid(np.where(world.truth > 0, 100, 0), CELL, (0.0, 0.0, 0.0))
     call = (world.grid(), CELL, (0.0, 0.0), (3.0, 3.0))
     assert robot.plan(*call, now=0.0, share=True).tells.all()
-    robot.hear(Word(STATION, (1.0, 1.0, 0.0), 0.0, 0.5, known))
+    robot.hear(Word(STATION, (1.0, 1.0, 0.0), 0.0, 0.5, {"b": (0.4, known)}))
     plan = robot.plan(*call, now=1.0, share=True)
     book = robot.team.book
     assert plan.done and not plan.tells.any() and book.memories["a"].linked and book.crew == {"a"}

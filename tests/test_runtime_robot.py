@@ -1,5 +1,7 @@
 """A planner on each robot: with what it has heard it chooses as a planner of the team does, else it plays alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_runtime_watch import CELL, SETTINGS, World
@@ -50,7 +52,7 @@ def test_robots_that_hear_each_other_choose_as_the_team_does(policy):
 
 
 def word(name: str, at, time: float, grid: OccupancyGrid | None = None) -> Word:
-    return Word(name, (float(at[0]), float(at[1]), 0.0), 0.0, time, grid)
+    return Word(name, (float(at[0]), float(at[1]), 0.0), 0.0, time, {} if grid is None else {name: (time, grid)})
 
 
 def test_who_hears_nobody_plays_alone():
@@ -85,7 +87,66 @@ def test_words_and_grids_go_together():
         tell(each)
     wanted = team.plan(world.grid(), CELL, origin, dict(zip(NAMES, world.at, strict=True)), now=0.0)
     np.testing.assert_array_equal(np.concatenate([plan.goals for plan in found]), wanted.goals)
-    assert (each["a"].word().grid.values >= 0).sum() == (world.grid() >= 0).sum() > (halves[0] >= 0).sum()
+    told = each["a"].word().grids
+    for name, half in zip(NAMES, halves, strict=True):
+        np.testing.assert_array_equal(told[name][1].values, half)
+
+
+AT = (1.0, 1.0, 0.0)
+PERSON = (slice(20, 24), slice(20, 24))
+
+
+def seen(columns: slice, person: bool) -> np.ndarray:
+    """What a robot has mapped of a place of 40 x 40 cells, with somebody standing there, or not any more."""
+    values = np.full((40, 40), -1)
+    values[2:38, columns] = 0
+    if person:
+        values[PERSON] = 100
+    return values
+
+
+def plan_on(planner: RobotPlanner, values: np.ndarray, now: float, monkeypatch) -> np.ndarray:
+    """The grid that a robot plans on."""
+    asked, ask = [], planner.team.plan
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            planner.team, "plan", lambda grid, *others, **more: asked.append(grid) or ask(grid, *others, **more)
+        )
+        planner.plan(values, CELL, (0.0, 0.0), AT, now=now, share=True)
+    return asked[0]
+
+
+def test_what_a_robot_has_cleared_is_gone_for_who_heard_of_it(monkeypatch):
+    """Somebody stood in the way, and has gone; the others have never been there, and pass on what they heard."""
+    first, second, third = (RobotPlanner(name, **SETTINGS) for name in "abc")
+    for now in range(4):
+        there = plan_on(first, seen(slice(2, 30), now == 0), float(now), monkeypatch)[PERSON]
+        assert (there == (100 if now == 0 else 0)).all(), "what it told others came back to it"
+        for teller, listener in ((first, second), (second, third), (third, second), (second, first)):
+            if teller.word() is not None:
+                listener.hear(teller.word())
+        for planner in (second, third):
+            there = plan_on(planner, seen(slice(2, 10), False), now + 0.5, monkeypatch)[PERSON]
+        assert (there == [-1, 100, 0, 0][now]).all(), "over two others it takes a round longer"
+
+
+def test_of_a_robot_the_newest_map_counts_whoever_told_it():
+    """Words come by several ways, and in any order."""
+    planner = RobotPlanner("a", **SETTINGS)
+    old, new, later = (OccupancyGrid(np.full((4, 4), k), CELL, (0.0, 0.0, 0.0)) for k in range(3))
+
+    def tell(teller: str, time: float, **grids) -> None:
+        planner.hear(replace(word(teller, AT, time), grids=grids))
+
+    tell("b", 9.0, c=(5.0, new))
+    tell("d", 9.5, c=(4.0, old), a=(9.0, old))
+    assert planner.grids == {"c": (5.0, new)}, "older, and its own"
+    tell("d", 9.6, c=(5.0, old))
+    assert planner.grids["c"] == (5.0, new), "of the same moment"
+    tell("c", 5.0, c=(5.0, old))
+    assert planner.grids["c"] == (5.0, old), "it knows best what it has told then"
+    tell("b", 8.0, c=(6.0, later))
+    assert planner.grids["c"] == (6.0, later) and planner.heard["b"].time == 9.5 - 0.5
 
 
 def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
@@ -108,10 +169,35 @@ def test_a_mate_is_forgotten_but_not_its_map(monkeypatch):
     assert not planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=0.0, share=True).done
 
 
+def test_who_is_connected_over_others(monkeypatch):
+    """In a line, a hears of d by b and c; once d is silent, that its last word goes round connects it with nobody."""
+    each = {name: RobotPlanner(name, **SETTINGS) for name in "abcd"}
+    world, found = World(), {name: [] for name in each}
+    for name, planner in each.items():
+        plan = planner.team.plan
+
+        def note(*call, name=name, plan=plan, **more):
+            found[name].append("".join(sorted(more["connected"][name])))
+            return plan(*call, **more)
+
+        monkeypatch.setattr(planner.team, "plan", note)
+    for now in range(9):
+        for planner in each.values():
+            planner.plan(world.grid(), CELL, (0.0, 0.0), AT, now=float(now))
+        for teller, listener in ("ab", "ba", "bc", "cb", "cd", "dc"):
+            if now < 4 or teller != "d":
+                each[listener].hear(each[teller].word())
+    assert found["a"] == ["", "b", "bc"] + ["bcd"] * 4 + ["bc"] * 2
+    assert found["c"] == ["", "bd"] + ["abd"] * 3 + ["ab"] * 4
+    assert each["a"].word().hears == {"b": 7.0, "c": 6.0, "d": 3.0}
+
+
 def test_a_word_from_the_future_does_not_stay():
     world, planner = World(), RobotPlanner("a", memory=5.0, **SETTINGS)
-    planner.hear(word("b", (9.0, 9.0), 1e9))
+    grid = OccupancyGrid(np.full((4, 4), 100), CELL, (0.0, 0.0, 0.0))
+    planner.hear(word("b", (9.0, 9.0), 1e9, grid))
     planner.plan(world.grid(), CELL, (0.0, 0.0), (1.0, 1.0), now=1.0)
+    assert not planner.grids and not planner.beats.times
     planner.hear(word("b", world.at[1], 2.0))
     assert planner.heard["b"].time == 2.0
 

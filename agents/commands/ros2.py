@@ -9,11 +9,13 @@ from typing import Any
 from maexp.agents.command_words import as_list
 from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.runtime.driver import DriverSettings, TeamDriver, read_settings
-from maexp.agents.runtime.robot_driver import RobotDriver
+from maexp.agents.runtime.base_driver import make_driver
+from maexp.agents.runtime.driver import DriverSettings, read_settings
 from maexp.agents.settings.runs import Recipe
+from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import Ros2Settings
 from maexp.agents.suites.suite import load_suite, suite_names
+from maexp.envs.config.comm import CommConfig
 
 KEPT = ("place", "seed", "name")
 """Settings of a served suite that `resume` keeps."""
@@ -53,18 +55,12 @@ def check(cfg: Ros2Settings) -> None:
     with blame_input():
         read_domain(cfg.domain)
         if cfg.task == "team":
-            make_driver(cfg)
-
-
-def make_driver(cfg: Ros2Settings) -> TeamDriver:
-    """Of the whole team, or of the one robot that is named."""
-    settings = driver_settings(cfg)
-    return RobotDriver(settings) if settings.only else TeamDriver(settings)
+            make_driver(driver_settings(cfg))
 
 
 def driver_settings(cfg: Ros2Settings) -> DriverSettings:
     """Those of the team; what was not given is as `DriverSettings` has it."""
-    values = {field.name: cfg[field.name] for field in fields(DriverSettings)}
+    values = {field.name: cfg[field.name] for field in fields(DriverSettings)} | {"comm": read(CommConfig, cfg.comm)}
     several = [field.name for field in fields(DriverSettings) if isinstance(field.default, tuple)]
     for name in several:
         values[name] = as_list(values[name])
@@ -107,7 +103,7 @@ def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
 def _team(cfg: Ros2Settings, wire: Any) -> int:
     from maexp.agents.ros2.robot import make_team
 
-    course = make_team(make_driver(cfg), wire, cfg.answer, _tell, cfg.goals).run()
+    course = make_team(make_driver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
     each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" * bool(course.plans)
     print(f"{course.plans} decisions{each}; {course.episodes} episodes of an arena.")
     return 0

@@ -64,6 +64,12 @@ TOPICS = {
         1,
         latched=True,
     ),
+    "known": Kind(
+        "nav_msgs/msg/OccupancyGrid",
+        "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+        1,
+        latched=True,
+    ),
     "scan": Kind(
         "sensor_msgs/msg/LaserScan",
         "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
@@ -87,7 +93,7 @@ TOPICS = {
     "feedback": Kind(f"{NAVIGATE}_FeedbackMessage"),
 }
 """By the last part of the topic's name. Ours are `episode`, what an arena tells of an episode, and `word`,
-what a robot tells its mates; both as JSON."""
+what a robot tells its mates, both as JSON; and `known`, the map that a robot plans on."""
 EPISODE = "/maexp/episode"
 SERVICES = {
     "send_goal": f"{NAVIGATE}_SendGoal",

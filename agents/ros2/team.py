@@ -104,11 +104,14 @@ class Ros2Team:
             self.driver.take_map(topic, message)
         self.heard = time.monotonic() if maps else self.heard
         now = self._due()
-        if now is not None and self.driver.maps:
+        if now is not None:
             self._decide(now)
             return False
-        silent = time.monotonic() - self.heard > self.answer
-        return silent and not any(reader.matched for reader in self.maps.values()) and self._end()
+        return time.monotonic() - self.heard > self.answer and self._is_over()
+
+    def _is_over(self) -> bool:
+        """Whether the maps that do not come any more will not come again; an error where none came at all."""
+        return not any(reader.matched for reader in self.maps.values()) and self._end()
 
     def _end(self) -> bool:
         if self.course.plans:
@@ -160,11 +163,17 @@ class Ros2Team:
     def _due(self) -> float | None:
         """The time of the decision that is to be made now [s]; None: none is."""
         episode = self.driver.episode
+        if not self.driver.maps:
+            return None
         if episode is not None:
             topics = [self.driver.topic_of(name) for name in self.driver.robots]
             stamps = {self._stamp(topic) for topic in topics}
             now = stamps.pop() if len(stamps) == 1 and all(goals.ready for goals in self.goals.values()) else None
             return None if now is None or now / SECOND == self.planned or now < episode["begins"] else now / SECOND
+        return self._due_by_clock()
+
+    def _due_by_clock(self) -> float | None:
+        """As `_due`, every period of the time of ROS."""
         if self.time is None and self.clock.matched:
             return None
         now = time.time() if self.time is None else self.time / SECOND

@@ -354,8 +354,9 @@ def open_book(
     if known is None or time_limit is None:
         raise ValueError(
             f"{policy} was trained with observation.radio=true: say how far radios reach, where the base station is "
-            "and how many seconds there are, as in comm={'range': 8.0, 'base_station': (0.0, 0.0)}, time_limit=600.0; "
-            "or use a policy that was trained without it"
+            "and how many seconds there are, as comm={'range': 8.0, 'base_station': (0.0, 0.0)}, time_limit=600.0 or, "
+            "of maexp ros2 team, only=NAME comm.range=8 comm.base_station=[0,0] time_limit=600; or use a policy that "
+            "was trained without it"
         )
     return ContactBook(known, time_limit, motion, watch.patience, watch.pause)
 

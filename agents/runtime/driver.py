@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from maexp.envs.config.comm import CommConfig
 from maexp.envs.fields import setting
 
 from .agent import extend_goals, planner_options
+from .contacts import BASE
 from .frames import (
     NOWHERE,
     Frames,
@@ -38,7 +40,7 @@ class DriverSettings:
     """Of a team; lengths in metres, times in seconds. None or (): what the second half of the text says."""
 
     robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
-    only: str = setting("", "drives this robot alone, by what it has heard of the others; default: all, by one plan")
+    only: str = setting("", "drives this robot alone, by what it has heard; or base_station; default: all, by one plan")
     memory: float = setting(10.0, "with only: how long a mate counts after its last word [s]")
     policy: str = setting("cost_utility", "a planner, a trained policy that ships or the folder of one, lookahead")
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
@@ -55,6 +57,7 @@ class DriverSettings:
     pause: float = setting(60.0, "how long a target is given up [s]")
     max_speed: float | None = setting(None, "of the robots [m/s], told to trained policies; default: as trained")
     time_limit: float | None = setting(None, "for the whole exploration [s]; policies are told what is left of it")
+    comm: CommConfig = setting(CommConfig(), "with only: radios, for policies that look at them, and the base station")
     pose_age: float = setting(2.0, "a pose older than this is not believed [s]")
     goal_change: float = setting(0.5, "a goal is sent again when it has moved farther than this [m]")
     resend: float | None = setting(None, "a goal is sent again after so long [s]; default: never")
@@ -110,7 +113,9 @@ class TeamDriver:
         robots, count = settings.robots, len(settings.robots)
         if not count or len(set(robots)) < count or not all(robots):
             raise ValueError(f"robots={','.join(robots)} must name the robots of the team, each once")
-        if settings.only and settings.only not in robots:
+        if settings.comm != CommConfig() and not settings.only:
+            raise ValueError("comm.* is for robots that plan for themselves: give only=NAME, or leave comm.* out")
+        if settings.only and settings.only not in (*robots, BASE):
             raise ValueError(f"only={settings.only} is none of the team: robots={','.join(robots)}")
         self.topics = settings.map_topics or tuple(f"/{name}/map" for name in robots)
         if len(self.topics) not in (1, count):
@@ -119,7 +124,7 @@ class TeamDriver:
             if len(getattr(settings, name)) not in sizes:
                 wanted = " or ".join(map(str, sizes[1:]))
                 raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
-        self.driven: tuple[str, ...] = (settings.only,) if settings.only else robots
+        self.driven: tuple[str, ...] = tuple(name for name in robots if settings.only in ("", name))
         self.listened = tuple(dict.fromkeys(map(self.topic_of, self.driven)))
         self.shared, self.own = Frames(), {name: Frames() for name in self.driven}
         self.begin()
@@ -150,6 +155,7 @@ class TeamDriver:
         for name in ("clearance_factor", "occupied", "bounded", "patience", "pause"):
             own.setdefault(name, getattr(given, name))
         own |= {name: value for name in ("radar_range", "max_speed") if (value := getattr(given, name)) is not None}
+        own |= {"time_limit": self._time_limit()} | ({"comm": given.comm} if given.comm != CommConfig() else {})
         if radius := given.robot_radius:
             each = radius if len(radius) > 1 else radius * len(given.robots)
             own["robot_radius"] = dict(zip(given.robots, each, strict=True))
@@ -208,8 +214,12 @@ class TeamDriver:
         return round(now - (0.0 if self.begun is None else self.begun), 6)
 
     def _time_left(self, now: float) -> float:
-        limit = self.settings.time_limit if self.episode is None else self.episode["seconds"]
+        limit = self._time_limit()
         return 1.0 if limit is None else max(1.0 - self._since(now) / limit, 0.0)
+
+    def _time_limit(self) -> float | None:
+        """For the whole exploration [s]."""
+        return self.settings.time_limit if self.episode is None else self.episode["seconds"]
 
     def _extend(self, plan: Plan, grid: tuple, poses: dict[str, Pose | None]) -> np.ndarray:
         at = np.array([(np.nan, np.nan) if pose is None else pose[:2] for pose in poses.values()])
@@ -313,7 +323,9 @@ def read_settings(values: dict[str, Any]) -> DriverSettings:
     """Of parameters by their names. ROS has none without a value: 0.0, "" and [0.0] stand for what is not given."""
     known, found = {field.name: field.default for field in fields(DriverSettings)}, {}
     for name, value in values.items():
-        if isinstance(known[name], tuple):
+        if isinstance(value, CommConfig):
+            found[name] = value
+        elif isinstance(known[name], tuple):
             found[name] = () if list(value) == [0.0] else tuple(value)
         else:
             found[name] = None if known[name] is None and not value else value

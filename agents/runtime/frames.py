@@ -6,7 +6,7 @@ Messages are read by the names of their fields, so those of rclpy, of DDS and of
 from __future__ import annotations
 
 import math
-from collections.abc import Container
+from collections.abc import Container, Hashable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,17 @@ class OccupancyGrid:
     values: np.ndarray
     resolution: float
     origin: Pose
+
+
+Maps = Mapping[Hashable, tuple[float, OccupancyGrid]]
+"""Robots, the times [s] at which their own maps were so, and these. Only so a robot that was told what one of them has
+since cleared, can clear it, too."""
+
+
+def is_newer(told: tuple, last: tuple | None, itself: bool) -> bool:
+    """Whether a robot's map that came, `told`, takes the place of the `last` one; both begin with their times. Of one
+    time, the robot `itself` is believed, and what comes by others is the same once more."""
+    return last is None or told[0] > last[0] or (itself and told[0] == last[0])
 
 
 def read_map(message) -> OccupancyGrid:

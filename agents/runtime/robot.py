@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Hashable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from .beats import Beats
 from .contacts import BASE, Memory, read_names
-from .frames import OccupancyGrid, merge_grids
+from .frames import Maps, OccupancyGrid, is_newer, merge_grids
 from .planner import Plan, TeamPlanner
 
 
@@ -22,16 +23,19 @@ class Word:
         pose: x, y [m] and yaw [rad] in the frame that all robots share.
         speed: [m/s]
         time: of the pose, by a clock that all robots share [s].
-        grid: what it knows, its own and heard; None: the caller merges grids.
+        grids: its own map and those that it has heard, by the names of the robots that made them, each with the time of
+            that robot's clock at which it was so [s]; none: the caller merges grids.
         memory: what it knows of radios; None: its policy does not look at that.
+        hears: whom it has heard of not long ago, from themselves or over others, and the times of their last words [s].
     """
 
     name: Hashable
     pose: tuple[float, ...]
     speed: float
     time: float
-    grid: OccupancyGrid | None = None
+    grids: Maps = field(default_factory=dict)
     memory: Memory | None = None
+    hears: Mapping[Any, float] = field(default_factory=dict)
 
 
 class RobotPlanner:
@@ -44,7 +48,7 @@ class RobotPlanner:
     Args:
         name: of the robot; the robots' names must sort, for all plan for the team in the same order.
         policy, settings: of `TeamPlanner`, the same for all robots.
-        memory: a mate counts so long after its last word [s]; what it told of the map stays.
+        memory: a mate counts so long after its last word [s]; its map stays until a newer one of it comes.
         mates: names of the others; policies that look at radios count those, too, that were never heard.
     """
 
@@ -65,34 +69,35 @@ class RobotPlanner:
         self.name, self.memory, self.mates = name, memory, mates
         self.team = TeamPlanner(policy, **settings)
         self.heard: dict[Hashable, Word] = {}
-        self.grids: dict[Hashable, OccupancyGrid] = {}
+        self.grids: dict[Hashable, tuple[float, OccupancyGrid]] = {}  # of each mate the newest, whoever told it
+        self.beats = Beats()
         self._word: Word | None = None
-        self._lately: set[Hashable] = set()  # heard since the last plan
 
     def reset(self) -> None:
         """Forget the past: mates, their maps, what was given up."""
         self.team.reset()
-        self.heard, self.grids, self._word = {}, {}, None
-        self._lately = set()
+        self.heard, self.grids, self.beats, self._word = {}, {}, Beats(), None
 
     def hear(self, word: Word) -> None:
-        """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last
-        changes nothing.
+        """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last,
+        and maps that are older than what was heard of the robots that made them, change nothing.
 
         Raises:
             ValueError: it comes from a robot of this one's name.
         """
         if word.name == self.name:
             raise ValueError(f"a word from {word.name!r} came to {self.name!r}: give each robot a name of its own")
+        for source, told in word.grids.items():
+            if source != self.name and is_newer(told, self.grids.get(source), source == word.name):
+                self.grids[source] = told
         last = self.heard.get(word.name)
         if last is None or word.time >= last.time:
             self.heard[word.name] = word
-            self._lately.add(word.name)
-            if word.grid is not None:
-                self.grids[word.name] = word.grid
+            self.beats.hear(word.name, word.time)
+            self.beats.hear_of({name: time for name, time in word.hears.items() if name != self.name})
 
     def word(self) -> Word | None:
-        """What this robot tells others: of its last plan's pose and grid; None before the first."""
+        """What this robot tells others: of its last plan's pose and grids; None before the first."""
         return self._word
 
     def plan(
@@ -115,35 +120,42 @@ class RobotPlanner:
             pose: x, y and, if known, yaw of this robot, or None.
             speed: its speed [m/s].
             now: the time, by the clock of all robots [s].
-            share: whether grids that were heard join this one, and its word holds what came of it; else the caller
-                merges them.
+            share: whether it plans on this grid and all that were heard together, and its word holds them; else the
+                caller merges them.
             connected: names of those that it is connected with now over any number of others, "base_station" for that;
-                None: those heard since the last plan. Only policies trained with ``observation.radio=true`` look at it.
+                None: those of whom words came since the last plan, from themselves or over others. Only policies that
+                were trained with ``observation.radio=true`` look at it.
             more: other arguments of `TeamPlanner.plan`.
 
         Raises:
             ValueError: as `TeamPlanner.plan`.
         """
+        self._forget_later(now + self.memory)
         if share:
             yaw = float(origin[2]) if len(origin) > 2 else 0.0
-            own = OccupancyGrid(np.asarray(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
-            own = merge_grids([own, *self.grids.values()])
-            grid, resolution, origin = own.values, own.resolution, own.origin
-        self.heard = {
-            name: word for name, word in self.heard.items() if word.time - now <= self.memory
-        }  # none from later
+            own = OccupancyGrid(np.array(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
+            merged = merge_grids([own, *(heard for _, heard in self.grids.values())])
+            grid, resolution, origin = merged.values, merged.resolution, merged.origin
         words = {name: word for name, word in self.heard.items() if now - word.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
         poses = {name: pose if name == self.name else words[name].pose for name in names}
         speeds = [speed if name == self.name else words[name].speed for name in names]
-        links = {self.name: set(self._lately if connected is None else read_names("connected", connected))}
-        self._lately.clear()
+        lately = self.beats.take_lately()
+        links = {self.name: lately if connected is None else set(read_names("connected", connected))}
         self._take_memories()
         plan = self.team.plan(grid, resolution, origin, poses, velocities=speeds, now=now, connected=links, **more)
         if pose is not None:
             knows = None if self.team.book is None else self.team.book.memories.get(self.name)
-            self._word = Word(self.name, tuple(map(float, pose)), speed, now, own if share else None, knows)
+            grids = {self.name: (now, own), **self.grids} if share else {}
+            hears = self.beats.tell(now - self.memory)
+            self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows, hears)
         return _row(plan, names.index(self.name))
+
+    def _forget_later(self, time: float) -> None:
+        """What claims to be of later than that [s] would hide what comes next."""
+        self.heard = {name: word for name, word in self.heard.items() if word.time <= time}
+        self.grids = {name: told for name, told in self.grids.items() if told[0] <= time}
+        self.beats.forget_later(time)
 
     def _take_memories(self) -> None:
         """What mates have told of radios takes the place of what was guessed of them."""

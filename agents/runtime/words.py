@@ -1,4 +1,4 @@
-"""What robots tell each other of themselves, as text: a `Word` without its map, in JSON."""
+"""What robots tell each other of themselves, as text: a `Word` without maps, in JSON."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from .robot import Word
 
 LONGEST = 100_000  # characters of a word that is read
 FURTHEST = 1e9  # numbers beyond are none
+LATEST = 1e12  # times, too [s]
 
 
 def write_word(word: Word) -> str:
     """In JSON; numbers are told to the last bit."""
     memory = None if word.memory is None else asdict(word.memory)
-    return json.dumps({"name": word.name, "pose": word.pose, "speed": word.speed, "time": word.time, "memory": memory})
+    plain = {name: getattr(word, name) for name in ("name", "pose", "speed", "time", "hears")}
+    return json.dumps(plain | {"memory": memory})
 
 
 def read_word(text: str) -> Word:
@@ -32,7 +34,9 @@ def read_word(text: str) -> Word:
         found = json.loads(text)
         pose = _numbers(found["pose"], 3)
         memory = None if found["memory"] is None else _read_memory(found["memory"])
-        return Word(_name(found["name"]), pose, _number(found["speed"]), _number(found["time"], 1e12), None, memory)
+        hears = {_name(name): _number(time, LATEST) for name, time in found["hears"].items()}
+        name, speed, time = _name(found["name"]), _number(found["speed"]), _number(found["time"], LATEST)
+        return Word(name, pose, speed, time, memory=memory, hears=hears)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
         raise ValueError("what came is no word of a robot") from None
 

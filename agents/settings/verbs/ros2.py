@@ -1,19 +1,24 @@
 """Settings of `maexp ros2`."""
 
-from dataclasses import dataclass, fields, make_dataclass
+from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any
 
 from omegaconf import MISSING
 
 from maexp.agents.runtime.driver import DriverSettings
 from maexp.agents.settings.groups import LAST_SEED
+from maexp.agents.settings.storable import storable
+from maexp.envs.config.comm import CommConfig
 from maexp.envs.fields import setting
+
+CommSettings = storable(CommConfig)
 
 DriveSettings = make_dataclass(
     "DriveSettings",
     [
-        (field.name, Any, setting(None if field.default == () else field.default, f"team: {field.metadata['help']}"))
-        for field in fields(DriverSettings)
+        (row.name, Any, setting(None if row.default == () else row.default, f"team: {row.metadata['help']}"))
+        for row in fields(DriverSettings)
+        if row.name != "comm"
     ],
 )
 
@@ -23,6 +28,7 @@ class Ros2Settings(DriveSettings):
     """`maexp ros2`."""
 
     task: str = MISSING
+    comm: CommSettings = field(default_factory=CommSettings)
     place: str | None = setting(None, "serve: the suite, or the .yaml file of one")
     domain: int | None = setting(None, "number of DDS's domain; default: ROS_DOMAIN_ID, or 0")
     answer: float = setting(60.0, "how long the other side may be silent before this ends", unit="s", above=0)

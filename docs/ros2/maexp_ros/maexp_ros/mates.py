@@ -1,4 +1,4 @@
-"""What the node of one robot tells its mates, and hears of them. All thinking is in maexp.agents.runtime."""
+"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.runtime."""
 
 from __future__ import annotations
 
@@ -7,26 +7,33 @@ from functools import partial
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.time import Time
 from std_msgs.msg import String
 
 from maexp.agents.runtime.frames import fill_grid
-from maexp.agents.runtime.robot_driver import RobotDriver
+from maexp.agents.runtime.radio_driver import RadioDriver, map_topic
 from maexp.agents.runtime.words import write_word
 
 
 class Mates:
-    """Topics /NAME/maexp/map and /NAME/maexp/word of all robots of a team."""
+    """Topics /NAME/maexp/... of all robots of a team, and of the base station."""
 
-    def __init__(self, node: Node, driver: RobotDriver, latched: QoSProfile):
+    def __init__(self, node: Node, driver: RadioDriver, latched: QoSProfile):
         self.node, self.driver = node, driver
-        for name in driver.mates:
-            map_topic, word_topic = f"/{name}/maexp/map", f"/{name}/maexp/word"
-            take = partial(self._take, map_topic, partial(driver.take_known, name))
-            node.create_subscription(OccupancyGrid, map_topic, take, latched)
-            take = partial(self._take, word_topic, lambda message, name=name: driver.take_word(name, message.data))
-            node.create_subscription(String, word_topic, take, QoSProfile(depth=1))
-        self.map = node.create_publisher(OccupancyGrid, f"/{driver.name}/maexp/map", latched)
+        for name in driver.speakers:
+            topic = f"/{name}/maexp/word"
+            take = partial(self._take, topic, lambda message, name=name: driver.take_word(name, message.data))
+            node.create_subscription(String, topic, take, QoSProfile(depth=1))
+        for topic, source in driver.map_topics().items():
+            take = partial(self._take, topic, partial(driver.take_known, source))
+            node.create_subscription(OccupancyGrid, topic, take, latched)
+        self.maps = {
+            name: node.create_publisher(OccupancyGrid, map_topic(driver.name, name), latched)
+            for name in (driver.name, *driver.mates)
+        }
+        self.known = node.create_publisher(OccupancyGrid, f"/{driver.name}/maexp/known", latched)
         self.word = node.create_publisher(String, f"/{driver.name}/maexp/word", QoSProfile(depth=1))
 
     def _take(self, topic: str, take: Callable, message) -> None:
@@ -36,16 +43,24 @@ class Mates:
             self.node.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=10.0)
 
     def tell(self, now) -> None:
-        """What this robot knows and where it is, at a rclpy.time.Time.
+        """What it has seen and heard, and where it is, at a rclpy.time.Time; to who looks on, all that in one map.
 
         Raises:
             ValueError: where its map lies in the team's frame is not known.
         """
-        known, word = self.driver.known([]), self.driver.word(now.nanoseconds * 1e-9)
-        if known is not None:
-            message = OccupancyGrid()
-            fill_grid(message, self.driver.settings.global_frame, known)
-            message.header.stamp = now.to_msg()
-            self.map.publish(message)
+        seconds = now.nanoseconds * 1e-9
+        own, word = self.driver.tell_own(seconds), self.driver.word(seconds)
+        if own is not None:
+            self._publish(self.maps[self.driver.name], Time(nanoseconds=round(own[0] * 1e9)), own[1])
+        if self.known.get_subscription_count() and (known := self.driver.known([])) is not None:
+            self._publish(self.known, now, known)
+        for source, message in self.driver.pass_on(seconds).items():
+            self.maps[source].publish(message)
         if word is not None:
             self.word.publish(String(data=write_word(word)))
+
+    def _publish(self, publisher: Publisher, time: Time, grid) -> None:
+        message = OccupancyGrid()
+        fill_grid(message, self.driver.settings.global_frame, grid)
+        message.header.stamp = time.to_msg()
+        publisher.publish(message)

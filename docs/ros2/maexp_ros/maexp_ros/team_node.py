@@ -15,17 +15,21 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maexp.agents.runtime.driver import DriverSettings, Order, TeamDriver, read_settings
+from maexp.agents.runtime.base_driver import make_driver
+from maexp.agents.runtime.contacts import USED
+from maexp.agents.runtime.driver import DriverSettings, Order, read_settings
 from maexp.agents.runtime.frames import fill_pose
-from maexp.agents.runtime.robot_driver import RobotDriver
+from maexp.agents.runtime.radio_driver import RadioDriver
+from maexp.envs.config.comm import CommConfig
 
 from . import conversion
 from .mates import Mates
 
 OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
-PARAMETERS = {name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()} | {
-    "action": "navigate_to_pose"
-}
+COMM = asdict(CommConfig()) | {"cell": 0.0, "base_station": [0.0]}
+PARAMETERS = {name: 0.0 if value is None else value for name, value in (asdict(DriverSettings()) | OWN).items()}
+PARAMETERS |= {"action": "navigate_to_pose"} | {f"comm.{name}": COMM[name] for name in USED}
+PARAMETERS.pop("comm")
 
 
 def latched(depth: int) -> QoSProfile:
@@ -35,7 +39,7 @@ def latched(depth: int) -> QoSProfile:
 
 
 class TeamNode(Node):
-    """One node for the whole team, or for one robot of it; its parameters are those of config/team.yaml."""
+    """For the whole team, or for one robot of it or the base station; its parameters are those of config/team.yaml."""
 
     def __init__(self):
         super().__init__("team")
@@ -43,9 +47,9 @@ class TeamNode(Node):
             self.declare_parameter(name, default)
         values = {name: self.get_parameter(name).value for name in PARAMETERS}
         action = values.pop("action")
-        settings = read_settings(values)
-        self.driver: TeamDriver = RobotDriver(settings) if settings.only else TeamDriver(settings)
-        driver = self.driver
+        radios = {name: values.pop(f"comm.{name}") for name in USED}
+        given = {name: value for name, value in radios.items() if value != COMM[name]}
+        self.driver = driver = make_driver(read_settings(values | {"comm": CommConfig(**given)}))
         self.frame = driver.settings.global_frame
         for topic in driver.listened:
             self.create_subscription(OccupancyGrid, topic, partial(driver.take_map, topic), latched(1))
@@ -58,7 +62,7 @@ class TeamNode(Node):
             take = partial(driver.take_odometry, robot)
             self.create_subscription(Odometry, f"/{robot}/odom", take, QoSProfile(depth=10))
         self.clients_of = {name: ActionClient(self, NavigateToPose, f"/{name}/{action}") for name in driver.driven}
-        self.mates = Mates(self, driver, latched(1)) if isinstance(driver, RobotDriver) else None
+        self.mates = Mates(self, driver, latched(1)) if isinstance(driver, RadioDriver) else None
         self.handles: dict[str, object] = {}  # of goals that nav2 has accepted
         self.markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self.finished = False

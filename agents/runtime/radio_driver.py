@@ -1,0 +1,189 @@
+"""A radio of a ROS 2 team without a central planner, a robot's or the base station's: what it hears and passes on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from .beats import Beats
+from .contacts import BASE
+from .driver import Decision, DriverSettings, TeamDriver
+from .frames import OccupancyGrid, is_newer, merge_grids, read_map, read_time, span
+from .grid import MAX_CELLS
+from .robot import Word
+from .words import FURTHEST, read_word
+
+FINEST = 1e-3  # edge of a cell of a map that is read [m]
+
+
+@dataclass(frozen=True)
+class Told:
+    """A mate's own map in the team's frame, and the message that it came by, to be passed on."""
+
+    grid: OccupancyGrid
+    message: Any
+
+
+def map_topic(speaker: str, source: str) -> str:
+    """Where a radio tells the own map of a robot, itself or another."""
+    return f"/{speaker}/maexp/{'' if speaker == source else f'heard/{source}/'}map"
+
+
+class RadioDriver(TeamDriver):
+    """Hears the robots of a team, keeps the newest map of each, and tells what is new.
+
+    Words carry times of ROS, by the clock that all share, and places in the team's frame.
+
+    Args:
+        settings: of the team; `only` names this radio.
+
+    Attributes:
+        mates: names of the robots that are heard.
+        speakers: names of all that are heard.
+
+    Raises:
+        ValueError: as for `TeamDriver`; nobody is named, or a robot as the base station is.
+    """
+
+    def __init__(self, settings: DriverSettings):
+        if not settings.only:
+            raise ValueError("only= must name the robot that is driven")
+        if BASE in settings.robots:
+            raise ValueError(f"robots={','.join(settings.robots)}: {BASE!r} names the base station, and no robot")
+        self.name = settings.only
+        self.mates = tuple(name for name in settings.robots if name != settings.only)
+        self.speakers = tuple(name for name in (*self.mates, BASE) if name != settings.only)
+        self.words: dict[str, Word] = {}  # the last of each speaker
+        self.told: dict[str, tuple[float, Told]] = {}  # of each mate the newest map, and since when it is so [s]
+        super().__init__(settings)
+
+    def begin(self, episode: dict[str, Any] | None = None, now: float | None = None) -> None:
+        """As `TeamDriver.begin`: what was told before an arena's episode is forgotten; who was faster may have told of
+        it already."""
+        super().begin(episode, now)
+        self.passed: dict[str, float] = {}  # times of the maps that were passed on
+        self.beats, self.before = Beats(), set[Any]()
+        for word in self.words.values():
+            self.hear(word)
+
+    def hear(self, word: Word) -> bool:
+        """Take in a word; whether it is one of a speaker, and of this episode."""
+        if word.name not in self.speakers:
+            return False
+        self.words[word.name] = word
+        self.begun = word.time if self.begun is None else self.begun
+        if not self._counts(word.time):
+            return False
+        self.beats.hear(word.name, word.time)
+        others = {name: time for name, time in word.hears.items() if name in self.speakers and self._counts(time)}
+        self.beats.hear_of(others)
+        return True
+
+    def take_word(self, name: str, text: str) -> bool:
+        """What came on /NAME/maexp/word, as `write_word` writes it; whether it counts.
+
+        Raises:
+            ValueError: it is none, or not its.
+        """
+        word = read_word(text)
+        if word.name != name:
+            raise ValueError(f"a word of {word.name!r} came")
+        return self.hear(word)
+
+    def map_topics(self) -> dict[str, str]:
+        """Where maps are told, a robot's own and those that were heard; the names of the robots that made these."""
+        told = [(speaker, source) for speaker in self.speakers for source in self.mates]
+        return {map_topic(speaker, source): source for speaker, source in told}
+
+    def take_known(self, source: str, message) -> None:
+        """What came on one of `map_topics`, a nav_msgs/OccupancyGrid in the team's frame.
+
+        One that is not newer than the last of that robot changes nothing.
+
+        Raises:
+            ValueError: it is of no mate, in another frame, none, or larger than is planned on.
+        """
+        if source not in self.mates:
+            raise ValueError(f"a map of {source} came, who is no mate")
+        time = read_time(message.header.stamp)
+        if not is_newer((time,), self.told.get(source), False):
+            return
+        frame = message.header.frame_id.lstrip("/")
+        if frame != self._root:
+            raise ValueError(f"a map in the frame {frame} is not known")
+        grid = read_map(message)
+        numbers = (grid.resolution, *grid.origin)
+        if not all(map(math.isfinite, numbers)) or grid.resolution < FINEST or max(map(abs, numbers)) > FURTHEST:
+            raise ValueError(f"a map with cells of {grid.resolution:g} m at {grid.origin} is none")
+        if grid.values.size == 0 or grid.values.size > MAX_CELLS:
+            raise ValueError(
+                f"a map of {grid.values.size:,} cells: more than none, and at most {MAX_CELLS:,}, are read"
+            )
+        self.told[source] = time, Told(grid, message)
+
+    def has_heard(self, name: str, now: float) -> bool:
+        """Whether somebody has spoken at `now` [s] or since."""
+        return name in self.words and self.words[name].time >= now
+
+    def _counts(self, time: float) -> bool:
+        """What was told before an episode of an arena, of another place, does not."""
+        return self.episode is None or self.begun is None or time >= self.begun
+
+    def word(self, now: float) -> Word | None:
+        """What to tell of itself at `now` [s]; None: it does not know where it is."""
+        raise NotImplementedError
+
+    def tell_own(self, now: float) -> tuple[float, OccupancyGrid] | None:
+        """Its own map in the team's frame, to be told at `now` [s], and since when it is so; None: it has none.
+
+        Raises:
+            ValueError: where it lies in the team's frame is not known.
+        """
+        raise NotImplementedError
+
+    def pass_on(self, now: float) -> dict[str, Any]:
+        """The messages with maps of mates that are newer than those that were passed on before, by the mates' names."""
+        found = {}
+        for source, (time, told) in self.told.items():
+            if self._counts(time) and time <= now + self.settings.memory and time != self.passed.get(source):
+                found[source], self.passed[source] = told.message, time
+        return found
+
+    def decide(self, now: float) -> Decision:
+        """As `TeamDriver.decide`. A map that claims to be of later would hide what comes next: it is forgotten."""
+        latest = now + self.settings.memory
+        later = [source for source, (time, _) in self.told.items() if time > latest]
+        self.told = {source: told for source, told in self.told.items() if source not in later}
+        self.beats.forget_later(latest)
+        decision = self._decide(now)
+        decision.notes.extend(f"the map of {source} is left out: its time has not come yet" for source in later)
+        return decision
+
+    def _decide(self, now: float) -> Decision:
+        return super().decide(now)
+
+    def known(self, notes: list[str]) -> OccupancyGrid | None:
+        """What it knows, in the team's frame: its own map, and those that it has heard; None: nothing yet.
+
+        Raises:
+            ValueError: where its own map lies in the team's frame is not known.
+        """
+        raise NotImplementedError
+
+    def _add_told(self, grids: list[OccupancyGrid], notes: list[str]) -> OccupancyGrid | None:
+        """These maps and those that were heard in one; None: there are none."""
+        for name, (time, told) in self.told.items():
+            if not self._counts(time):
+                continue
+            if span([*grids, told.grid])[2].astype(float).prod() > MAX_CELLS:
+                notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
+                continue
+            grids.append(told.grid)
+        return merge_grids(grids) if grids else None
+
+    def _take_linked(self) -> set[Any]:
+        """Whom it is connected with now: whose words have come since the last decision but one."""
+        lately = self.beats.take_lately()
+        linked, self.before = lately | self.before, lately
+        return linked
