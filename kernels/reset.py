@@ -290,6 +290,8 @@ def place_teams(launch: Launch, shard: Shard) -> None:
         flags += [s.known_free, s.known_boundary]
     if shard.settings.false_alarms:
         flags.append(s.false_walls)
+    if shard.settings.map_errors:
+        flags += [s.drawn, s.place_free, s.place_boundary]
     lanes = lanes_on(shard.device, 1024)
     for flag in flags:
         shard.call(launch, _clear_flags, (*flag.shape[:2], lanes), flags=flag, lanes=lanes)

@@ -9,6 +9,7 @@ from maexp.kernels.collision import detect_collisions
 from maexp.kernels.dynamics import move_robots
 from maexp.kernels.faults import fail_robots
 from maexp.kernels.launches import Launch
+from maexp.kernels.mapping import draw_looks, draw_told
 from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track
@@ -33,8 +34,10 @@ def local_step(launch: Launch, shard: Shard) -> None:
     detect_collisions(launch, shard)
     estimate_poses(launch, shard, active, begins=0)
     scan(launch, shard, active, ahead=1)
+    draw_looks(launch, shard, active, ahead=1)
     merge_scan(launch, shard, active)
     share_maps(launch, shard, active)
+    draw_told(launch, shard, active)
     settle_walls(launch, shard, active)
     note_links(launch, shard)
     reward_robots(launch, shard)
@@ -60,8 +63,10 @@ def reset(launch: Launch, shard: Shard) -> None:
     estimate_poses(launch, shard, mask, begins=1)
     list_near(launch, shard, mask)
     scan(launch, shard, mask, ahead=0)
+    draw_looks(launch, shard, mask, ahead=0)
     merge_scan(launch, shard, mask)
     share_maps(launch, shard, mask)
+    draw_told(launch, shard, mask)
     settle_walls(launch, shard, mask)
     record_track(launch, shard, mask, ahead=0)
     start_episodes(launch, shard)
