@@ -242,9 +242,9 @@ def _measure_maps(
     wp.atomic_add(count, e, row, points)
 
 
-def draw_looks(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> None:
-    """Let robots draw what they see, if that is where they believe it to be, in the envs where ``running`` [env] is
-    set; ``ahead``: 0 in the scan of a reset, 1 in that of a local step.
+def draw_maps(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> None:
+    """Let robots draw what they see and what they have heard of, if maps have errors, in the envs where ``running``
+    [env] is set; ``ahead``: 0 after the scan of a reset, 1 after that of a local step.
 
     In the one map of a team, robots draw one after the other: of points that several see, the first has the place.
     """
@@ -253,36 +253,21 @@ def draw_looks(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> N
     envs, robots = shard.shape
     viewed = shard.view.visible_count if shard.values["sensing"] is None else shard.view.viewed_count
     given = {"active": running, "ahead": ahead, "viewed": viewed}
-    if shard.settings.limited:
-        shard.call(launch, _draw_looks, (envs, robots, shard.lanes), first=0, **given)
+    if not shard.settings.limited:
+        for robot in reversed(range(robots)):
+            shard.call(launch, _draw_looks, (envs, 1, shard.lanes), first=robot, **given)
         return
-    for robot in reversed(range(robots)):
-        shard.call(launch, _draw_looks, (envs, 1, shard.lanes), first=robot, **given)
-
-
-def draw_told(launch: Launch, shard: Shard, running: wp.array) -> None:
-    """Let robots draw what they have heard of, where maps have errors and communication is limited, in the envs where
-    ``running`` [env] is set."""
-    if not (shard.settings.map_errors and shard.settings.limited):
-        return
-    maps, grids, s = shard.values["maps"], shard.values["grids"], shard.view
-    ground = {
-        "point_begin": maps.free_begin,
-        "point_cell": grids.free_cell,
-        "known": s.known_free,
-        "place": s.place_free,
-        "key": TOLD,
-    }
-    walls = {
-        "point_begin": maps.boundary_begin,
-        "point_cell": grids.boundary_cell,
-        "known": s.known_boundary,
-        "place": s.place_boundary,
-        "key": TOLD + 1,
-    }
-    lanes = lanes_on(shard.device, 1024)
-    for layer in (ground, walls):
-        shard.call(launch, _draw_told, (shard.shape[0], lanes), active=running, lanes=lanes, **layer)
+    shard.call(launch, _draw_looks, (envs, robots, shard.lanes), first=0, **given)
+    maps, grids, lanes = shard.values["maps"], shard.values["grids"], lanes_on(shard.device, 1024)
+    for what, key in (("free", TOLD), ("boundary", TOLD + 1)):
+        layer = {
+            "point_begin": getattr(maps, f"{what}_begin"),
+            "point_cell": getattr(grids, f"{what}_cell"),
+            "known": getattr(shard.view, f"known_{what}"),
+            "place": getattr(shard.view, f"place_{what}"),
+            "key": key,
+        }
+        shard.call(launch, _draw_told, (envs, lanes), active=running, lanes=lanes, **layer)
 
 
 def measure_maps(launch: Launch, shard: Shard) -> tuple[torch.Tensor, torch.Tensor]:
