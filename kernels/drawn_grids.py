@@ -57,11 +57,11 @@ def _copy_drawn(
     # State in:
     drawn: wp.array3d(dtype=wp.int32),  # [env, row, cell]
     # In and out:
-    stale: wp.array(dtype=wp.int32),  # [row]
     known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     news_count: wp.array(dtype=wp.int32),  # [row]
     # Out:
+    stale: wp.array(dtype=wp.int32),  # [row]
     news: wp.array2d(dtype=wp.int32),  # [row, slot]
 ):
     """Show what is drawn. A row that loses a wall, or shows less, is stale."""
@@ -97,10 +97,10 @@ def _enter_false_walls(
     false_flags: wp.array3d(dtype=wp.int32),  # [env, word, free]
     place_free: wp.array3d(dtype=wp.int32),  # [env, row, free]
     # In and out:
-    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     walls: wp.array2d(dtype=wp.int32),  # [row, word]
     news_count: wp.array(dtype=wp.int32),  # [row]
     # Out:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
     news: wp.array2d(dtype=wp.int32),  # [row, slot]
 ):
     """Show false walls where the row has its free points that it takes for them."""

@@ -106,6 +106,7 @@ def _draw_looks(
     viewed: wp.array2d(dtype=wp.int32),  # [env, robot]
     # State in and out:
     drawn: wp.array3d(dtype=wp.int32),  # [env, row, cell]
+    # State out:
     place_free: wp.array3d(dtype=wp.int32),  # [env, row, free]
     place_boundary: wp.array3d(dtype=wp.int32),  # [env, row, boundary]
 ):
@@ -209,6 +210,28 @@ def _draw_told(
 
 
 @wp.kernel
+def _forget_drawings(
+    # Settings:
+    lanes: int,
+    # Scratch in:
+    mask: wp.array(dtype=wp.int32),  # [env]
+    # State out:
+    drawn: wp.array3d(dtype=wp.int32),  # [env, row, cell]
+    place_free: wp.array3d(dtype=wp.int32),  # [env, row, free]
+    place_boundary: wp.array3d(dtype=wp.int32),  # [env, row, boundary]
+):
+    e, row, lane = wp.tid()
+    if mask[e] == 0:
+        return
+    for cell in range(lane, drawn.shape[2], lanes):
+        drawn[e, row, cell] = 0
+    for j in range(lane, place_free.shape[2], lanes):
+        place_free[e, row, j] = 0
+    for j in range(lane, place_boundary.shape[2], lanes):
+        place_boundary[e, row, j] = 0
+
+
+@wp.kernel
 def _measure_maps(
     # Map:
     maps: Maps,
@@ -218,8 +241,9 @@ def _measure_maps(
     lanes: int,
     limited: int,
     # State in:
-    known: wp.array3d(dtype=wp.int32),  # [env, word, free]
     place_free: wp.array3d(dtype=wp.int32),  # [env, row, free]
+    # In:
+    known: wp.array3d(dtype=wp.int32),  # [env, word, free]
     # Out:
     total: wp.array2d(dtype=wp.int64),  # [env, row], sum of distances [um]
     count: wp.array2d(dtype=wp.int32),  # [env, row]
@@ -268,6 +292,13 @@ def draw_maps(launch: Launch, shard: Shard, running: wp.array, ahead: int) -> No
             "key": key,
         }
         shard.call(launch, _draw_told, (envs, lanes), active=running, lanes=lanes, **layer)
+
+
+def forget_drawings(launch: Launch, shard: Shard) -> None:
+    """Clear the maps of the envs of ``mask``, if they have errors."""
+    if shard.settings.map_errors:
+        lanes = lanes_on(shard.device, 1024)
+        shard.call(launch, _forget_drawings, (*shard.view.drawn.shape[:2], lanes), lanes=lanes)
 
 
 def measure_maps(launch: Launch, shard: Shard) -> tuple[torch.Tensor, torch.Tensor]:
