@@ -69,12 +69,14 @@ def _copy_drawn(
     e = row / rows_per_env
     m = grid_of_row[row]
     w = grids.width[m]
+    keys = drawn[e, row % rows_per_env]
+    shown = known[row]
     for cell in range(lane, w * grids.height[m], lanes):
-        key = drawn[e, row % rows_per_env, cell]
+        key = keys[cell]
         value = wp.uint8(UNKNOWN)
         if key != 0:
             value = wp.where(key % 2 != 0, wp.uint8(OBSTACLE), wp.uint8(FREE))
-        before = known[row, cell]
+        before = shown[cell]
         if value != before:
             if before == wp.uint8(OBSTACLE):
                 x = cell % w

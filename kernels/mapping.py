@@ -20,7 +20,6 @@ from maexp.kernels.drawn_grids import place_x, place_y
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import Launch, lanes_on
-from maexp.kernels.odometry import place_from
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, point_xy
@@ -35,46 +34,54 @@ MICRON = 1.0e6  # distances are summed in whole numbers: so their order does not
 
 
 @wp.func
-def place_at(grids: NavGrids, m: int, at: wp.vec2) -> int:
-    """The number of a place, its coordinates being rounded to half cells: 1 + y (2 width + 1) + x; clamped to the
-    grid."""
-    p = (2.0 / grids.cell[m]) * (at - grids.origin[m])
+def half_cells(grids: NavGrids, m: int, scale: float, at: wp.vec2) -> wp.vec2i:
+    """A place in half cells from the grid's corner, rounded, and clamped to the grid; ``scale``: half cells a metre."""
+    p = scale * (at - grids.origin[m])
     x = wp.clamp(int(wp.floor(p[0] + 0.5)), 0, 2 * grids.width[m])
     y = wp.clamp(int(wp.floor(p[1] + 0.5)), 0, 2 * grids.height[m])
-    return 1 + y * (2 * grids.width[m] + 1) + x
+    return wp.vec2i(x, y)
 
 
 @wp.func
-def draw_cell(
-    grids: NavGrids, m: int, e: int, row: int, of: int, x: int, y: int, key: int, drawn: wp.array3d(dtype=wp.int32)
-):
+def place_number(grids: NavGrids, m: int, half: wp.vec2i) -> int:
+    """The number of a place."""
+    return 1 + half[1] * (2 * grids.width[m] + 1) + half[0]
+
+
+@wp.func
+def turned_place(believed: wp.vec3, true: wp.vec3, c: float, s: float, at: wp.vec3) -> wp.vec2:
+    """Where a robot believes a point to be; ``c``, ``s``: cosine and sine of the error of its heading."""
+    way = at - true
+    return point_xy(believed) + wp.vec2(c * way[0] - s * way[1], s * way[0] + c * way[1])
+
+
+@wp.func
+def draw_cell(grids: NavGrids, m: int, of: int, x: int, y: int, key: int, cells: wp.array(dtype=wp.int32)):
     """Draw cell (x, y), and the voids that follow it as they follow cell ``of`` of the map, as far away as there."""
     w = grids.width[m]
     h = grids.height[m]
-    wp.atomic_max(drawn, e, row, y * w + x, key)
+    wp.atomic_max(cells, y * w + x, key)
     begin = grids.cell_begin[m] + of
     for k in range(grids.void_begin[begin], grids.void_begin[begin + 1]):
         u = x + grids.voids[k] % w - of % w
         v = y + grids.voids[k] / w - of / w
         if u >= 0 and v >= 0 and u < w and v < h:
-            wp.atomic_max(drawn, e, row, v * w + u, key)
+            wp.atomic_max(cells, v * w + u, key)
 
 
 @wp.func
-def draw_point(
-    grids: NavGrids, m: int, e: int, row: int, of: int, place: int, key: int, drawn: wp.array3d(dtype=wp.int32)
-):
-    """Draw a point of cell ``of`` at a place: a wall in one cell, ground in all that its half cell touches."""
-    x = place_x(grids, m, place)
-    y = place_y(grids, m, place)
+def draw_point(grids: NavGrids, m: int, of: int, half: wp.vec2i, key: int, cells: wp.array(dtype=wp.int32)):
+    """Draw a point of cell ``of`` at a place on a map: a wall in one cell, ground in all that its half cell touches."""
+    x = half[0]
+    y = half[1]
     last_x = wp.min(x / 2, grids.width[m] - 1)
     last_y = wp.min(y / 2, grids.height[m] - 1)
     if key % 2 != 0:
-        draw_cell(grids, m, e, row, of, last_x, last_y, key, drawn)
+        draw_cell(grids, m, of, last_x, last_y, key, cells)
     else:
         for v in range(wp.max(y - 1, 0) / 2, last_y + 1):
             for u in range(wp.max(x - 1, 0) / 2, last_x + 1):
-                draw_cell(grids, m, e, row, of, u, v, key, drawn)
+                draw_cell(grids, m, of, u, v, key, cells)
 
 
 @wp.kernel
@@ -126,6 +133,9 @@ def _draw_looks(
     origin = center[e, i]
     believed = center_estimate[e, i]
     turn = pose_estimate[e, i][3] - pose[e, i][3]
+    c = wp.cos(turn)
+    s = wp.sin(turn)
+    scale = 2.0 / grids.cell[m]
     look = TOLD * (local_step[e] + ahead + 2)
     if collided[e, i] != 0:
         look = TOLD
@@ -133,6 +143,7 @@ def _draw_looks(
     first_free = maps.free_begin[m]
     first_wall = maps.boundary_begin[m]
     known = visible_count[e, i]
+    cells = drawn[e, row]
     for slot in range(lane, wp.min(viewed[e, i], visible.shape[2]), lanes):
         j = visible[e, i, slot]
         point = first_free + j
@@ -141,18 +152,18 @@ def _draw_looks(
             wrong = false_walls[e, word, j] & bit
         if slot < known or wrong != 0:
             at = maps.free[point]
-            place = place_at(grids, m, place_from(believed, origin, turn, point_xy(at)))
-            place_free[e, row, j] = place
+            half = half_cells(grids, m, scale, turned_place(believed, origin, c, s, at))
+            place_free[e, row, j] = place_number(grids, m, half)
             if slot < known:
                 key = wp.where(wp.length(at - origin) <= inner, look, TOLD)
-                draw_point(grids, m, e, row, grids.free_cell[point], place, key, drawn)
+                draw_point(grids, m, grids.free_cell[point], half, key, cells)
         for n in range(maps.neighbour_begin[point], maps.neighbour_begin[point + 1]):
             wall = maps.neighbour[n]
             at = maps.boundary[first_wall + wall]
             if (seen_boundary[e, word, wall] & bit) != 0 and wp.length(at - origin) <= radius:
-                place = place_at(grids, m, place_from(believed, origin, turn, point_xy(at)))
-                place_boundary[e, row, wall] = place
-                draw_point(grids, m, e, row, grids.boundary_cell[first_wall + wall], place, look + 1, drawn)
+                half = half_cells(grids, m, scale, turned_place(believed, origin, c, s, at))
+                place_boundary[e, row, wall] = place_number(grids, m, half)
+                draw_point(grids, m, grids.boundary_cell[first_wall + wall], half, look + 1, cells)
 
 
 @wp.func
@@ -200,13 +211,20 @@ def _draw_told(
     if active[e] == 0:
         return
     m = map_id[e]
-    for j in range(lane, point_begin[m + 1] - point_begin[m], lanes):
-        for i in range(drawn.shape[1]):
-            if place[e, i, j] == 0 and (known[e, i / ROBOTS_PER_WORD, j] & (1 << (i % ROBOTS_PER_WORD))) != 0:
+    points = point_begin[m + 1] - point_begin[m]
+    for i in range(drawn.shape[1]):
+        mine = place[e, i]
+        cells = drawn[e, i]
+        knows = known[e, i / ROBOTS_PER_WORD]
+        bit = 1 << (i % ROBOTS_PER_WORD)
+        for j in range(lane, points, lanes):
+            if (knows[j] & bit) != 0 and mine[j] == 0:
                 teller = find_teller(e, i, j, hears, known, place)
                 if teller >= 0:
-                    place[e, i, j] = place[e, teller, j]
-                    draw_point(grids, m, e, i, point_cell[point_begin[m] + j], place[e, i, j], key, drawn)
+                    there = place[e, teller, j]
+                    mine[j] = there
+                    half = wp.vec2i(place_x(grids, m, there), place_y(grids, m, there))
+                    draw_point(grids, m, point_cell[point_begin[m] + j], half, key, cells)
 
 
 @wp.kernel
