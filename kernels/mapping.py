@@ -172,15 +172,14 @@ def find_teller(
     i: int,
     j: int,
     hears: wp.array3d(dtype=wp.int32),
-    known: wp.array3d(dtype=wp.int32),
     place: wp.array3d(dtype=wp.int32),
 ) -> int:
-    """The first robot that knows a point and has drawn it, if possible one that robot i hears now; -1: none."""
+    """The first robot that has a place for a point, if possible one that robot i hears now; -1: none."""
     any = int(-1)
     for k in range(place.shape[1]):
         word = k / ROBOTS_PER_WORD
         bit = 1 << (k % ROBOTS_PER_WORD)
-        if place[e, k, j] != 0 and (known[e, word, j] & bit) != 0:
+        if place[e, k, j] != 0:
             if (hears[e, i, word] & bit) != 0:
                 return k
             if any < 0:
@@ -219,7 +218,7 @@ def _draw_told(
         bit = 1 << (i % ROBOTS_PER_WORD)
         for j in range(lane, points, lanes):
             if (knows[j] & bit) != 0 and mine[j] == 0:
-                teller = find_teller(e, i, j, hears, known, place)
+                teller = find_teller(e, i, j, hears, place)
                 if teller >= 0:
                     there = place[e, teller, j]
                     mine[j] = there

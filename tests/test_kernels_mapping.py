@@ -22,6 +22,7 @@ from maexp.envs.navigation import Navigation, known_grids
 from maexp.kernels import unpack_flags
 from maexp.kernels.constants import OBSTACLE, UNKNOWN
 from maexp.kernels.launches import launch_on
+from maexp.kernels.planner import find_paths
 
 pytestmark = pytest.mark.kernels
 
@@ -77,6 +78,7 @@ class Followed:
             count = int(s["visible_count"][e, i])
             viewed = count if self.env.simulation.settings.false_alarms == 0 else int(s["viewed_count"][e, i])
             view = s["visible"][e, i, :viewed].tolist() if not s["failed"][e, i] else []
+            assert len(set(view)) == len(view), "those without a return are behind the others, none is lost"
             points = []
             for slot, j in enumerate(view):
                 if slot < count or wrong[i, j]:
@@ -228,6 +230,10 @@ def test_what_changes_is_entered_as_if_painted_anew(settings):
             np.testing.assert_array_equal(*masks)
         anew += int((kept.known_grids.news_count.numpy() < 0).sum())
     assert 0 < anew < 20 * len(kept.known_grids.news_count.numpy()), "some rows lose a wall, not all"
+    for block in env.simulation.blocks:  # robots find their ways on the same grids
+        block.replay(find_paths)
+        rows = slice(block.first * kept.rows, block.last * kept.rows)
+        np.testing.assert_array_equal(block.wavefront.known.known.numpy(), kept.known_grids.known.numpy()[rows])
 
 
 def two_robots(comm: CommConfig):

@@ -86,7 +86,7 @@ def tell(drawings: list[Drawing], kind: str, j: int, knows, hears, of: int) -> N
     for i, mine in enumerate(drawings):
         if not knows[i] or (kind, j) in mine.places:
             continue
-        tellers = [k for k, other in enumerate(drawings) if knows[k] and (kind, j) in other.places]
+        tellers = [k for k, other in enumerate(drawings) if (kind, j) in other.places]
         heard = [k for k in tellers if hears[i][k]]
         if tellers:
             place, certain = drawings[(heard or tellers)[0]].places[kind, j]
