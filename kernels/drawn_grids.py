@@ -16,7 +16,7 @@ wp.set_module_options(MODULE_OPTIONS)
 
 @wp.func
 def place_x(grids: NavGrids, m: int, place: int) -> int:
-    """Half cells from the grid's corner to a place (`mapping.place_at`), along x."""
+    """Half cells from the grid's corner to a place (`mapping.place_number`), along x."""
     return (place - 1) % (2 * grids.width[m] + 1)
 
 

@@ -17,6 +17,7 @@ from maexp.envs import (
     RadarConfig,
     make_map,
 )
+from maexp.envs.belief import Beliefs
 from maexp.envs.nav_grid import build_nav_grid
 from maexp.envs.navigation import Navigation, known_grids
 from maexp.kernels import unpack_flags
@@ -338,7 +339,7 @@ def test_imagined_worlds_are_made_of_what_is_drawn(comm):
     env.simulation.tensors["active"].fill_(1)
     nav = Navigation(env)
     nav.update()
-    beliefs = worlds_of(env, nav)
+    beliefs = Beliefs(env, 1, 2, nav)
     beliefs.look(torch.tensor([0]))
     state, walls = beliefs.certain, 0
     for world in range(beliefs.worlds):
@@ -353,12 +354,6 @@ def test_imagined_worlds_are_made_of_what_is_drawn(comm):
         known = nav.known[0, world if beliefs.worlds > 1 else 0]
         assert int((state[world] != 0).sum()) == int((known != UNKNOWN).sum())
     assert walls > 20
-
-
-def worlds_of(env: ExplorationEnv, nav: Navigation):
-    from maexp.envs.belief import Beliefs
-
-    return Beliefs(env, 1, 2, nav)
 
 
 @pytest.mark.parametrize(
