@@ -99,8 +99,8 @@ STATE = {
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
     "drawn": Field(wp.int32, "E r c", "", "what stands in the cell in a robot's map, or the team's, and since when"
         " (`mapping`); 0: nothing"),
-    "place_free": Field(wp.int32, "E r f", "", "where the free point is believed to be (`mapping.place_number`); 0: never"
-        " drawn"),
+    "place_free": Field(wp.int32, "E r f", "", "where the free point is believed to be (`mapping.place_number`); 0:"
+        " never drawn"),
     "place_boundary": Field(wp.int32, "E r b", "", "the same of boundary points"),
     "learned": Field(wp.int32, "E X Y", "", "points in the order in which the radio learned of them; boundary points"
         " are numbered after the map's free ones"),
