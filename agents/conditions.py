@@ -45,6 +45,7 @@ CONDITIONS = {
     "radar": RADAR,
     "false_alarm": ("radar.false_alarm=0.2",),
     "odometry": ODOMETRY,
+    "map_errors": (*ODOMETRY, "odometry.map_errors=true"),
     "base": BASE,
     "base_return": (*BASE, "comm.strategy=return_to_base"),
     "base_rendezvous": (*BASE, "comm.strategy=rendezvous"),

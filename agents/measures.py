@@ -108,6 +108,7 @@ MEASURES = {
         Measure("connected", "connected", "Steps in which a robot is connected", "%", 0, 1),
         Measure("bytes_sent", "sent", "What all radios send", "kB", 0),
         Measure("odometry_error", "off", "Distance from where robots believe to be", "m", 2),
+        Measure("map_error", "maps off", "Distance of known ground from where it is drawn", "m", 2),
     )
 }
 """Metric of `envs.metrics.episode_metrics` -> how it is told; the order is that of tables and plots."""

@@ -199,9 +199,14 @@ class Beliefs(Branches):
         replay(self.writing)
 
     def _take_up(self, teams: torch.Tensor) -> None:
-        """What the robots of some teams know: of each cell, and the walls that they have seen."""
-        prefix = "known" if self.rows > 1 else "viewers"
+        """What the robots of some teams know: of each cell, and the walls that they have seen.
+
+        Where maps have errors nobody knows where those are: all walls stand in the middle of their cells.
+        """
         self.known[: len(teams) * self.rows] = self.nav._known[teams].flatten(0, 1)
+        if self.origin.settings.odometry.map_errors:
+            return
+        prefix = "known" if self.rows > 1 else "viewers"
         self.flags[: len(teams)] = self.origin.simulation.tensors[f"{prefix}_boundary"][teams]
 
     def _guess(self, count: int) -> None:

@@ -272,6 +272,8 @@ class ExplorationEnv(EnvBase):
             info["failed"] = s["failed"] != 0
         if self.settings.odometry.some:
             info["odometry_error"] = (self.simulation.believed["center"] - s["center"]).norm(dim=-1)
+        if self.settings.odometry.map_errors:
+            info["map_error"] = self.simulation.map_error().unsqueeze(-1)
         return info | (self._radio_info(total) if self.settings.limited else {})
 
     def _radio_info(self, total: torch.Tensor) -> dict[str, torch.Tensor]:

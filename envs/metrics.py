@@ -43,7 +43,8 @@ def episode_metrics(
         ``longest_path`` the way of the robot that drove farthest. Where communication is limited: `RADIO`,
         ``connected``, ``told_step_95`` and ``bytes_sent``, by all radios; where robots may fail: ``failed``, how many
         have at the end; where odometry drifts: ``odometry_error`` [m], how far robots then are from where they believe
-        to be, on average.
+        to be, on average; where maps have errors: ``map_error`` [m], how far known ground then is from where it is
+        drawn, on average over points, then over maps.
         Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
@@ -62,6 +63,8 @@ def episode_metrics(
         metrics["failed"] = info["failed"].sum(axis=1)
     if "odometry_error" in info:
         metrics["odometry_error"] = info["odometry_error"].mean(axis=1)
+    if "map_error" in info:
+        metrics["map_error"] = info["map_error"][:, 0]
     if "connected" in info:
         metrics["connected"] = info["connected"].mean(axis=1)
         metrics["bytes_sent"] = info["bytes_sent"][:, 0]

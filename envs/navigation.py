@@ -19,6 +19,7 @@ from maexp.envs.simulation import navigation_bytes, refuse_too_many
 from maexp.kernels import goals, outlook, targets
 from maexp.kernels.blocks import FrontierBlocks
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, RAYS, STRAIGHT
+from maexp.kernels.drawn_grids import DrawnGrids
 from maexp.kernels.known_grid import KnownGrids
 from maexp.kernels.launches import Launch, finish_filling, launch_named, launch_on, record, replay, view
 from maexp.kernels.passable import PassableGrids
@@ -429,4 +430,7 @@ def known_grids(env: ExplorationEnv) -> KnownGrids:
     grids, cells = (sim.nav_grids, sim.nav_cells) if sim.nav_cells else bank_nav_grids(env.bank, env.device)
     map_id, *flags = (wp.from_torch(state[name]) for name in ("map_id", f"{prefix}_free", f"{prefix}_boundary"))
     false = wp.from_torch(state["false_walls"]) if sim.settings.false_alarms else None
-    return KnownGrids(sim.maps, grids, map_id, *flags, env.num_robots if limited else 1, cells, false)
+    known = (sim.maps, grids, map_id, *flags, env.num_robots if limited else 1, cells, false)
+    if sim.settings.map_errors:
+        return DrawnGrids(*known, **{name: wp.from_torch(state[name]) for name in ("drawn", "place_free")})
+    return KnownGrids(*known)

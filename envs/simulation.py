@@ -32,7 +32,7 @@ TRACK_LENGTH = 625
 
 def build_simulation(settings: EnvSettings, bank: MapBank, together: bool = False) -> Simulation:
     """The simulation of an env with these settings on these maps; ``together``: teams start in one place."""
-    need_grids = settings.planner.name == "wavefront" or settings.comm.signal
+    need_grids = settings.planner.name == "wavefront" or settings.comm.signal or settings.odometry.map_errors
     simulation = Simulation(
         maps=bank.tensors(settings.device),
         num_maps=len(bank.maps),
@@ -159,6 +159,7 @@ def step_settings(settings: EnvSettings, together: bool = False) -> Settings:
         odometry_turn=odometry.turn,
         odometry_jump=odometry.jump,
         odometry_jump_rate=odometry.jump_rate,
+        map_errors=odometry.map_errors,
         episode_steps=settings.episode_steps,
         done=DONE.index(settings.done) if settings.limited else 0,  # else all know the same
         draw_known=settings.observation.map == "known",
@@ -189,6 +190,8 @@ def sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
         drifts=settings.odometry.some,
         messages=settings.comm.messages,
         false_alarms=false_alarms(settings),
+        map_errors=settings.odometry.map_errors,
+        cells=max(math.prod(grid_shape(world)) for world in bank.maps) if settings.odometry.map_errors else 1,
         body_pixels=max(body_pixels(r.length / pixel, r.width / pixel) for r in settings.robot),
     )
 

@@ -42,7 +42,9 @@ INFO_BASE = {"base_coverage": torch.float32, "base_coverage_auc": torch.float32}
 """The same where there is a base station."""
 INFO_COUNTED = {"counted_coverage": torch.float32}
 """The same where not what the team has seen ends an episode: what does."""
-OF_TEAM = INFO_ENV | INFO_RADIO | INFO_BASE | INFO_COUNTED
+INFO_MAPS = {"map_error": torch.float32}
+"""The same where maps have errors: how far known ground is from where it is drawn [m]."""
+OF_TEAM = INFO_ENV | INFO_RADIO | INFO_BASE | INFO_COUNTED | INFO_MAPS
 
 
 def info_shapes(settings: EnvSettings) -> tuple[dict[str, torch.dtype], dict[str, torch.dtype]]:
@@ -56,6 +58,8 @@ def info_shapes(settings: EnvSettings) -> tuple[dict[str, torch.dtype], dict[str
         robot["failed"] = torch.bool
     if settings.odometry.some:
         robot["odometry_error"] = torch.float32
+    if settings.odometry.map_errors:
+        team |= INFO_MAPS
     return team, robot
 
 

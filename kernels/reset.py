@@ -7,6 +7,7 @@ import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
+from maexp.kernels.mapping import forget_drawings
 from maexp.kernels.messages import forget_messages
 from maexp.kernels.sensing import forget_returns
 from maexp.kernels.shards import Shard
@@ -295,6 +296,7 @@ def place_teams(launch: Launch, shard: Shard) -> None:
         shard.call(launch, _clear_flags, (*flag.shape[:2], lanes), flags=flag, lanes=lanes)
     forget_returns(launch, shard)
     forget_messages(launch, shard)
+    forget_drawings(launch, shard)
     shard.call(launch, _clear_env, shard.shape[0])
     shard.call(launch, _place_team, shard.shape[0])
     shard.call(launch, _clear_robots)

@@ -97,9 +97,11 @@ def _sense_points(
     # Scratch in and out:
     visible: wp.array3d(dtype=wp.int32),  # [env, robot, slot]
     visible_count: wp.array2d(dtype=wp.int32),  # [env, robot]
+    # Scratch out:
+    viewed_count: wp.array2d(dtype=wp.int32),  # [env, robot]
 ):
     """Mark the boundary points in view of robot (e, i) that it knows now, as `visibility._scan_boundary` does, and
-    leave in the list of visible free points those that give a true return and are known.
+    leave in the list of visible free points those that give a true return and are known, the others behind them.
 
     A boundary point is in view where a free point is that it touches, whether or not that gives a return itself.
     """
@@ -154,10 +156,12 @@ def _sense_points(
                 wp.atomic_and(false_walls, e, word, j, ~bit)
             known = known and found < FALSE and found >= needed
         if known:
+            visible[e, i, k] = visible[e, i, kept]
             visible[e, i, kept] = j
             kept += 1
         else:
             wp.atomic_sub(viewers_free, e, 0, j, VIEWER_NOW)
+    viewed_count[e, i] = count
     visible_count[e, i] = kept
 
 

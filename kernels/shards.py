@@ -52,6 +52,7 @@ class Settings:
     odometry_turn: float  # [rad/sqrt(m)]
     odometry_jump: float  # [m]
     odometry_jump_rate: float  # [1/s]
+    map_errors: bool  # whether robots draw what they see where they believe it to be
     episode_steps: int  # local steps of an episode
     done: int  # whose coverage ends an episode (`radio.UNION`)
     draw_known: bool  # pictures show what robots know, not what they have seen

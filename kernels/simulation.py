@@ -8,6 +8,7 @@ from maexp.kernels.dwa import list_curvatures
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.mapping import measure_maps
 from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
@@ -162,6 +163,15 @@ class Simulation:
         self.tensors["mask"].fill_(1) if mask is None else self.tensors["mask"].copy_(mask)
         launch = launch_on(self.device)
         self.threads.each(self.shards, lambda shard: step.observe(launch, shard, picture, team, pose, grid))
+
+    def map_error(self) -> torch.Tensor:
+        """How far known ground is from where it is drawn [m], on average over points, then over the maps of a team:
+        float32 [E]. Maps without any do not count."""
+        launch = launch_on(self.device)
+        found = [measure_maps(launch, shard) for shard in self.shards]
+        total, count = (torch.cat(parts) for parts in zip(*found, strict=True))
+        mean = 1.0e-6 * total.double() / count.clamp_min(1)
+        return (mean.sum(1) / (count > 0).sum(1).clamp_min(1)).float()
 
 
 def maps_struct(tensors: dict[str, torch.Tensor]) -> Maps:

@@ -31,6 +31,10 @@ AXES = {
     "I": ("boundary", "as B where radars miss returns, else 1"),
     "L": ("word", "as W where radars give false returns, else 1"),
     "Z": ("free", "as F where radars give false returns, else 1"),
+    "r": ("row", "as N where maps have errors and communication is limited, else 1"),
+    "f": ("free", "as F where maps have errors, else 1"),
+    "b": ("boundary", "as B where maps have errors, else 1"),
+    "c": ("cell", "cells of the largest navigation grid where maps have errors, else 1"),
     "X": ("radio", "as U where messages take room or time, else 1"),
     "Y": ("point", "points of the largest map where messages take room or time, else 1"),
     "R": ("term", "terms of the reward"),
@@ -93,6 +97,11 @@ STATE = {
     "false_walls": Field(wp.int32, "E L Z", "", "bit of every robot that takes the free point for a wall"),
     "known_free": Field(wp.int32, "E H P", "", "bit of every robot that has scanned the point or heard of it"),
     "known_boundary": Field(wp.int32, "E H Q", "", "the same of boundary points"),
+    "drawn": Field(wp.int32, "E r c", "", "what stands in the cell in a robot's map, or the team's, and since when"
+        " (`mapping`); 0: nothing"),
+    "place_free": Field(wp.int32, "E r f", "", "where the free point is believed to be (`mapping.place_number`); 0:"
+        " never drawn"),
+    "place_boundary": Field(wp.int32, "E r b", "", "the same of boundary points"),
     "learned": Field(wp.int32, "E X Y", "", "points in the order in which the radio learned of them; boundary points"
         " are numbered after the map's free ones"),
     "learned_count": Field(wp.int32, "E X", "", "how many those are"),
@@ -156,6 +165,8 @@ SCRATCH = {
     "wall_count": Field(wp.int32, "E N", "", "how many of them, the first, belong to the map; 0: no matter"),
     "visible": Field(wp.int32, "E N V", "", "free points that the robot sees now"),
     "visible_count": Field(wp.int32, "E N", "", "how many those are"),
+    "viewed_count": Field(wp.int32, "E N", "", "how many were in view where radars miss returns, those without a return"
+        " behind the others"),
 
     # Merging.
     "discovered": Field(wp.int32, "E N", "weight", "of the visible points that are new to the team"),
@@ -190,6 +201,8 @@ def axis_sizes(
     drifts: bool = False,
     messages: bool = False,
     false_alarms: bool = False,
+    map_errors: bool = False,
+    cells: int = 1,
 ) -> dict[str, int]:
     """Length of every named axis of `STATE` and `SCRATCH`."""
     radios = num_robots + base_station
@@ -210,6 +223,10 @@ def axis_sizes(
         "I": max(boundary, 1) if sensing else 1,
         "L": words if false_alarms else 1,
         "Z": max(free, 1) if false_alarms else 1,
+        "r": num_robots if map_errors and limited else 1,
+        "f": max(free, 1) if map_errors else 1,
+        "b": max(boundary, 1) if map_errors else 1,
+        "c": cells if map_errors else 1,
         "X": radios if messages else 1,
         "Y": max(free + boundary, 1) if messages else 1,
         "V": max(visible, 1),

@@ -9,6 +9,7 @@ from maexp.kernels.collision import detect_collisions
 from maexp.kernels.dynamics import move_robots
 from maexp.kernels.faults import fail_robots
 from maexp.kernels.launches import Launch
+from maexp.kernels.mapping import draw_maps
 from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track
@@ -23,7 +24,7 @@ from maexp.kernels.visibility import scan
 
 
 def local_step(launch: Launch, shard: Shard) -> None:
-    """Plan, fail, drift, move, collide, scan, merge, reward, terminate, in the envs that are active."""
+    """Plan, fail, drift, move, collide, scan, merge, draw, reward, terminate, in the envs that are active."""
     active = shard.view.active
     list_near(launch, shard, active)
     plan(launch, shard)
@@ -36,6 +37,7 @@ def local_step(launch: Launch, shard: Shard) -> None:
     merge_scan(launch, shard, active)
     share_maps(launch, shard, active)
     settle_walls(launch, shard, active)
+    draw_maps(launch, shard, active, ahead=1)
     note_links(launch, shard)
     reward_robots(launch, shard)
     record_track(launch, shard, active, ahead=1)
@@ -63,6 +65,7 @@ def reset(launch: Launch, shard: Shard) -> None:
     merge_scan(launch, shard, mask)
     share_maps(launch, shard, mask)
     settle_walls(launch, shard, mask)
+    draw_maps(launch, shard, mask, ahead=0)
     record_track(launch, shard, mask, ahead=0)
     start_episodes(launch, shard)
 

@@ -18,6 +18,7 @@ import warp as wp
 
 from maexp.kernels.arrays import Field, count_bytes, make_arrays
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
+from maexp.kernels.drawn_grids import DrawnGrids
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.geodesic import SEARCH, SKIP, DistanceSearch
 from maexp.kernels.known_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
@@ -280,7 +281,11 @@ class Wavefront:
         radius, comfort, mask_of_robot = distinct_masks(threshold, COMFORT * clearance, limited)
         boundary = shard.known("boundary")
         free = shard.known("free")
-        self.known = KnownGrids(maps, grids, view.map_id, free, boundary, rows, cells, shard.false_walls)
+        known = (maps, grids, view.map_id, free, boundary, rows, cells, shard.false_walls)
+        if shard.settings.map_errors:
+            self.known = DrawnGrids(*known, drawn=view.drawn, place_free=view.place_free)
+        else:
+            self.known = KnownGrids(*known)
         self.passable = PassableGrids(self.known, radius, comfort, MARGIN_CELLS, through_unknown=True)
         self.paths = PathSearch(self.passable, mask_of_robot)
         self.narrowed = narrowed

@@ -110,6 +110,8 @@ def setups() -> dict:
     near, sight = CommConfig(range=9.0), CommConfig(range=20.0, line_of_sight=True)
     base = CommConfig(signal=True, power=-12.0, cell=0.1, noise=13.0, loss=0.2, base_station=True)
     kinds = [RobotConfig(kind=kind) for kind in ("ackermann", "differential", "omnidirectional", "ackermann")]
+    astray = OdometryConfig(drift=0.2, turn=0.1, jump=0.5, jump_rate=1.0, map_errors=True)
+    wrong = RadarConfig(missed=0.5, false_alarm=0.2)
     dwa, wavefront = (PlannerConfig(name=name) for name in ("dwa", "wavefront"))
     return {
         "dwa": (dict(planner=dwa), "cost_utility"),
@@ -133,13 +135,15 @@ def setups() -> dict:
         "faults": (dict(planner=dwa, faults=FaultsConfig(probability=0.9, duration=0.5)), "voronoi"),
         "radars": (dict(planner=wavefront, radar=RadarConfig(missed=0.3, noise=0.4, evidence=2)), "cost_utility"),
         "false alarms": (
-            dict(planner=wavefront, comm=near, radar=RadarConfig(missed=0.5, false_alarm=0.2)),
+            dict(planner=wavefront, comm=near, radar=wrong),
             "cost_utility",
         ),
         "odometry": (
             dict(planner=wavefront, odometry=OdometryConfig(drift=0.2, turn=0.1, jump=0.5, jump_rate=1.0)),
             "hungarian",
         ),
+        "map errors": (dict(planner=wavefront, odometry=astray, radar=wrong, num_robots=4), "cost_utility"),
+        "map errors, near": (dict(planner=wavefront, comm=near, odometry=astray), "lookahead"),
         "rollouts": (dict(planner=wavefront), "lookahead"),
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),

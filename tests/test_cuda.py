@@ -105,6 +105,17 @@ def test_odometry_agrees(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("comm", [CommConfig(), CommConfig(range=12.0)])
+def test_maps_with_errors_agree(device, comm):
+    """What robots draw, but for places that round otherwise."""
+    odometry = OdometryConfig(drift=0.1, turn=0.05, jump=0.5, jump_rate=0.5, map_errors=True)
+    here, there = (play(processor, "wavefront", odometry=odometry, comm=comm)["info"] for processor in ("cpu", device))
+    for name in ("map_error", "coverage"):
+        torch.testing.assert_close(there[name], here[name], rtol=1e-2, atol=1e-2)
+    assert 0.1 < here["map_error"][-1].mean() < 2.0
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_the_radar_agrees(device):
     world = room(30, 22, "jittered")
     free, obstacles = (torch.as_tensor(points) for points in (world.free, world.obstacles))

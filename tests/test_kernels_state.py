@@ -37,7 +37,7 @@ def make(planner: str, limited: bool, robots: int = 2, envs: int = 2, worlds=Non
         observation=ObservationConfig(map="known"),
         faults=FaultsConfig(probability=0.5) if limited else None,
         radar=RadarConfig(evidence=2, false_alarm=0.1) if limited else None,
-        odometry=OdometryConfig(drift=0.1) if limited else None,
+        odometry=OdometryConfig(drift=0.1, map_errors=True) if limited else None,
     )
 
 
@@ -83,6 +83,10 @@ def test_every_array_stands_in_the_table(robots, limited, envs):
         "Q": boundary if limited else 1,
         "L": words if limited else 1,
         "Z": free if limited else 1,
+        "r": robots if limited else 1,
+        "f": free if limited else 1,
+        "b": boundary if limited else 1,
+        "c": env.simulation.nav_cells if limited else 1,
         "X": robots if limited else 1,
         "S": robots,
         "M": 3,

@@ -75,6 +75,14 @@ SETUPS = {
         "cost_utility", {"faults": FaultsConfig(at=((1, 1.0),), probability=0.3, duration=2.0), "observation": BLIND},
     ),
     "cost_utility, drift": ("cost_utility", {"odometry": OdometryConfig(drift=0.05, turn=0.02), "observation": BLIND}),
+    "cost_utility, maps with errors, radios": (
+        "cost_utility",
+        {
+            "odometry": OdometryConfig(drift=0.05, turn=0.02, map_errors=True),
+            "comm": CommConfig(range=8.0),
+            "observation": BLIND,
+        },
+    ),
     "cost_utility, noise": (
         "cost_utility",
         {"radar": RadarConfig(missed=0.2, noise=0.02, false_alarm=0.001, evidence=2), "observation": BLIND},
