@@ -64,6 +64,7 @@ METRICS = (
     "connected",
     "bytes_sent",
     "odometry_error",
+    "map_error",
     "collisions",
 )
 """Columns of the table."""
