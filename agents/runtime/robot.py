@@ -11,6 +11,7 @@ import numpy as np
 from .beats import Beats
 from .contacts import BASE, Memory, read_names
 from .frames import Maps, OccupancyGrid, is_newer, merge_grids
+from .grid import read_grid
 from .planner import Plan, TeamPlanner
 
 
@@ -131,7 +132,9 @@ class RobotPlanner:
             ValueError: as `TeamPlanner.plan`.
         """
         self._forget_later(now + self.memory)
+        notes: list[str] = []
         if share:
+            read_grid(grid, resolution, origin, self.team.occupied, notes)  # before mates' grids hide what is wrong
             yaw = float(origin[2]) if len(origin) > 2 else 0.0
             own = OccupancyGrid(np.array(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
             merged = merge_grids([own, *(heard for _, heard in self.grids.values())])
@@ -149,6 +152,7 @@ class RobotPlanner:
             grids = {self.name: (now, own), **self.grids} if share else {}
             hears = self.beats.tell(now - self.memory)
             self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows, hears)
+        plan = replace(plan, notes=tuple(dict.fromkeys([*notes, *plan.notes])))
         return _row(plan, names.index(self.name))
 
     def _forget_later(self, time: float) -> None:
