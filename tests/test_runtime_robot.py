@@ -246,3 +246,10 @@ def test_a_grid_that_is_none_is_named_beside_those_of_mates(changes, told):
         planner.plan(**given, now=0.0, share=True)
     odd = np.where(grid < 0, 300, grid)
     assert "hold neither -1 nor 0 to 100" in planner.plan(odd, CELL, (0.0, 0.0), None, now=0.0, share=True).notes[0]
+
+
+def test_a_grid_that_lies_too_far_away_is_left_out():
+    planner, grid = RobotPlanner("a", **SETTINGS), World().grid()
+    planner.hear(Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (1e5, 0.0, 0.0)))}))
+    plan = planner.plan(grid, CELL, (0.0, 0.0), (1.0, 1.0, 0.0), now=0.0, share=True)
+    assert plan.notes[0] == "the map of b is left out: it lies too far away, or has too small cells"
