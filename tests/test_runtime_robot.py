@@ -250,6 +250,6 @@ def test_a_grid_that_is_none_is_named_beside_those_of_mates(changes, told):
 
 def test_a_grid_that_lies_too_far_away_is_left_out():
     planner, grid = RobotPlanner("a", **SETTINGS), World().grid()
-    planner.hear(Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (1e5, 0.0, 0.0)))}))
+    planner.hear(Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (1e6, 0.0, 0.0)))}))
     plan = planner.plan(grid, CELL, (0.0, 0.0), (1.0, 1.0, 0.0), now=0.0, share=True)
     assert plan.notes[0] == "the map of b is left out: it lies too far away, or has too small cells"
