@@ -204,7 +204,11 @@ def read_config(words: list[str]) -> ConditionsConfig:
         UserError: a name or value that is none.
     """
     try:
-        given = OmegaConf.merge(OmegaConf.structured(ConditionsConfig), OmegaConf.from_dotlist(words))
+        told = OmegaConf.from_dotlist(words)
+        for name in ("conditions", "scenarios", "teams", "policies"):
+            if isinstance(told.get(name), str | int):  # as `maexp evaluate` takes several: a,b
+                told[name] = str(told[name]).split(",")
+        given = OmegaConf.merge(OmegaConf.structured(ConditionsConfig), told)
         values = OmegaConf.to_container(given)
         if wrong := [name for name in values["conditions"] if name not in CONDITIONS]:
             raise ValueError(f"conditions={wrong[0]} is unknown: choose among {', '.join(CONDITIONS)}.")

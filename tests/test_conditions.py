@@ -106,6 +106,14 @@ def test_bad_words_are_named(word, told, tmp_path, capsys):
     assert told in capsys.readouterr().err
 
 
+def test_lists_may_be_given_without_brackets():
+    words = ["scenarios=maze_small,maze", "teams=2", "policies=cost_utility,some/run", "conditions=base"]
+    config = conditions.read_config(words)
+    assert (config.scenarios, config.teams) == (["maze_small", "maze"], [2])
+    assert (config.policies, config.conditions) == (["cost_utility", "some/run"], ["perfect", "base"])
+    assert conditions.read_config(["teams=3,5"]).teams == [3, 5]
+
+
 def test_maps_of_ones_own_share_the_episodes(tmp_path):
     for index in (0, 1):
         make_map("maze_small", index).save(tmp_path / f"m{index}.npz")
