@@ -107,7 +107,7 @@ def _team(cfg: Ros2Settings, wire: Any) -> int:
     from maexp.agents.ros2.robot import make_team
 
     course = make_team(make_driver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
-    each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" * bool(course.plans)
+    each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" if course.plans else ""
     print(f"{course.plans} decisions{each}; {course.episodes} episodes of an arena.")
     return 0
 
