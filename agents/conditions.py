@@ -11,6 +11,7 @@ import math
 import shlex
 import sys
 from dataclasses import dataclass, field, fields
+from glob import escape
 from itertools import product
 from pathlib import Path
 
@@ -98,6 +99,8 @@ class ConditionsConfig:
 
 
 KEPT = ("episodes", "num_envs", "seed")  # of a folder: the rest may grow
+OWN_WORDS = ("policy", "scenario", "scenario.path", "num_robots", "num_threads", "hydra.run.dir", "resume", *KEPT)
+"""Words of `maexp evaluate` that this command gives itself."""
 
 
 def play(config: ConditionsConfig, scenario: str, team: int, condition: str, policy: str) -> None:
@@ -201,7 +204,11 @@ def read_config(words: list[str]) -> ConditionsConfig:
         UserError: a name or value that is none.
     """
     try:
-        given = OmegaConf.merge(OmegaConf.structured(ConditionsConfig), OmegaConf.from_dotlist(words))
+        told = OmegaConf.from_dotlist(words)
+        for name in ("conditions", "scenarios", "teams", "policies"):
+            if isinstance(told.get(name), str | int):  # as `maexp evaluate` takes several: a,b
+                told[name] = str(told[name]).split(",")
+        given = OmegaConf.merge(OmegaConf.structured(ConditionsConfig), told)
         values = OmegaConf.to_container(given)
         if wrong := [name for name in values["conditions"] if name not in CONDITIONS]:
             raise ValueError(f"conditions={wrong[0]} is unknown: choose among {', '.join(CONDITIONS)}.")
@@ -230,16 +237,22 @@ def check_own(own: dict[str, str], scenarios: list[str]) -> None:
 
 
 def check_words(words: dict[str, str], policies: list[str]) -> None:
-    """Raise ValueError for words of a policy that is not played, or that are none."""
+    """Raise ValueError for two policies of one name, and for words of a policy that is not played, or that are none."""
+    if twice := [name for name in policies if policies.count(name) > 1]:
+        raise ValueError(f"policies={','.join(policies)} has two called {twice[0]}: their folders would be one.")
     for name, text in words.items():
         if name not in policies:
             raise ValueError(f"words.{name} is of no policy that is played: policies={','.join(policies)}.")
         try:
-            wrong = [word for word in shlex.split(text) if "=" not in word]
+            given = shlex.split(str(text))
         except ValueError as error:  # a quotation mark without its partner
             raise ValueError(f"words.{name}={text}: {error}.") from error
-        if wrong:
-            raise ValueError(f"words.{name}: {wrong[0]} is no word of `maexp evaluate`, as {name}='a.b=1 c.d=2'.")
+        if wrong := [word for word in given if "=" not in word or not isinstance(text, str)]:
+            raise ValueError(
+                f"words.{name}: {wrong[0]} is no word of `maexp evaluate`: write words.{name}='a.b=1 c.d=2'."
+            )
+        if wrong := [word for word in given if word.partition("=")[0].lstrip("+~") in OWN_WORDS]:
+            raise ValueError(f"words.{name}: {wrong[0]} would play other episodes than the table says: leave it out.")
 
 
 def keep_plan(config: ConditionsConfig) -> None:
@@ -259,7 +272,9 @@ def keep_plan(config: ConditionsConfig) -> None:
         there = {}
     given = there.get("words", {})
     differ = {name: (there.get(name), value) for name, value in wanted.items() if there.get(name) != value}
-    differ |= {f"words.{name}": (given[name], text) for name, text in words.items() if given.get(name, text) != text}
+    for name, text in words.items():
+        if given.get(name, text) != text and any(Path(config.out).glob(f"*/robots_*/*/{escape(name)}")):
+            differ[f"words.{name}"] = given[name], text
     for name, (was, value) in differ.items():
         raise UserError(f"out={config.out} was played with {name}={was}, not {value}: take another folder.")
     write_json(path, wanted | {"words": given | words})

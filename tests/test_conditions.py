@@ -96,11 +96,22 @@ def test_differences_are_paired_and_to_what_the_head_says():
         ("words.x='comm.range=9'", "words.x is of no policy that is played: policies=cost_utility,hungarian,universal"),
         ("words.universal=fast", "words.universal: fast is no word of `maexp evaluate`"),
         ("words.universal=a='b", "No closing quotation"),
+        ("words.universal=[a=1]", "is no word of `maexp evaluate`: write words.universal='a.b=1 c.d=2'"),
+        ("words.universal='a=1 num_robots=7'", "num_robots=7 would play other episodes than the table says"),
+        ("policies=[a/one,b/one]", "policies=one,one has two called one: their folders would be one"),
     ],
 )
 def test_bad_words_are_named(word, told, tmp_path, capsys):
     assert conditions.main([f"out={tmp_path}/it", word]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_lists_may_be_given_without_brackets():
+    words = ["scenarios=maze_small,maze", "teams=2", "policies=cost_utility,some/run", "conditions=base"]
+    config = conditions.read_config(words)
+    assert (config.scenarios, config.teams) == (["maze_small", "maze"], [2])
+    assert (config.policies, config.conditions) == (["cost_utility", "some/run"], ["perfect", "base"])
+    assert conditions.read_config(["teams=3,5"]).teams == [3, 5]
 
 
 def test_maps_of_ones_own_share_the_episodes(tmp_path):
@@ -123,6 +134,9 @@ def test_a_policy_has_words_of_its_own_and_the_condition_overrides_them(tmp_path
     search, plain = played[2:]
     assert search.index("comm.range=90") < search.index("comm.range=8"), "the last one counts"
     assert "lookahead.horizon=2" in search and "lookahead.horizon=2" not in plain
+    assert conditions.main([*words, own.replace("2", "3")]) == 0, "as long as nothing is played"
+    assert conditions.main([*words, own]) == 0
+    (tmp_path / "it" / "maze_small" / "robots_2" / "range" / "searching").mkdir(parents=True)
     assert conditions.main([*words, own.replace("90", "80")]) == 2
     told = "was played with words.searching=comm.range=90 lookahead.horizon=2, not comm.range=80 lookahead.horizon=2"
     assert told in capsys.readouterr().err

@@ -19,6 +19,7 @@ from maexp.agents.cli import main
 from maexp.agents.errors import UserError
 from maexp.agents.ros2.dds import Wire
 from maexp.agents.ros2.robot import Ros2Base, make_team
+from maexp.agents.ros2.team import Outing
 from maexp.agents.runtime import Word
 from maexp.agents.runtime.base_driver import BaseDriver, make_driver
 from maexp.agents.runtime.contacts import BASE
@@ -108,6 +109,7 @@ def test_strangers_and_times_that_have_not_come_connect_nobody():
         ([f"only={BASE}", "comm.base_station=true"], "comm.base_station=True says no place"),
         ([f"only={BASE}", "comm.base_station=[1]"], "comm.base_station=[1] must be"),
         ([f"only={BASE}", "comm.base_station=[1,2]", "comm.range=-1"], "comm.range=-1.0 must be"),
+        ([f"only={BASE}", "comm.base_station=[1,2]", "memory=-1"], "memory=-1 must be a number above 0 [s], or inf"),
         (["comm.range=8"], "comm.* is for robots that plan for themselves: give only=NAME"),
         (["only=a", "comm.range=8"], "comm= is for policies trained with observation.radio=true, and cost_utility"),
         (["only=a", "comm.reach=8"], "comm.reach is not a setting of maexp ros2"),
@@ -135,6 +137,13 @@ def test_a_policy_that_looks_at_radios_needs_to_know_them(folder, capsys):
     for more in ([], ["comm.range=8"], ["time_limit=60"]):
         assert main([*words, *more]) == 2
         assert "only=NAME comm.range=8 comm.base_station=[0,0] time_limit=600" in capsys.readouterr().err
+
+
+def test_a_base_station_ends_with_the_arena(monkeypatch, capsys):
+    """It has made no decisions."""
+    monkeypatch.setattr(Ros2Base, "run", lambda made: Outing(plans=0, episodes=2))
+    assert main(["ros2", "team", "robots=a,b", f"only={BASE}", "comm.base_station=[1,2]"]) == 0
+    assert "0 decisions; 2 episodes of an arena." in capsys.readouterr().out
 
 
 @pytest.mark.slow

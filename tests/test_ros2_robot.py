@@ -73,7 +73,7 @@ def test_bad_settings_are_named():
         RobotDriver(DriverSettings(**SETTINGS, only="c"))
     with pytest.raises(ValueError, match="only= must name"):
         RobotDriver(DriverSettings(**SETTINGS))
-    with pytest.raises(ValueError, match="memory=0.0 must be a number of seconds"):
+    with pytest.raises(ValueError, match="memory=0.0 must be a number above 0"):
         RobotDriver(DriverSettings(**SETTINGS, only="a", memory=0.0))
     driver = RobotDriver(DriverSettings(**SETTINGS, only="b"))
     assert driver.listened == ("/b/map",) and driver.mates == ("a",) and list(driver.own) == ["b"]

@@ -7,7 +7,7 @@ import pytest
 from test_runtime_watch import CELL, SETTINGS, World
 
 from maexp.agents.runtime import CHOICES, RobotPlanner, TeamPlanner, Word
-from maexp.agents.runtime.frames import OccupancyGrid
+from maexp.agents.runtime.frames import OccupancyGrid, merge_grids
 
 NAMES = ("a", "b")
 
@@ -215,3 +215,41 @@ def test_bad_input_is_named():
         RobotPlanner("a").hear(word("a", (0.0, 0.0), 0.0))
     with pytest.raises(ValueError, match="choose|unknown"):
         RobotPlanner("a", spare="away")
+
+
+@pytest.mark.parametrize("kind", [np.uint8, float, np.int16])
+@pytest.mark.parametrize("side", [0.0, 0.3], ids=["alike", "apart"])
+def test_cells_that_tell_nothing_rub_out_nothing(kind, side):
+    """Unknown cells of unsigned numbers are 255, and others are odd."""
+    walls = np.array([[100, 0, -1, 0]])
+    odd = np.array([[255, 255, 255, 101]]).astype(kind)
+    grids = [OccupancyGrid(values, 0.1, (side * k, 0.0, 0.0)) for k, values in enumerate((walls, odd))]
+    assert merge_grids(grids).values[0, :4].tolist() == [100, 0, -1, 0]
+    assert merge_grids(grids[::-1]).values[0, :4].tolist() == [100, 0, -1, 0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"origin": (1.0,)}, "origin=.1.0,. must be x, y"),
+        ({"origin": None}, "origin=None must be"),
+        ({"resolution": 0.0}, "resolution=0.0 must be"),
+        ({"grid": np.zeros((4, 4), bool)}, "of bool: give numbers"),
+    ],
+)
+def test_a_grid_that_is_none_is_named_beside_those_of_mates(changes, told):
+    planner, grid = RobotPlanner("a", **SETTINGS), World().grid()
+    mate = Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (0.0, 0.0, 0.0)))})
+    planner.hear(mate)
+    given = {"grid": grid, "resolution": CELL, "origin": (0.0, 0.0), "pose": None} | changes
+    with pytest.raises(ValueError, match=told):
+        planner.plan(**given, now=0.0, share=True)
+    odd = np.where(grid < 0, 300, grid)
+    assert "hold neither -1 nor 0 to 100" in planner.plan(odd, CELL, (0.0, 0.0), None, now=0.0, share=True).notes[0]
+
+
+def test_a_grid_that_lies_too_far_away_is_left_out():
+    planner, grid = RobotPlanner("a", **SETTINGS), World().grid()
+    planner.hear(Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (1e6, 0.0, 0.0)))}))
+    plan = planner.plan(grid, CELL, (0.0, 0.0), (1.0, 1.0, 0.0), now=0.0, share=True)
+    assert plan.notes[0] == "the map of b is left out: it lies too far away, or has too small cells"

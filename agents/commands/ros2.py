@@ -10,7 +10,7 @@ from maexp.agents.command_words import as_list
 from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.runtime.base_driver import make_driver
-from maexp.agents.runtime.driver import DriverSettings, read_settings
+from maexp.agents.runtime.driver import DriverSettings, check_name, read_settings
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import Ros2Settings
@@ -41,6 +41,9 @@ def check(cfg: Ros2Settings) -> None:
         if not cfg.place:
             raise UserError(f"maexp ros2 serve needs a suite after it: {', '.join(suite_names())}.")
         load_suite(cfg.place)
+        with blame_input():
+            for robot in as_list(cfg.robots):
+                check_name("robots", str(robot))
     elif cfg.place:
         raise UserError(f"maexp ros2 team takes no name: leave {cfg.place} out, and name the robots: robots=a,b,c.")
     elif not cfg.robots:
@@ -104,7 +107,7 @@ def _team(cfg: Ros2Settings, wire: Any) -> int:
     from maexp.agents.ros2.robot import make_team
 
     course = make_team(make_driver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
-    each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" * bool(course.plans)
+    each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" if course.plans else ""
     print(f"{course.plans} decisions{each}; {course.episodes} episodes of an arena.")
     return 0
 

@@ -5,13 +5,14 @@ Needs neither ROS nor DDS: whoever uses it hands over the messages, and sends th
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from maexp.envs.config.comm import CommConfig
-from maexp.envs.fields import setting
+from maexp.envs.fields import check_settings, setting
 
 from .agent import extend_goals, planner_options
 from .contacts import BASE
@@ -33,6 +34,8 @@ from .planner import Plan, TeamPlanner
 
 ODOMETRY = "odometry of "
 SERVED_AGE = 0.05  # seconds; an arena tells everything of one moment
+NAME = re.compile(r"[a-zA-Z_]\w*(/[a-zA-Z_]\w*)*", re.ASCII)
+"""What a robot may be called: topics begin with it."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +44,15 @@ class DriverSettings:
 
     robots: tuple[str, ...] = setting((), "namespaces of the robots: a,b,c")
     only: str = setting("", "drives this robot alone, by what it has heard; or base_station; default: all, by one plan")
-    memory: float = setting(10.0, "with only: how long a mate counts after its last word [s]")
+    memory: float = setting(
+        10.0, "with only: a mate counts so long after its last word", unit="s", above=0, infinite=True
+    )
     policy: str = setting("cost_utility", "a planner, a trained policy that ships or the folder of one, lookahead")
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
     global_frame: str = setting("map", "all maps and poses are brought into this frame")
     base_frame: str = setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")
     offsets: tuple[float, ...] = setting((), "x, y, yaw of each robot's map in the team's frame; zeros: they are one")
-    period: float = setting(2.0, "between two decisions [s]")
+    period: float = setting(2.0, "between two decisions", unit="s", above=0)
     radar_range: float | None = setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
     robot_radius: tuple[float, ...] = setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
     clearance_factor: float = setting(2.0, "where there is room, ways keep twice this many radii from obstacles")
@@ -58,9 +63,9 @@ class DriverSettings:
     max_speed: float | None = setting(None, "of the robots [m/s], told to trained policies; default: as trained")
     time_limit: float | None = setting(None, "for the whole exploration [s]; policies are told what is left of it")
     comm: CommConfig = setting(CommConfig(), "with only: radios, for policies that look at them, and the base station")
-    pose_age: float = setting(2.0, "a pose older than this is not believed [s]")
-    goal_change: float = setting(0.5, "a goal is sent again when it has moved farther than this [m]")
-    resend: float | None = setting(None, "a goal is sent again after so long [s]; default: never")
+    pose_age: float = setting(2.0, "a pose older than this is not believed", unit="s", above=0, infinite=True)
+    goal_change: float = setting(0.5, "a goal is sent again when it has moved farther than this", unit="m", low=0)
+    resend: float | None = setting(None, "a goal is sent again after so long; default: never", unit="s", above=0)
 
 
 @dataclass(frozen=True)
@@ -110,9 +115,14 @@ class TeamDriver:
 
     def __init__(self, settings: DriverSettings):
         self.settings = settings
+        check_settings(settings)
         robots, count = settings.robots, len(settings.robots)
         if not count or len(set(robots)) < count or not all(robots):
             raise ValueError(f"robots={','.join(robots)} must name the robots of the team, each once")
+        for name in robots:
+            check_name("robots", name)
+        for topic in settings.map_topics:
+            check_name("map_topics", topic.removeprefix("/"))
         if settings.comm != CommConfig() and not settings.only:
             raise ValueError("comm.* is for robots that plan for themselves: give only=NAME, or leave comm.* out")
         if settings.only and settings.only not in (*robots, BASE):
@@ -317,6 +327,12 @@ class TeamDriver:
         if last is None or self.episode is not None or np.linalg.norm(last - goal) >= self.settings.goal_change:
             return True
         return resend is not None and now - self.sent[name] >= resend
+
+
+def check_name(setting: str, name: str) -> None:
+    """Raise ValueError for what ROS takes for no namespace or topic."""
+    if not NAME.fullmatch(name):
+        raise ValueError(f"{setting}: {name!r} is no name in ROS: use letters, digits, _ and /, no digit at its head")
 
 
 def read_settings(values: dict[str, Any]) -> DriverSettings:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -141,8 +141,11 @@ def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
     """One grid of several in one frame: occupied where any is, free where any is and none occupied.
 
     It has the finest resolution and lies along the frame's axes. Grids that lie alike, or one alone, stay as they are.
+    Of several, cells that hold neither -1 nor 0 to 100 are unknown: an unsigned 255 rubs out no wall.
     """
     first = grids[0]
+    if len(grids) > 1:
+        grids = [replace(grid, values=_known(grid.values)) for grid in grids]
     alike = (first.resolution, first.origin, first.values.shape)
     if all((grid.resolution, grid.origin, grid.values.shape) == alike for grid in grids):
         return OccupancyGrid(np.maximum.reduce([grid.values for grid in grids]), first.resolution, first.origin)
@@ -158,6 +161,13 @@ def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         merged[inside] = np.maximum(merged[inside], grid.values[row[inside], column[inside]])
     return OccupancyGrid(merged, cell, (float(low[0]), float(low[1]), 0.0))
+
+
+def _known(values: np.ndarray) -> np.ndarray:
+    """Cells, int8 or float; -1 where they tell nothing."""
+    if values.dtype.kind == "f":
+        return np.where((values >= 0) & (values <= 100), values, -1.0)
+    return np.where((values >= 0) & (values <= 100), values.astype(np.int8), np.int8(-1))
 
 
 def span(grids: list[OccupancyGrid]) -> tuple[float, np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ from typing import Any
 from .beats import Beats
 from .contacts import BASE
 from .driver import Decision, DriverSettings, TeamDriver
-from .frames import OccupancyGrid, is_newer, merge_grids, read_map, read_time, span
+from .frames import OccupancyGrid, is_newer, read_map, read_time
 from .grid import MAX_CELLS
-from .robot import Word
+from .robot import Word, merge_told
 from .words import FURTHEST, read_word
 
 FINEST = 1e-3  # edge of a cell of a map that is read [m]
@@ -173,14 +173,8 @@ class RadioDriver(TeamDriver):
 
     def _add_told(self, grids: list[OccupancyGrid], notes: list[str]) -> OccupancyGrid | None:
         """These maps and those that were heard in one; None: there are none."""
-        for name, (time, told) in self.told.items():
-            if not self._counts(time):
-                continue
-            if span([*grids, told.grid])[2].astype(float).prod() > MAX_CELLS:
-                notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
-                continue
-            grids.append(told.grid)
-        return merge_grids(grids) if grids else None
+        counting = {name: told.grid for name, (time, told) in self.told.items() if self._counts(time)}
+        return merge_told(grids, counting, notes)
 
     def _take_linked(self) -> set[Any]:
         """Whom it is connected with now: whose words have come since the last decision but one."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from .beats import Beats
 from .contacts import BASE, Memory, read_names
-from .frames import Maps, OccupancyGrid, is_newer, merge_grids
+from .frames import Maps, OccupancyGrid, is_newer, merge_grids, span
+from .grid import MAX_CELLS, read_grid
 from .planner import Plan, TeamPlanner
 
 
@@ -131,10 +132,12 @@ class RobotPlanner:
             ValueError: as `TeamPlanner.plan`.
         """
         self._forget_later(now + self.memory)
+        notes: list[str] = []
         if share:
+            read_grid(grid, resolution, origin, self.team.occupied, notes)  # before mates' grids hide what is wrong
             yaw = float(origin[2]) if len(origin) > 2 else 0.0
             own = OccupancyGrid(np.array(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
-            merged = merge_grids([own, *(heard for _, heard in self.grids.values())])
+            merged = merge_told([own], {name: heard for name, (_, heard) in self.grids.items()}, notes)
             grid, resolution, origin = merged.values, merged.resolution, merged.origin
         words = {name: word for name, word in self.heard.items() if now - word.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
@@ -149,6 +152,7 @@ class RobotPlanner:
             grids = {self.name: (now, own), **self.grids} if share else {}
             hears = self.beats.tell(now - self.memory)
             self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows, hears)
+        plan = replace(plan, notes=tuple(dict.fromkeys([*notes, *plan.notes])))
         return _row(plan, names.index(self.name))
 
     def _forget_later(self, time: float) -> None:
@@ -163,6 +167,17 @@ class RobotPlanner:
             self.team.book.crew |= {self.name, *self.mates, *self.heard} - {BASE}
             told = {name: word.memory for name, word in self.heard.items() if word.memory is not None}
             self.team.book.memories |= told
+
+
+def merge_told(grids: list[OccupancyGrid], told: Mapping[Any, OccupancyGrid], notes: list[str]) -> OccupancyGrid | None:
+    """These grids and those that robots have told in one; None: there are none. What would make it larger than is
+    planned on is left out, which is noted."""
+    for name, grid in told.items():
+        if span([*grids, grid])[2].astype(float).prod() > MAX_CELLS:
+            notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
+        else:
+            grids = [*grids, grid]
+    return merge_grids(grids) if grids else None
 
 
 def _row(plan: Plan, row: int) -> Plan:

@@ -9,14 +9,14 @@ from maexp.agents.runtime.driver import DriverSettings
 from maexp.agents.settings.groups import LAST_SEED
 from maexp.agents.settings.storable import storable
 from maexp.envs.config.comm import CommConfig
-from maexp.envs.fields import setting
+from maexp.envs.fields import explain, setting
 
 CommSettings = storable(CommConfig)
 
 DriveSettings = make_dataclass(
     "DriveSettings",
     [
-        (row.name, Any, setting(None if row.default == () else row.default, f"team: {row.metadata['help']}"))
+        (row.name, Any, setting(None if row.default == () else row.default, f"team: {explain(row.metadata)}"))
         for row in fields(DriverSettings)
         if row.name != "comm"
     ],
