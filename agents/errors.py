@@ -43,3 +43,8 @@ def advise_on_disk(number: int) -> str:
     if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
     return "check that the disk works" if number == errno.EIO else "check that the folder is there and can be written"
+
+
+def printable(words: str, most: int = 300) -> str:
+    """The first `most` characters of what others wrote, which do nothing to a terminal."""
+    return "".join(character if character.isprintable() else "?" for character in words[:most])

@@ -1,8 +1,8 @@
-"""DDS for tests: on this machine alone, in a domain that nobody else is likely to have."""
+"""DDS for tests: on this machine alone, in a domain that nobody else has."""
 
-import os
-import random
 import time
+from itertools import count
+from uuid import uuid4
 
 import numpy as np
 
@@ -11,14 +11,20 @@ QUICK = {"stands": 0.2, "limit": 0.5, "answer": 20.0}
 
 LOOPBACK = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='true'/></Interfaces></General>"
-    "</Domain></CycloneDDS>"
+    "<Discovery><Tag>{tag}</Tag></Discovery></Domain></CycloneDDS>"
 )
+FIRST, LAST = 1, 101  # domains whose ports Linux gives to nobody who has not asked for them
+DOMAINS = count()
 
 
 def surroundings() -> dict[str, str]:
-    """Environment variables of a process that is to be alone with those that get the same."""
-    domain = random.Random(os.urandom(8)).randrange(100, 230)
-    return {"CYCLONEDDS_URI": LOOPBACK, "ROS_DOMAIN_ID": str(domain), "OMP_NUM_THREADS": "1"}
+    """Environment variables of a process that is to be alone with those that get the same.
+
+    Numbers of domains are few, and tests run at once: two that draw the same are kept apart by their tags. Within a
+    process, which takes the tag of a domain that it still has, each gets another number.
+    """
+    domain = FIRST + next(DOMAINS) % (LAST + 1 - FIRST)
+    return {"CYCLONEDDS_URI": LOOPBACK.format(tag=uuid4()), "ROS_DOMAIN_ID": str(domain), "OMP_NUM_THREADS": "1"}
 
 
 def publish_robot(wire, name: str, values: np.ndarray, place: tuple[float, float, float]) -> None:

@@ -33,13 +33,6 @@ WORD = Word("a", (1.0, 2.0 / 3.0, -0.5), 0.25, TIME, memory=MEMORY, hears={"b": 
 SETTINGS = {"robots": ("a", "b"), "radar_range": 3.0, "robot_radius": (0.2,), "offsets": (0.0,) * 6, "period": 0.2}
 
 
-@pytest.fixture
-def alone(monkeypatch):
-    """This process, and those that it starts, in a domain of their own on this machine."""
-    for name, value in surroundings().items():
-        monkeypatch.setenv(name, value)
-
-
 def test_words_are_told_to_the_last_bit():
     assert read_word(write_word(WORD)) == WORD and read_word(write_word(replace(WORD, memory=None))).memory is None
 
@@ -155,7 +148,7 @@ def step_until(made: list[Ros2Robot], done, places: Places, seconds: float = 120
 
 
 @pytest.mark.slow
-def test_robots_merge_what_they_hear_and_keep_it_when_they_part(alone):
+def test_robots_merge_what_they_hear_and_keep_it_when_they_part(own_domain):
     places, both = Places(), [robot("a", memory=2.0), robot("b", memory=2.0)]
     places.publish()
 
@@ -188,7 +181,7 @@ def test_robots_merge_what_they_hear_and_keep_it_when_they_part(alone):
 
 
 @pytest.mark.slow
-def test_what_is_told_is_read_and_nonsense_is_noted(alone):
+def test_what_is_told_is_read_and_nonsense_is_noted(own_domain):
     places, member = Places(), robot("a")
     other = Wire()
     said, shown = other.reader("/a/maexp/word"), other.reader("/a/maexp/map")
@@ -218,7 +211,7 @@ def test_what_is_told_is_read_and_nonsense_is_noted(alone):
 
 
 @pytest.mark.slow
-def test_a_map_that_is_not_aligned_is_refused(alone):
+def test_a_map_that_is_not_aligned_is_refused(own_domain):
     places, member = Places(), robot("a", offsets=())
     places.publish()
     with pytest.raises(UserError, match="/a/map is in a frame called map.*give offsets="):

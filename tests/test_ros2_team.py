@@ -1,10 +1,14 @@
 """A team over DDS that plans for robots which are no simulation's."""
 
+import json
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
 import pytest
-from loopback import publish_robot
+from loopback import publish_robot, surroundings
 
 pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED: DDS is not tested")
 
@@ -15,7 +19,7 @@ from maexp.agents.ros2.goal_sending import (
     SUCCEEDED,
     NavigationServer,
 )
-from maexp.agents.ros2.team import Ros2Team
+from maexp.agents.ros2.team import NUMBERS, Ros2Team
 from maexp.agents.runtime.driver import Decision, DriverSettings, Order, TeamDriver
 
 pytestmark = pytest.mark.slow  # processes, and waiting
@@ -125,6 +129,46 @@ def test_an_episode_that_is_none_ends_no_team(text, own_domain):
     assert made.told == [f"{EPISODE}: what came is no episode of an arena"] and made.driver.episode is None
     robots.publish()
     step_until(made, lambda: made.course.plans, again=robots.publish)
+
+
+def test_an_arena_of_other_robots_is_passed_over(own_domain):
+    robots, made = Publishers(), team(offsets=(0.0,) * 6, period=0.2)
+    writer = robots.wire.writer(EPISODE)
+    episode = dict.fromkeys(NUMBERS, 1.0) | {"robots": ["robot1", "robot2"]}
+    writer.write(writer.make(data=json.dumps(episode)))
+    step_until(made, lambda: made.told)
+    robots.publish()
+    step_until(made, lambda: made.course.plans, again=robots.publish)
+    assert len(made.told) == 1 and made.driver.episode is None
+    assert f"{EPISODE}: an arena plays with robot1,robot2, and not with robots=a,b: give its robots" in made.told[0]
+
+
+def test_an_episode_that_cannot_be_played_says_why(own_domain):
+    robots, made = Publishers(), team(offsets=(0.0,) * 6)
+    writer = robots.wire.writer(EPISODE)
+    writer.write(writer.make(data=json.dumps(dict.fromkeys(NUMBERS, 1.5) | {"robots": ["a", "b"]})))
+    with pytest.raises(UserError, match=f"{EPISODE}: this team cannot play it: seed=1.5 must be"):
+        step_until(made, lambda: False)
+
+
+HEAR = """
+import sys, time
+from maexp.agents.ros2.dds import EPISODE, Wire
+heard = Wire().reader(EPISODE)
+end = time.monotonic() + float(sys.argv[1])
+while time.monotonic() < end and not heard.matched:
+    time.sleep(0.05)
+print(heard.matched)
+"""
+
+
+def test_tests_with_one_domain_do_not_hear_each_other(own_domain):
+    wire, around = Wire(), dict(os.environ)
+    assert wire.writer(EPISODE).matched == 0
+    apart = around | {"CYCLONEDDS_URI": surroundings()["CYCLONEDDS_URI"]}
+    hear = [sys.executable, "-c", HEAR]
+    assert int(subprocess.run([*hear, "60"], env=around, capture_output=True, text=True, check=True).stdout) == 1
+    assert int(subprocess.run([*hear, "3"], env=apart, capture_output=True, text=True, check=True).stdout) == 0
 
 
 def test_maps_that_are_not_aligned_are_refused(own_domain):

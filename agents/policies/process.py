@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from uuid import uuid4
 
+from maexp.agents.errors import printable
 from maexp.agents.policies import warden, wire
 
 EXEC, APART = "exec:", "process:"
@@ -46,8 +47,7 @@ class Lost(Exception):
     """A process that cannot be gone on with; says why in a line that can be printed, whatever the process wrote."""
 
     def __str__(self) -> str:
-        words = " ".join(super().__str__().split())[:MOST_REASON]
-        return "".join(character if character.isprintable() else "?" for character in words)
+        return printable(" ".join(super().__str__().split()), MOST_REASON)
 
 
 class Session(subprocess.Popen):

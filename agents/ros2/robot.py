@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from maexp.agents.errors import UserError
+from maexp.agents.errors import UserError, printable
 from maexp.agents.ros2.convert import SECOND, fill_map
 from maexp.agents.ros2.dds import Wire, Writer
 from maexp.agents.ros2.team import Ros2Team
@@ -69,7 +69,7 @@ class Ros2Robot(Ros2Team):
 
     def _note(self, sentence: str) -> None:
         """Told once; what others wrote does nothing to a terminal."""
-        sentence = "".join(character if character.isprintable() else "?" for character in sentence[:300])
+        sentence = printable(sentence)
         if sentence not in self.noted:
             self.noted.add(sentence)
             self.tell(sentence)

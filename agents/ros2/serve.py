@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from maexp.agents.errors import UserError
+from maexp.agents.errors import UserError, printable
 from maexp.agents.irsim.floor import make_floor
 from maexp.agents.policies.foreign import TeamSight
 from maexp.agents.ros2.convert import (
@@ -337,7 +337,7 @@ class Ros2Policy:
         """Told once, and no more after `MOST_TOLD`; what others wrote does nothing to a terminal."""
         if sentence not in self.said and len(self.said) < MOST_TOLD:
             self.said.add(sentence)
-            self.serving.tell("".join(character if character.isprintable() else "?" for character in sentence[:300]))
+            self.serving.tell(printable(sentence))
 
     def _now(self) -> int:
         """What the clock shows now [ns]."""

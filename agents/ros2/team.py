@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.errors import UserError
+from maexp.agents.errors import UserError, printable
 from maexp.agents.ros2.convert import SECOND, read_nanoseconds
 from maexp.agents.ros2.dds import EPISODE, Wire
 from maexp.agents.ros2.goal_sending import SENDERS
@@ -72,6 +72,7 @@ class Ros2Team:
         self.time: int | None = None  # that /clock showed last [ns]
         self.planned: float | None = None  # time of the last decision [s]
         self.said: set[str] = set()
+        self.strangers: set[str] = set()  # robots of arenas that are not this team's
         self.heard = time.monotonic()
         self.course = Outing()
 
@@ -146,17 +147,34 @@ class Ros2Team:
             found = json.loads(text)
             if found.get("over"):
                 return found
-            named = isinstance(found["robots"], list) and all(isinstance(name, str) for name in found["robots"])
+            robots = found["robots"]
+            named = isinstance(robots, list) and all(isinstance(name, str) for name in robots)
             if named and all(type(found[name]) in (int, float) and math.isfinite(found[name]) for name in NUMBERS):
-                return found
+                return found if self._is_ours(robots) else None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
             pass
         self.tell(f"{EPISODE}: what came is no episode of an arena")
         return None
 
+    def _is_ours(self, robots: list[str]) -> bool:
+        """Whether an episode of these robots is one of this team; another's is told once, and passed over."""
+        team, named = self.driver.settings.robots, printable(",".join(robots))
+        if not set(team).isdisjoint(robots):
+            return True
+        if named not in self.strangers:
+            self.strangers.add(named)
+            self.tell(
+                f"{EPISODE}: an arena plays with {named}, and not with robots={','.join(team)}: give its robots, or "
+                "another ROS_DOMAIN_ID than it has"
+            )
+        return False
+
     def _begin(self, episode: dict[str, Any]) -> None:
         """Another episode of the arena."""
-        self.driver.begin(episode, episode["begins"] / SECOND)
+        try:
+            self.driver.begin(episode, episode["begins"] / SECOND)
+        except ValueError as error:
+            raise UserError(f"{EPISODE}: this team cannot play it: {error}.") from error
         self.planned = None
         self.course.episodes += 1
 
