@@ -98,7 +98,8 @@ def draw_pixel(
         while bits != wp.uint32(0):  # those that are set only: few of a large team have seen a point
             below = bits - wp.uint32(1)
             i = w * ROBOTS_PER_WORD + int(wp.bit_count(below & ~bits))
-            picture[i, channel, p] = wp.uint8(ON)
+            if i < picture.shape[0]:  # a base station has no picture
+                picture[i, channel, p] = wp.uint8(ON)
             bits = bits & below
 
 

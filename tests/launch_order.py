@@ -123,7 +123,12 @@ def setups() -> dict:
         ),
         "mixed team": (dict(planner=wavefront, num_robots=4, robot=kinds, collision="footprint"), "oracle"),
         "large team": (dict(planner=dwa, num_robots=34, comm=near), "random"),
-        "signals": (dict(planner=wavefront, comm=base, done="everyone", num_robots=6), "cost_utility"),
+        "signals": (
+            dict(
+                planner=wavefront, comm=base, done="everyone", num_robots=6, observation=ObservationConfig(map="known")
+            ),
+            "cost_utility",
+        ),
         "messages": (
             dict(planner=wavefront, comm=CommConfig(range=9.0, base_station=True, bandwidth=400.0, delay=0.2)),
             "voronoi",

@@ -8,7 +8,15 @@ import torch
 from oracle import dwa, motion, picture, radar, team
 from worlds import act, moment, room
 
-from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, RadarConfig, RewardConfig, RobotConfig
+from maexp.envs import (
+    CommConfig,
+    ExplorationEnv,
+    ObservationConfig,
+    PlannerConfig,
+    RadarConfig,
+    RewardConfig,
+    RobotConfig,
+)
 
 pytestmark = pytest.mark.kernels
 
@@ -346,6 +354,38 @@ def test_what_robots_know_travels_one_hop_a_step(episode):
     assert partial > 0
 
 
+def draw_points(m, free, boundary) -> np.ndarray:
+    """Channels 0 to 2 of robots for whom these points of a map are drawn, uint8 [N, 3, 125, 125]."""
+    corner, size = picture.frame(m.extent)
+    points = np.concatenate([m.free, m.boundary])
+    spacing = np.concatenate([m.free_spacing, m.boundary_spacing])
+    shown = picture.shown_points(points, spacing / math.sqrt(2.0) * (1.0 + 1e-6), corner, size)
+    flags = np.concatenate([free, boundary], axis=1)
+    want = np.zeros((len(flags), 3, 125, 125), np.uint8)
+    for (ix, iy), listed in shown.items():
+        for p in listed:
+            want[:, 0 if p < len(m.free) else 1, ix, iy] |= (flags[:, p] * 255).astype(np.uint8)
+            if p < len(m.free):
+                want[:, 2, ix, iy] |= flags[:, p]
+    return want
+
+
+@pytest.mark.parametrize("count", [2, 32])
+def test_pictures_of_what_robots_know_beside_a_base_station(count):
+    """Which has none: its row of flags comes after the robots', in a word of its own after 32."""
+    comm = CommConfig(range=4.0, base_station=True)
+    settings = dict(comm=comm, observation=ObservationConfig(map="known"), local_steps=5, seed=4)
+    env = ExplorationEnv(room(40, 40, "rotated", 1), 3, count, **settings)
+    td, generator = env.reset(), torch.Generator().manual_seed(3)
+    for _ in range(4):
+        td = env.step(act(env, generator))["next"]
+    for e in range(3):
+        now = moment(env, e)
+        want = draw_points(now.map, now.known_free, now.known_boundary)
+        np.testing.assert_array_equal(td["agents", "observation", "map"][e, :, :2].numpy(), want[:, :2])
+        assert env.simulation.tensors["known_weight"][e, count] > 0 and want[:, 0].any()
+
+
 def test_pictures():
     """The picture of the design from the flags, the poses and the past."""
     env = ExplorationEnv(
@@ -369,16 +409,7 @@ def test_pictures():
         now = moment(env, e)
         m = now.map
         corner, size = picture.frame(m.extent)
-        points = np.concatenate([m.free, m.boundary])
-        spacing = np.concatenate([m.free_spacing, m.boundary_spacing])
-        shown = picture.shown_points(points, spacing / math.sqrt(2.0) * (1.0 + 1e-6), corner, size)
-        flags = np.concatenate([now.seen_free, now.seen_boundary], axis=1)
-        want = np.zeros((4, 3, 125, 125), np.uint8)
-        for (ix, iy), listed in shown.items():
-            for p in listed:
-                want[:, 0 if p < len(m.free) else 1, ix, iy] |= (flags[:, p] * 255).astype(np.uint8)
-                if p < len(m.free):
-                    want[:, 2, ix, iy] |= flags[:, p]
+        want = draw_points(m, now.seen_free, now.seen_boundary)
         np.testing.assert_array_equal(pictures[e, :, :2], want[:, :2])
         np.testing.assert_array_equal(teams[e, :2], want[:, :2].max(0))
         np.testing.assert_array_equal(teams[e, 2], want[:, 2].sum(0))
