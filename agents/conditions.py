@@ -49,6 +49,7 @@ CONDITIONS = {
     "map_errors": (*ODOMETRY, "odometry.map_errors=true"),
     "base": BASE,
     "base_return": (*BASE, "comm.strategy=return_to_base"),
+    "base_courier": (*BASE, "comm.strategy=courier"),
     "base_rendezvous": (*BASE, "comm.strategy=rendezvous"),
     "base_relay": (*BASE, "comm.strategy=relay"),
     "base_pursuit": (*BASE, "comm.strategy=pursuit"),

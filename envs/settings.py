@@ -139,7 +139,7 @@ def check_strategy(config: CommConfig, num_robots: int, planner: PlannerConfig) 
         raise ValueError(f"comm.strategy={name} sends robots back: planner={planner.name} finds no way, use wavefront")
     if not config.limited:
         raise ValueError(f"comm.strategy={name} is for radios that do not reach: add comm=ir2, comm.range or the like")
-    if name in ("relay", "return_to_base") and not config.has_base:
+    if name in ("relay", "return_to_base", "courier") and not config.has_base:
         raise ValueError(f"comm.strategy={name} needs a base station: add comm.base_station=true")
     if name == "relay" and num_robots < 2:
         raise ValueError(f"comm.strategy=relay needs an explorer and a relay: num_robots={num_robots}, give 2 or more")

@@ -28,7 +28,7 @@ WORTH = 1.0  # a pursuit pays where the other misses so many radar discs, and
 WAY_COST = 0.3  # as many more for every radar range of way there
 NEAR = 0.5  # a robot this near to a place is there [radar ranges]
 TEAMS = 64  # whose points are compared at once
-TELLING = ("opportunistic", "return_to_base")  # strategies that leave it to the policy to tell the base station sooner
+TELLING = ("opportunistic", "return_to_base", "courier")  # a policy may choose to tell the base station sooner
 
 
 class Strategy:
@@ -46,9 +46,10 @@ class Strategy:
         state: tensors that later decisions depend on; U radios, the base station's last. ``met`` int32 [E, N, U], the
             macro step in which a robot was last connected with a radio, -1: never; ``place`` [E, N, U, 2], where that
             was then [m]; ``driven`` [E, N, U], the robot's odometer then [m]; ``told`` int32 [E, N, U], what of its
-            knowledge that radio had then; ``knew`` and ``grew`` int32 [E, N], what it knew last and when that last
-            became more; ``duty`` bool [E, N], who is on its way to tell; ``due`` int32 [E, N], ``spot`` [E, N, 2] and
-            ``party`` bool [E, N, U]: when, where and with whom it has an appointment.
+            knowledge that radio had then; ``eased`` int32 [E, N], when another last set out with all that it knows;
+            ``knew`` and ``grew`` int32 [E, N], what it knew last and when that last became more; ``duty`` bool [E, N],
+            who is on its way to tell; ``due`` int32 [E, N], ``spot`` [E, N, 2] and ``party`` bool [E, N, U]: when,
+            where and with whom it has an appointment.
     """
 
     def __init__(self, env: ExplorationEnv, name: str | None = None):
@@ -70,6 +71,7 @@ class Strategy:
             "place": zeros(e, n, u, 2, dtype=torch.float32),
             "driven": zeros(e, n, u, dtype=torch.float32),
             "told": zeros(e, n, u),
+            "eased": zeros(e, n),
             "knew": zeros(e, n),
             "grew": zeros(e, n),
             "duty": zeros(e, n, dtype=torch.bool),
@@ -115,7 +117,7 @@ class Strategy:
         odometer = sim["path_length"]
         for name, blank in (("met", -1), ("driven", 0), ("told", 0), ("party", False)):
             s[name] = s[name].masked_fill(wide, blank)
-        for name, blank in (("duty", False), ("knew", 0), ("grew", 0), ("due", 0)):
+        for name, blank in (("duty", False), ("eased", 0), ("knew", 0), ("grew", 0), ("due", 0)):
             s[name] = s[name].masked_fill(begins, blank)
         s["place"] = torch.where(links.unsqueeze(-1), radios.unsqueeze(1), s["place"])
         s["met"] = torch.where(links, self.step.unsqueeze(-1).to(torch.int32), s["met"])
@@ -181,11 +183,39 @@ class Strategy:
 
         A period that is given counts to where the robot turns back, the other one to where it arrives.
         """
+        n = self.robots
+        return (self._is_due() | self._is_late()) & self._has_news(n), self.state["place"][:, :, n]
+
+    def _is_due(self) -> torch.Tensor:
+        """Robots that are on their way to report, or are to set out, bool [E, N]."""
         n, s = self.robots, self.state
-        since, way = self.step - s["met"][..., n].clamp_min(0), self.way[..., n] / self.drive
+        since = self.step - s["met"][..., n].clamp_min(0).maximum(s["eased"])
+        way = self.way[..., n] / self.drive
         away = since + (way if self.given_period == "auto" else 0.0)
-        go = s["duty"] | (away >= self._period(2.0 * way, self.rest + since)) | self.idle | self._is_late()
-        return go & self._has_news(n), s["place"][:, :, n]
+        return s["duty"] | (away >= self._period(2.0 * way, self.rest + since)) | self.idle
+
+    def _courier(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `_return_to_base`, but one goes for all: of robots that are connected and know the same, whoever has the
+        shortest way. The others take for told what it knows, and their period begins anew; also on the way, and where
+        they meet one that is on its way.
+
+        Before the end nobody sets out for another that still has time.
+        """
+        n, s = self.robots, self.state
+        news = self._has_news(n) & (self.sim["collided"] == 0)
+        due, late = self._is_due() & news, self._is_late() & news
+        way, number = self.way[..., n], torch.arange(n, device=self.at.device)
+        nearer = way.unsqueeze(1) < way.unsqueeze(2)
+        nearer |= (way.unsqueeze(1) == way.unsqueeze(2)) & (number < number.unsqueeze(-1))
+        mates = self.done[..., :n]
+        takes = mates & news.unsqueeze(1) & nearer  # [i, j]: j knows what i knows, and has a shorter way
+        gives, heir = takes.any(-1), torch.where(takes, way.unsqueeze(1), torch.inf).argmin(-1)
+        asked = torch.zeros_like(s["due"]).scatter_add_(1, heir, (due & gives).int()) > 0
+        go = ((due | late) & ~gives) | asked
+        eased = news & ~go & ((late & gives) | (mates & go.unsqueeze(1)).any(-1))
+        s["told"][..., n] = torch.where(eased, self.known, s["told"][..., n])
+        s["eased"] = torch.where(eased, self.step.to(torch.int32), s["eased"])
+        return go, s["place"][:, :, n]
 
     def _has_news(self, radio: int) -> torch.Tensor:
         """Robots that know what a radio did not know when they were last connected, or does not yet."""

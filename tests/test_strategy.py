@@ -176,6 +176,55 @@ def test_who_has_nothing_to_tell_does_not_report():
     assert not wait(env, 5).any()
 
 
+def test_one_reports_for_all_that_know_the_same():
+    """Whoever has the shortest way; the others take it for told, and their period begins anew."""
+    env = make("courier", robots=3)
+    start(env, (4.0, 10.0), (6.0, 12.0), (6.0, 10.0))
+    wait(env)
+    put(env, {0: (20.0, 10.0), 1: (17.0, 10.0), 2: (33.0, 10.0)})
+    assert not wait(env, 2).any(), "not yet"
+    assert wait(env).tolist() == [False, True, True], "2 is alone"
+    assert goal_of(env, 1) == pytest.approx(BASE, abs=1e-3)
+    s = env.strategy.state
+    told = s["told"][0, :, 3].tolist()
+    assert told[0] > told[1] and s["eased"][0].tolist() == [3, 0, 0]
+    put(env, {1: (2.0, 12.0), 2: (2.0, 10.0)})
+    assert not wait(env, 2)[0], "its period has begun anew"
+
+
+def test_whoever_carries_the_news_hands_them_over_on_its_way():
+    env = make("courier", robots=2)
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    put(env, {0: (12.0, 10.0), 1: (30.0, 10.0)})
+    wait(env)
+    s, now = env.strategy.state, int(env.simulation.tensors["macro_step"][0])
+    s["met"][:, 0, 2] = s["grew"][:, 0] = now  # 0 is not due for some time
+    assert wait(env, 2).tolist() == [False, True]
+    put(env, {1: (15.0, 10.0)})
+    assert wait(env).tolist() == [True, False], "0 is nearer"
+    put(env, {0: (2.0, 12.0)})
+    assert wait(env).tolist() == [False, False], "and has told it all"
+
+
+def test_before_the_end_the_last_to_have_time_reports():
+    """Who is farther away hands over what it knows, and looks on."""
+    env = make("courier", robots=2, period=1000, macro_steps=24)
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    put(env, {0: (10.0, 10.0), 1: (15.0, 10.0)})
+    duty, s = [], env.strategy.state
+    for _ in range(22):
+        s["grew"][:] = env.simulation.tensors["macro_step"].view(-1, 1)  # there is always news
+        duty.append(wait(env).tolist())
+        if any(duty[-1]):
+            break
+    assert duty[-1] == [True, False], "the nearer one, as late as it may"
+    assert 0 < int(s["eased"][0, 1]) < 1 + len(duty), "the other has given it up before"
+    drive = 0.7 * env.robot_configs[0].max_speed * 1.0  # of a decision [m]
+    assert 24 - len(duty) == pytest.approx(8.0 / drive + 1, abs=2.0)
+
+
 def test_robots_come_home_in_time():
     """Before the end they turn back as far away as they are, long before the period is over."""
     env = make(robots=1, period=1000)
@@ -310,6 +359,7 @@ def test_a_new_episode_remembers_nothing():
         (dict(strategy="rendezvous"), {}, "is for radios that do not reach"),
         (dict(strategy="relay", range=5.0), {}, "needs a base station"),
         (dict(strategy="return_to_base", range=5.0), {}, "needs a base station"),
+        (dict(strategy="courier", range=5.0), {}, "needs a base station"),
         (dict(strategy="relay", range=5.0, base_station=True), dict(num_robots=1), "num_robots=1"),
         (dict(strategy="pursuit", range=5.0), dict(planner=PlannerConfig(name="dwa")), "planner=dwa finds no way"),
         (dict(strategy="pursuit", range=5.0, period=0), {}, "comm.period=0"),

@@ -114,5 +114,5 @@ def _check(env: ExplorationEnv, learner: str) -> None:
     if learner == "base" and env.strategy is None:
         raise ValueError(
             f"{SETTING}=base: nothing sends robots to the base station with comm.strategy=opportunistic; add "
-            "observation.radio=true, so that they may choose to go there, or comm.strategy=return_to_base"
+            "observation.radio=true, so that they may choose to go there, or comm.strategy=courier"
         )

@@ -51,7 +51,7 @@ class CommConfig(Group):
     base_station: bool | tuple[float, float] = setting(
         False, "true: a radio with a map of its own where robot 0 starts; or a place [x, y]", unit="m"
     )
-    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "pursuit"] = setting(
+    strategy: Literal["opportunistic", "rendezvous", "relay", "return_to_base", "courier", "pursuit"] = setting(
         "opportunistic", "what robots do to tell others what they know (docs/conditions.md)"
     )
     period: int | Literal["auto"] = setting(
