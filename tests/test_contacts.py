@@ -155,7 +155,7 @@ def test_who_goes_to_tell_gets_there_and_is_released():
 
 
 def test_with_other_strategies_nobody_chooses_to_tell():
-    for name, offered in (("return_to_base", True), ("rendezvous", False), ("pursuit", False)):
+    for name, offered in (("return_to_base", True), ("courier", True), ("rendezvous", False), ("pursuit", False)):
         env = make(comm=CommConfig(range=6.0, base_station=BASE, strategy=name, period=9))
         start(env, (4.0, 8.0), (6.0, 12.0))
         put(env, {0: (30.0, 8.0)})
