@@ -101,7 +101,7 @@ def test_maps_that_make_no_sense_change_nothing():
     odd = [
         ("c", message(seen(slice(5, 30), True), 6.0, frame="c/map"), "a map in the frame c/map is not known"),
         ("c", cut, "a map of 60 x 60 cells came with 3599"),
-        ("c", huge, "a map of 100,000,000 cells"),
+        ("c", huge, "a map of 100,000,000 cells is none: grid has"),
         ("d", message(seen(slice(5, 30), True), 6.0), "a map of d came, who is no mate"),
         ("a", message(seen(slice(5, 30), True), 6.0), "a map of a came, who is no mate"),
     ]

@@ -96,9 +96,12 @@ def test_a_map_that_is_none_is_refused(changes):
     assert not driver.told
 
 
-def test_a_map_that_lies_too_far_away_is_left_out():
+@pytest.mark.parametrize(
+    "changes", [{"x": 1e6}, {"resolution": 1e-3, "x": 10.0}], ids=["far", "too fine to look around"]
+)
+def test_a_map_that_lies_too_far_away_is_left_out(changes):
     driver, notes = RobotDriver(DriverSettings(**SETTINGS, only="b")), []
-    driver.take_known("a", grid_message(x=1e6))
+    driver.take_known("a", grid_message(**changes))
     driver.take_map("/b/map", grid_message())
     assert driver.known(notes).values.shape == (4, 5)
     assert notes == ["the map of a is left out: it lies too far away, or has too small cells"]

@@ -2,7 +2,8 @@
 
 from .choices import CHOICES
 from .planner import Plan, TeamPlanner
-from .robot import RobotPlanner, Word
+from .robot import RobotPlanner
 from .shipped import shipped_names
+from .words import Word
 
 __all__ = ["CHOICES", "Plan", "RobotPlanner", "TeamPlanner", "Word", "shipped_names"]

@@ -6,8 +6,8 @@ from .contacts import BASE, read_comm
 from .driver import Decision, DriverSettings, TeamDriver
 from .frames import OccupancyGrid
 from .radio_driver import RadioDriver
-from .robot import Word
 from .robot_driver import RobotDriver
+from .words import Word
 
 
 class BaseDriver(RadioDriver):

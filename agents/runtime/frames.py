@@ -8,10 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Hashable, Mapping
 from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 import numpy as np
 
 from maexp.envs.quaternions import fill_turn, read_yaw
+
+from .grid import check_grid
 
 Pose = tuple[float, float, float]
 """x, y [m] and yaw [rad]."""
@@ -135,6 +139,22 @@ class Frames:
 def place_grid(grid: OccupancyGrid, pose: Pose) -> OccupancyGrid:
     """The grid in the frame in which its own frame stands at `pose`."""
     return grid if pose == NOWHERE else OccupancyGrid(grid.values, grid.resolution, compose(pose, grid.origin))
+
+
+def check_map(grid: Any) -> OccupancyGrid:
+    """A map that somebody told, as `merge_grids` takes it: as it came, if that can be, else in plain numbers.
+
+    Raises:
+        ValueError: it would be refused as a robot's own grid, too.
+    """
+    try:
+        values, cell, origin = check_grid(grid.values, grid.resolution, grid.origin)
+    except AttributeError:
+        raise ValueError(f"a {type(grid).__name__} is no OccupancyGrid") from None
+    plain = isinstance(grid, OccupancyGrid) and grid.values is values and isinstance(grid.origin, tuple | list)
+    if plain and len(grid.origin) == 3 and all(isinstance(number, Real) for number in (grid.resolution, *grid.origin)):
+        return grid
+    return OccupancyGrid(values, cell, origin)
 
 
 def merge_grids(grids: list[OccupancyGrid]) -> OccupancyGrid:

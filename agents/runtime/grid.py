@@ -77,18 +77,41 @@ def read_grid(grid, resolution, origin, occupied: float, notes: list[str]) -> Kn
     Raises:
         ValueError: what was given cannot be an occupancy grid.
     """
-    values = _check_values(grid)
-    number = _number(resolution)
-    if not (number is not None and 1e-4 <= number <= 1e3):
-        raise ValueError(f"resolution={resolution!r} must be the edge of a cell in metres, 0.0001 to 1000")
-    x, y, yaw = _check_origin(origin)
+    values, cell, (x, y, yaw) = check_grid(grid, resolution, origin)
     valid = (values >= 0) & (values <= 100)
     odd = int(np.count_nonzero(~valid & (values != (255 if values.dtype.kind == "u" else -1))))
     if odd:
         notes.append(f"grid: {odd} cells hold neither -1 nor 0 to 100 and were taken as unknown")
     known = np.where(values >= occupied, np.uint8(OBSTACLE), np.uint8(FREE))
     known[~valid] = UNKNOWN
-    return KnownGrid(known, number, (x, y), yaw)
+    return KnownGrid(known, cell, (x, y), yaw)
+
+
+def check_grid(grid, resolution, origin) -> tuple[np.ndarray, float, tuple[float, float, float]]:
+    """The values of an occupancy grid, the edge of its cells [m], and x, y [m] and yaw [rad] of its lower left corner.
+
+    Args:
+        grid, resolution, origin: of `read_grid`.
+
+    Raises:
+        ValueError: as `read_grid`.
+    """
+    values = _check_values(grid)
+    cell = _number(resolution)
+    if not (cell is not None and 1e-4 <= cell <= 1e3):
+        raise ValueError(f"resolution={resolution!r} must be the edge of a cell in metres, 0.0001 to 1000")
+    return values, cell, _check_origin(origin)
+
+
+def is_planned_on(width: float, height: float, reach: float) -> bool:
+    """Whether a grid is small enough.
+
+    Args:
+        width, height: of the grid [cells].
+        reach: how far around it robots look [cells].
+    """
+    around = (width + 2.0 * reach) * (height + 2.0 * reach)
+    return width * height <= MAX_CELLS and around <= 2 * MAX_CELLS
 
 
 def _check_values(grid) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from .coarse import coarsen
 from .contacts import Links, open_book, read_links
 from .features import Motion, list_candidates
 from .folder import Contract, LearnedChoice
-from .grid import MAX_CELLS, KnownGrid, read_grid
+from .grid import KnownGrid, is_planned_on, read_grid
 from .imagine import LOOKAHEAD, load_foresight, read_lookahead
 from .scene import ArrayScene, look_at
 from .sharing import Shares
@@ -197,10 +197,10 @@ class TeamPlanner:
             ValueError: an argument cannot be used. Odd cells and poses are ignored, and `Plan.notes` says so.
         """
         notes: list[str] = []
-        now = time.monotonic() if now is None else _finite("now", now)
+        now = time.monotonic() if now is None else finite("now", now)
         known = read_grid(grid, resolution, origin, self.occupied, notes)
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
-        reach = self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+        reach = self.reach(radar_range)
         _check_reach(reach, known)
         time_left = self._time_left(time_left, now)
         if self.book is not None:
@@ -217,11 +217,19 @@ class TeamPlanner:
         self.last = {name: plan.goals[k] for k, name in enumerate(team.names) if plan.active[k]}
         return self._finish(self._send_away(self._send_to_tell(plan, team, scene, ends), team, scene, shares))
 
+    def reach(self, radar_range: float | None) -> float:
+        """How far robots see [m]: as `plan` is told, None: as this planner was.
+
+        Raises:
+            ValueError: it is none.
+        """
+        return self.radar_range if radar_range is None else _positive("radar_range", radar_range)
+
     def _time_left(self, given: float | None, now: float) -> float:
         self.begun = now if self.begun is None else self.begun
         if given is None:
             given = 1.0 if self.time_limit is None else 1.0 - (now - self.begun) / self.time_limit
-        return min(max(_finite("time_left", given), 0.0), 1.0)
+        return min(max(finite("time_left", given), 0.0), 1.0)
 
     def _look(self, grid: KnownGrid, team: Team, reach: float, notes: list[str]) -> ArrayScene:
         shift = self._shift(grid, notes)
@@ -335,11 +343,17 @@ class TeamPlanner:
 
     def _finish(self, plan: Plan) -> Plan:
         """Log what has not been said in the call before."""
-        for note in plan.notes:
-            if note not in self.said:
-                LOG.warning(note)
-        self.said = frozenset(plan.notes)
+        self.said = log_new(plan.notes, self.said)
         return plan
+
+
+def log_new(notes: Iterable[str], said: frozenset[str]) -> frozenset[str]:
+    """Log those that have not been said in the call before; returns what is said now."""
+    now = tuple(notes)
+    for note in now:
+        if note not in said:
+            LOG.warning(note)
+    return frozenset(now)
 
 
 def _describe(team: Team, scene: ArrayScene, chosen: np.ndarray, notes: list[str]) -> Plan:
@@ -370,7 +384,12 @@ def _stay(team: Team, notes: list[str]) -> Plan:
     )
 
 
-def _finite(name: str, value) -> float:
+def finite(name: str, value) -> float:
+    """The number that a setting has.
+
+    Raises:
+        ValueError: it is none.
+    """
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -385,7 +404,7 @@ def _check_reach(radar_range: float, grid: KnownGrid) -> None:
     cells = radar_range / grid.cell
     if cells < 1.0:
         raise ValueError(f"radar_range={radar_range:g} m is less than a cell of {grid.cell:g} m: give both in metres")
-    if (grid.width + 2.0 * cells) * (grid.height + 2.0 * cells) > 2 * MAX_CELLS:
+    if not is_planned_on(grid.width, grid.height, cells):
         raise ValueError(
             f"radar_range={radar_range:g} is {cells:,.0f} cells of {grid.cell:g} m, "
             "too many to plan on: lower radar_range or make cells larger"
@@ -393,7 +412,7 @@ def _check_reach(radar_range: float, grid: KnownGrid) -> None:
 
 
 def _positive(name: str, value, zero: bool = False) -> float:
-    number = _finite(name, value)
+    number = finite(name, value)
     if number < 0.0 or (number == 0.0 and not zero):
         raise ValueError(f"{name}={value!r} must be {'0 or more' if zero else 'above 0'}")
     return number

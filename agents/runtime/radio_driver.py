@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 from .beats import Beats
 from .contacts import BASE
 from .driver import Decision, DriverSettings, TeamDriver
-from .frames import OccupancyGrid, is_newer, read_map, read_time
-from .grid import MAX_CELLS
-from .robot import Word, merge_told
-from .words import FURTHEST, read_word
+from .frames import OccupancyGrid, check_map, is_newer, read_map, read_time
+from .robot import merge_told
+from .words import Word, read_word
 
 FINEST = 1e-3  # edge of a cell of a map that is read [m]
 
@@ -113,13 +111,13 @@ class RadioDriver(TeamDriver):
         if frame != self._root:
             raise ValueError(f"a map in the frame {frame} is not known")
         grid = read_map(message)
-        numbers = (grid.resolution, *grid.origin)
-        if not all(map(math.isfinite, numbers)) or grid.resolution < FINEST or max(map(abs, numbers)) > FURTHEST:
-            raise ValueError(f"a map with cells of {grid.resolution:g} m at {grid.origin} is none")
-        if grid.values.size == 0 or grid.values.size > MAX_CELLS:
-            raise ValueError(
-                f"a map of {grid.values.size:,} cells: more than none, and at most {MAX_CELLS:,}, are read"
-            )
+        try:
+            grid = check_map(grid)
+        except ValueError as error:
+            raise ValueError(f"a map of {grid.values.size:,} cells is none: {error}") from None
+        if grid.values.size == 0 or grid.resolution < FINEST:
+            wanted = f"it must have cells, of at least {FINEST:g} m"
+            raise ValueError(f"a map of {grid.values.size:,} cells of {grid.resolution:g} m is none: {wanted}")
         self.told[source] = time, Told(grid, message)
 
     def has_heard(self, name: str, now: float) -> bool:
@@ -171,10 +169,10 @@ class RadioDriver(TeamDriver):
         """
         raise NotImplementedError
 
-    def _add_told(self, grids: list[OccupancyGrid], notes: list[str]) -> OccupancyGrid | None:
-        """These maps and those that were heard in one; None: there are none."""
+    def _add_told(self, grids: list[OccupancyGrid], notes: list[str], reach: float = 0.0) -> OccupancyGrid | None:
+        """These maps and those that were heard in one, as of `merge_told`; None: there are none."""
         counting = {name: told.grid for name, (time, told) in self.told.items() if self._counts(time)}
-        return merge_told(grids, counting, notes)
+        return merge_told(grids, counting, notes, reach)
 
     def _take_linked(self) -> set[Any]:
         """Whom it is connected with now: whose words have come since the last decision but one."""

@@ -3,40 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from .beats import Beats
-from .contacts import BASE, Memory, read_names
-from .frames import Maps, OccupancyGrid, is_newer, merge_grids, span
-from .grid import MAX_CELLS, read_grid
-from .planner import Plan, TeamPlanner
+from .contacts import BASE, read_names
+from .frames import OccupancyGrid, merge_grids, span
+from .grid import is_planned_on, read_grid
+from .planner import Plan, TeamPlanner, finite, log_new
+from .words import Word, check_told, check_word, show
 
-
-@dataclass(frozen=True)
-class Word:
-    """What a robot tells of itself.
-
-    Attributes:
-        name: its name.
-        pose: x, y [m] and yaw [rad] in the frame that all robots share.
-        speed: [m/s]
-        time: of the pose, by a clock that all robots share [s].
-        grids: its own map and those that it has heard, by the names of the robots that made them, each with the time of
-            that robot's clock at which it was so [s]; none: the caller merges grids.
-        memory: what it knows of radios; None: its policy does not look at that.
-        hears: whom it has heard of not long ago, from themselves or over others, and the times of their last words [s].
-    """
-
-    name: Hashable
-    pose: tuple[float, ...]
-    speed: float
-    time: float
-    grids: Maps = field(default_factory=dict)
-    memory: Memory | None = None
-    hears: Mapping[Any, float] = field(default_factory=dict)
+MOST_NOTES = 20  # of odd words between two plans
 
 
 class RobotPlanner:
@@ -62,7 +42,7 @@ class RobotPlanner:
         mates: Collection[Hashable] = (),
         **settings: Any,
     ):
-        if not memory > 0.0:
+        if not isinstance(memory, Real) or not memory > 0.0:
             raise ValueError(f"memory={memory!r} must be a number of seconds above 0")
         mates = read_names("mates", mates)
         if BASE in (name, *mates):
@@ -73,24 +53,46 @@ class RobotPlanner:
         self.grids: dict[Hashable, tuple[float, OccupancyGrid]] = {}  # of each mate the newest, whoever told it
         self.beats = Beats()
         self._word: Word | None = None
+        self._odd: list[str] = []  # what was left out of words since the last plan
+        self._said: frozenset[str] = frozenset()
 
     def reset(self) -> None:
         """Forget the past: mates, their maps, what was given up."""
         self.team.reset()
         self.heard, self.grids, self.beats, self._word = {}, {}, Beats(), None
+        self._odd, self._said = [], frozenset()
 
     def hear(self, word: Word) -> None:
         """Take in a mate's word, or the base station's, who is no robot to plan for; one that is older than its last,
         and maps that are older than what was heard of the robots that made them, change nothing.
 
+        What is odd in a word is left out, and `Plan.notes` of the next plan says so: a pose, a map that would be
+        refused as this robot's own, too, a time of `hears`, a memory. The rest of the word counts. A word that is no
+        `Word`, has no time, or whose name does not sort with the others, is left out as a whole.
+
         Raises:
             ValueError: it comes from a robot of this one's name.
         """
+        notes: list[str] = []
+        word = check_word(word, (self.name, *self.heard), notes)
+        if word is not None:
+            self._take(word, notes)
+        fresh = [note for note in dict.fromkeys(notes) if note not in self._odd]
+        self._odd = [*self._odd, *fresh][:MOST_NOTES]
+
+    def _take(self, word: Word, notes: list[str]) -> None:
         if word.name == self.name:
             raise ValueError(f"a word from {word.name!r} came to {self.name!r}: give each robot a name of its own")
         for source, told in word.grids.items():
-            if source != self.name and is_newer(told, self.grids.get(source), source == word.name):
-                self.grids[source] = told
+            if source == self.name:
+                continue
+            try:
+                newer = check_told(told, self.grids.get(source), source == word.name)
+            except ValueError as error:
+                notes.append(f"the word of {show(word.name)}: the map of {show(source)} is left out: {error}")
+                continue
+            if newer is not None:
+                self.grids[source] = newer
         last = self.heard.get(word.name)
         if last is None or word.time >= last.time:
             self.heard[word.name] = word
@@ -131,13 +133,14 @@ class RobotPlanner:
         Raises:
             ValueError: as `TeamPlanner.plan`.
         """
+        now, reach = finite("now", now), self.team.reach(more.get("radar_range"))
         self._forget_later(now + self.memory)
-        notes: list[str] = []
+        notes = list(self._odd)
         if share:
             read_grid(grid, resolution, origin, self.team.occupied, notes)  # before mates' grids hide what is wrong
             yaw = float(origin[2]) if len(origin) > 2 else 0.0
             own = OccupancyGrid(np.array(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
-            merged = merge_told([own], {name: heard for name, (_, heard) in self.grids.items()}, notes)
+            merged = merge_told([own], {name: heard for name, (_, heard) in self.grids.items()}, notes, reach)
             grid, resolution, origin = merged.values, merged.resolution, merged.origin
         words = {name: word for name, word in self.heard.items() if now - word.time <= self.memory and name != BASE}
         names = sorted([self.name, *words])
@@ -151,7 +154,9 @@ class RobotPlanner:
             knows = None if self.team.book is None else self.team.book.memories.get(self.name)
             grids = {self.name: (now, own), **self.grids} if share else {}
             hears = self.beats.tell(now - self.memory)
-            self._word = Word(self.name, tuple(map(float, pose)), speed, now, grids, knows, hears)
+            place = tuple(np.asarray(pose, np.float64).tolist())
+            self._word = Word(self.name, place, speed, now, grids, knows, hears)
+        self._odd, self._said = [], log_new(notes, self._said)
         plan = replace(plan, notes=tuple(dict.fromkeys([*notes, *plan.notes])))
         return _row(plan, names.index(self.name))
 
@@ -169,11 +174,14 @@ class RobotPlanner:
             self.team.book.memories |= told
 
 
-def merge_told(grids: list[OccupancyGrid], told: Mapping[Any, OccupancyGrid], notes: list[str]) -> OccupancyGrid | None:
+def merge_told(
+    grids: list[OccupancyGrid], told: Mapping[Any, OccupancyGrid], notes: list[str], reach: float = 0.0
+) -> OccupancyGrid | None:
     """These grids and those that robots have told in one; None: there are none. What would make it larger than is
-    planned on is left out, which is noted."""
+    planned on by robots that see so far, `reach` [m], is left out, which is noted."""
     for name, grid in told.items():
-        if span([*grids, grid])[2].astype(float).prod() > MAX_CELLS:
+        cell, _, size = span([*grids, grid])
+        if not is_planned_on(*size.astype(float), reach / cell):
             notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
         else:
             grids = [*grids, grid]

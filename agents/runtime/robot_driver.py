@@ -10,7 +10,8 @@ import numpy as np
 from .frames import OccupancyGrid, Pose
 from .planner import Plan
 from .radio_driver import RadioDriver
-from .robot import RobotPlanner, Word
+from .robot import RobotPlanner
+from .words import Word
 
 
 class RobotDriver(RadioDriver):
@@ -60,7 +61,7 @@ class RobotDriver(RadioDriver):
     def known(self, notes: list[str]) -> OccupancyGrid | None:
         """As of `RadioDriver`; nothing without a map of its own."""
         own = super()._merge(notes)
-        return None if own is None else self._add_told([own], notes)
+        return None if own is None else self._add_told([own], notes, self.planner.team.radar_range)
 
     _merge = known
 

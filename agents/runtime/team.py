@@ -49,7 +49,7 @@ def read_team(poses, velocities, radius, notes: list[str]) -> Team:
     names, rows = _split(poses, "poses", "{name: (x, y, yaw)} or numbers [N, 2] or [N, 3]")
     pose = np.full((len(names), 3), np.nan)
     for row, (name, given) in enumerate(zip(names, rows, strict=True)):
-        pose[row] = _pose(name, given)
+        pose[row] = check_pose(name, given)
     team = Team(
         names,
         pose[:, :2],
@@ -73,8 +73,12 @@ def _split(value, what: str, wanted: str) -> tuple[tuple, list]:
     return tuple(range(len(rows))), rows
 
 
-def _pose(name, value) -> np.ndarray:
-    """x, y, yaw; NaN where there is no pose."""
+def check_pose(name, value) -> np.ndarray:
+    """x, y [m] and yaw [rad] of a robot; NaN where there is no pose.
+
+    Raises:
+        ValueError: what was given cannot be read as that.
+    """
     if value is None:
         return np.full(3, np.nan)
     numbers = _numbers(value)
