@@ -255,6 +255,16 @@ def test_a_grid_that_is_none_is_named_beside_those_of_mates(changes, told):
     assert "hold neither -1 nor 0 to 100" in planner.plan(odd, CELL, (0.0, 0.0), None, now=0.0, share=True).notes[0]
 
 
+def test_an_own_cell_as_a_word_does_beside_maps_of_mates():
+    world = np.zeros((60, 60), int)
+    plans = []
+    for cell in (0.1, "0.1"):
+        planner = RobotPlanner("a", radar_range=1.0)
+        planner.hear(Word("b", (3.0, 3.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(world, 0.1, (1.0, 0.0, 0.0)))}))
+        plans.append(planner.plan(world, cell, (0.0, 0.0), (1.0, 1.0), now=0.0, share=True))
+    assert np.array_equal(plans[0].goals, plans[1].goals)
+
+
 def test_a_grid_that_lies_too_far_away_is_left_out():
     planner, grid = RobotPlanner("a", **SETTINGS), World().grid()
     planner.hear(Word("b", (1.0, 1.0, 0.0), 0.0, 0.0, {"b": (0.0, OccupancyGrid(grid, CELL, (1e6, 0.0, 0.0)))}))

@@ -12,7 +12,7 @@ import numpy as np
 from .beats import Beats
 from .contacts import BASE, read_names
 from .frames import OccupancyGrid, merge_grids, span
-from .grid import is_planned_on, read_grid
+from .grid import check_grid, is_planned_on, read_grid
 from .planner import Plan, TeamPlanner, finite, log_new
 from .words import Word, check_told, check_word, show
 
@@ -138,8 +138,8 @@ class RobotPlanner:
         notes = list(self._odd)
         if share:
             read_grid(grid, resolution, origin, self.team.occupied, notes)  # before mates' grids hide what is wrong
-            yaw = float(origin[2]) if len(origin) > 2 else 0.0
-            own = OccupancyGrid(np.array(grid), resolution, (float(origin[0]), float(origin[1]), yaw))
+            values, cell, corner = check_grid(grid, resolution, origin)
+            own = OccupancyGrid(np.array(values), cell, corner)
             merged = merge_told([own], {name: heard for name, (_, heard) in self.grids.items()}, notes, reach)
             grid, resolution, origin = merged.values, merged.resolution, merged.origin
         words = {name: word for name, word in self.heard.items() if now - word.time <= self.memory and name != BASE}
