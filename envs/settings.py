@@ -161,7 +161,9 @@ def check_failing(config: FaultsConfig, num_robots: int, steps: int) -> None:
             )
         if robot >= num_robots:
             last = num_robots - 1
-            raise ValueError(f"faults.at names robot {shown(robot)}: there are num_robots={num_robots}, from 0 to {last}")
+            raise ValueError(
+                f"faults.at names robot {shown(robot)}: there are num_robots={num_robots}, from 0 to {last}"
+            )
 
 
 def positive_count(name: str, value: int) -> int:

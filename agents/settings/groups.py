@@ -68,7 +68,9 @@ class ScenarioSettings(optional_settings(Scenario)):
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: str = same(EnvSettings, "done")
     collision: str = same(EnvSettings, "collision")
-    importing: ImportSettings = import_settings(robot_radius="${robot.radius}", num_robots="${largest_team:${num_robots}}")
+    importing: ImportSettings = import_settings(
+        robot_radius="${robot.radius}", num_robots="${largest_team:${num_robots}}"
+    )
 
 
 @dataclass
