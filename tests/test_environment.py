@@ -1,5 +1,7 @@
 """ExplorationEnv: the contract of docs/concepts.md."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,7 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
+from maexp.envs.nav_grid import stands_free
 from maexp.envs.settings import complete_settings
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
 from maexp.kernels.types import PICTURE_CHANNELS
@@ -345,6 +348,12 @@ def test_a_place_of_any_numbers_is_one_of_pythons(place):
 
 def test_whether_there_is_a_base_may_be_numpys():
     assert CommConfig(base_station=np.True_).checked().base_station is True
+
+
+def test_a_place_far_from_a_map_is_outside_of_it(maps):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of numbers that no whole number holds
+        assert not stands_free(maps[0], (1e300, 0.0)) and not stands_free(maps[0], (0.0, -1e300))
 
 
 def test_an_env_is_made_of_its_settings(maps):
