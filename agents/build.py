@@ -1,6 +1,7 @@
 """From settings to maps, environments and learners."""
 
 import copy
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -104,11 +105,16 @@ def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
 
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
-    from maexp.envs.importing import ImportOptions, import_map
+    from maexp.envs.importing import ImportOptions, import_map_with_report
 
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
-    maps = [import_map(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
+    maps = []
+    for path in split_paths(scenario.path):
+        world, report = import_map_with_report(path, read(ImportOptions, scenario.importing))
+        for text in report.warnings:
+            warnings.warn(f"map {world.name}: {text}", stacklevel=2)
+        maps.append(world)
     names = [world.name for world in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")

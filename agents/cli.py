@@ -244,8 +244,10 @@ def print_settings(cfg: "DictConfig", verb: str) -> None:
 
 
 def _check_flags(name: str, flags: list[str]) -> None:
+    from maexp.agents.settings.compose import SWEEPING
+
     allowed = {"-h", "--help", "-c", "--cfg", "job"}
-    allowed |= {"-m", "--multirun"} if name == "train" else set()
+    allowed |= {"-m", "--multirun"} if name in SWEEPING else set()
     for flag in flags:
         if flag not in allowed:
             known = ", ".join(sorted(word for word in allowed if word.startswith("--")))

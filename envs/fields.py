@@ -6,7 +6,8 @@ neither torch nor Warp: whoever asks for help does not wait for them.
 """
 
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, field, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
@@ -14,6 +15,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 WHOLE_LIMIT = 10**9  # beyond any sensible count, and far from overflowing a 64-bit integer
+NUMBER_LIMIT = 1e12  # beyond anything measured; kernels count in 32 bits, which hold its third power
 PRIMITIVES = (bool, int, float, str)
 
 
@@ -97,9 +99,50 @@ def check_settings(settings: Any, group: str = "", error: type[ValueError] = Val
 
 
 def check_value(name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError) -> None:
-    """Raise ``error`` unless the value is of one of the types and in the range of a setting."""
-    if not _fits(value, allowed, **metadata["limits"]):
-        raise error(f"{name}={value!r} must be {_wanted(allowed, metadata['unit'], **metadata['limits'])}.")
+    """Raise ``error`` unless the value is of one of the types and in the range of a setting.
+
+    Ranges without an end reach to `WHOLE_LIMIT` or `NUMBER_LIMIT`, which are told only to who leaves them.
+    """
+    for limits in (metadata["limits"], _closed(allowed, **metadata["limits"])):
+        if not _fits(value, allowed, **limits):
+            raise error(f"{name}={shown(value)} must be {_wanted(allowed, metadata['unit'], **limits)}.")
+
+
+def plain_numbers(value: Any) -> Any:
+    """Arrays and numbers of NumPy and torch as Python's, and sequences that hold them as lists."""
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain_numbers(item) for item in value]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def is_finite(value: Any) -> bool:
+    """Whether it is a number, and a float can hold it."""
+    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def shown(value: Any) -> str:
+    """A value as messages show it: a whole number that no float holds as a power of ten, not digit by digit."""
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        inside = ", ".join(map(shown, value))
+        return f"({inside})" if isinstance(value, tuple) else f"[{inside}]"
+    if isinstance(value, int) and abs(value) > sys.float_info.max:
+        return f"{'-' * (value < 0)}1e+{int(math.log10(abs(value)))}"
+    return repr(value)
+
+
+def _closed(allowed, low, high, above, below, infinite) -> dict[str, Any]:
+    """The limits with ends where there are none: what overflows in a kernel, or is 0 there, would mean nothing."""
+    if float in allowed:
+        end = sys.float_info.max if infinite else NUMBER_LIMIT  # what may be infinite is as good as that beyond
+        if below is None and high is None:
+            high = end
+        if low is None and above is None:
+            low = -end
+        if above == 0 and below is None:
+            low, above = 1.0 / NUMBER_LIMIT, None
+    elif low is not None and high is None:
+        high = WHOLE_LIMIT
+    return {"low": low, "high": high, "above": above, "below": below, "infinite": infinite}
 
 
 def _fits(value, allowed, low, high, above, below, infinite) -> bool:
@@ -112,11 +155,11 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return str in allowed or value in words
     if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
-    if float not in allowed and low is not None and high is None and float(value) > WHOLE_LIMIT:
-        return False
+    if infinite and value == math.inf:
+        return True
     inside = (low is None or value >= low) and (high is None or value <= high)
     inside = inside and (above is None or value > above) and (below is None or value < below)
-    return inside and (math.isfinite(value) or (infinite and value == math.inf))
+    return inside and (isinstance(value, Integral) or math.isfinite(value))
 
 
 def _wanted(allowed, unit, low, high, above, below, infinite) -> str:

@@ -90,9 +90,9 @@ def open_cells(grid: NavGrid) -> np.ndarray:
 def stands_free(map: PointCloudMap, place: tuple[float, float]) -> bool:
     """Whether a place [m] lies on free ground."""
     grid = build_nav_grid(map)
-    x, y = np.floor((np.array(place) - grid.origin) / grid.cell).astype(np.int64)
+    x, y = np.floor((np.array(place) - grid.origin) / grid.cell)
     inside = 0 <= x < grid.width and 0 <= y < grid.height
-    return bool(inside and open_cells(grid)[y * grid.width + x])
+    return bool(inside and open_cells(grid)[int(y) * grid.width + int(x)])
 
 
 def stack_nav_grids(grids: list[NavGrid], device: str = "cpu") -> tuple[NavGrids, int]:

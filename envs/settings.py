@@ -16,7 +16,7 @@ from maexp.envs.config import (
     RadarConfig,
     RobotConfig,
 )
-from maexp.envs.fields import check_settings
+from maexp.envs.fields import check_settings, shown
 from maexp.envs.map import MapError, PointCloudMap
 from maexp.envs.nav_grid import stands_free
 from maexp.envs.scenarios import find_scenario
@@ -55,7 +55,7 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
     check_base(maps, comm)
     check_noise(maps, settings.radar)
     check_done(settings.done, comm)
-    check_failing(faults, num_robots, settings.macro_steps * settings.local_steps * DT)
+    check_failing(faults, num_robots, settings.episode_steps)
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
     return replace(
         settings,
@@ -151,14 +151,19 @@ def check_done(done: str, comm: CommConfig) -> None:
         raise ValueError("done='base' needs a base station: add comm.base_station=true")
 
 
-def check_failing(config: FaultsConfig, num_robots: int, seconds: float) -> None:
-    """Raise ValueError if a robot fails that is not there, or after the episode's `seconds`."""
+def check_failing(config: FaultsConfig, num_robots: int, steps: int) -> None:
+    """Raise ValueError if a robot fails that is not there, or after the episode's last step."""
     for robot, moment in config.at:
-        if moment >= seconds:
-            raise ValueError(f"faults.at: robot {robot} fails after {moment:g} s, and an episode ends at {seconds:g} s")
+        if config.steps[robot] >= steps:
+            raise ValueError(
+                f"faults.at: robot {shown(robot)} fails after {moment:g} s, and an episode ends at {steps * DT:g} s: "
+                f"give {(steps - 1) * DT:g} s, when its last step begins, or less"
+            )
         if robot >= num_robots:
             last = num_robots - 1
-            raise ValueError(f"faults.at names robot {robot}: there are num_robots={num_robots}, from 0 to {last}")
+            raise ValueError(
+                f"faults.at names robot {shown(robot)}: there are num_robots={num_robots}, from 0 to {last}"
+            )
 
 
 def positive_count(name: str, value: int) -> int:

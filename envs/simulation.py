@@ -118,8 +118,8 @@ def radar_sensing(settings: EnvSettings, bank: MapBank) -> Sensing:
 def fault_steps(settings: EnvSettings) -> torch.Tensor:
     """Local step in which each robot is to fail, int32 [N]; -1: none is given."""
     steps = torch.full((settings.num_robots,), -1, dtype=torch.int32, device=settings.device)
-    for robot, seconds in settings.faults.at:
-        steps[robot] = round(seconds / DT)
+    for robot, step in settings.faults.steps.items():
+        steps[robot] = step
     return steps
 
 

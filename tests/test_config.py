@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from maexp.agents.algorithms.catalogue import ALGORITHMS, TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices, model_settings
 from maexp.agents.errors import UserError
+from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import compose_config, group_choices, groups
 from maexp.agents.settings.env import planner_config, team_configs
 from maexp.agents.settings.model import SIZES
@@ -104,12 +105,36 @@ def test_every_verb_composes():
         ("num_robot=3", ("num_robot ", "num_robots")),
         ("radar.rang=3", ("radar.rang ", "radar.range")),
         ("num_envs=1,2", ("num_envs=1,2", "-m")),
+        ("comm.base_station=1,1", ("comm.base_station=1,1", "-m", "comm.base_station=[1,1]")),
+        ("comm.range=1" + 400 * "0", ("comm.range has more than 308 digits",)),
+        ("comm.range=1" + 5000 * "0", ("comm.range=1000000000", "give fewer digits")),
+        ("seed=1" + 400 * "0", ("seed=1e+400", "from 0 to")),
+        ("+comm.bogus=5", ("comm.bogus is not a setting of maexp train",)),
+        ("++faults.bogus=5", ("faults.bogus is not a setting of maexp train", "faults.at")),
+        ("+scenario.importing.bogus=5", ("scenario.importing.bogus is not a setting",)),
+        ("+comm.bogus.more=5", ("comm.bogus is not a setting",)),
+        ("+bogus=5", ("bogus is not a setting of maexp train",)),
         ("maze", ("'maze'", "name=value")),
     ],
 )
 def test_one_clear_sentence(word, wanted):
     message = refusal("train", word)
     assert all(part in message for part in wanted), message
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "view", "bench"])
+def test_a_verb_without_sweeps_names_no_flag_for_them(verb):
+    message = refusal(verb, "comm.base_station=1,1")
+    assert "-m " not in message and "write a list in brackets, comm.base_station=[1,1]" in message, message
+
+
+def test_a_setting_that_is_there_may_be_forced():
+    assert compose_config("train", ["++comm.range=5"]).comm.range == 5.0
+
+
+def test_no_team_is_so_large():
+    with pytest.raises(UserError, match=r"num_robots=1e\+400 must be a whole number from 1 to 1000000000"):
+        team_sizes(10**400)
 
 
 NAMES = ["a b.yaml", "a=b (1).yaml", "it's.npz", "a,b.ply", "${x}.pcd", "back\\slash.xyz", "1e3"]

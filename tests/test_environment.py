@@ -1,5 +1,7 @@
 """ExplorationEnv: the contract of docs/concepts.md."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,7 @@ from maexp.envs import (
     RobotConfig,
     make_map,
 )
+from maexp.envs.nav_grid import stands_free
 from maexp.envs.settings import complete_settings
 from maexp.envs.specs import INFO_ENV, INFO_ROBOT, REWARD_TERMS
 from maexp.kernels.types import PICTURE_CHANNELS
@@ -297,6 +300,14 @@ def test_bad_actions(maps):
         (dict(comm=CommConfig(base_station="home")), "comm.base_station='home'"),
         (dict(comm=CommConfig(base_station=(1.0, 2.0, 3.0))), "comm.base_station="),
         (dict(comm=CommConfig(base_station=(-900.0, 0.0))), "-900.0, 0.0. is no free ground of map maze"),
+        (dict(comm=CommConfig(base_station=(1e300, 0.0))), r"\[1e.300, 0.0\] is no free ground of map maze"),
+        (
+            dict(comm=CommConfig(base_station=[10**400, 0])),
+            r"comm.base_station=\[1e.400, 0\] must be true .* or a place",
+        ),
+        (dict(comm=CommConfig(base_station=[True, True])), r"comm.base_station=\[True, True\] must be true"),
+        (dict(comm=CommConfig(base_station=np.array([1.0]))), r"comm.base_station=array\(\[1.\]\) must be true"),
+        (dict(comm=CommConfig(base_station=(np.nan, 1.0))), r"comm.base_station=\(nan, 1.0\) must be true"),
         (dict(done="base"), "done='base' needs a base station"),
         (dict(done="nobody"), "done='nobody' must be one of union"),
         (dict(num_envs=10**7), "lower num_envs"),
@@ -316,6 +327,33 @@ def test_a_base_in_a_wall_is_refused(maps):
     x, y = maps[0].obstacles[len(maps[0].obstacles) // 2, :2].tolist()
     with pytest.raises(ValueError, match="comm.base_station=.* is no free ground of map"):
         ExplorationEnv(maps[0], comm=CommConfig(base_station=(x, y)))
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        [1, 2],
+        (np.float32(1), np.int64(2)),
+        np.array([1.0, 2.0], np.float32),
+        np.array([1, 2]),
+        torch.tensor([1.0, 2.0]),
+        [torch.tensor(1), 2.0],
+    ],
+)
+def test_a_place_of_any_numbers_is_one_of_pythons(place):
+    comm = CommConfig(base_station=place).checked()
+    assert comm == CommConfig(base_station=(1.0, 2.0)) and hash(comm) == hash(CommConfig(base_station=(1.0, 2.0)))
+    assert [type(x) for x in comm.base_station] == [float, float]
+
+
+def test_whether_there_is_a_base_may_be_numpys():
+    assert CommConfig(base_station=np.True_).checked().base_station is True
+
+
+def test_a_place_far_from_a_map_is_outside_of_it(maps):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of numbers that no whole number holds
+        assert not stands_free(maps[0], (1e300, 0.0)) and not stands_free(maps[0], (0.0, -1e300))
 
 
 def test_an_env_is_made_of_its_settings(maps):

@@ -1,6 +1,7 @@
 """`scenario=ir2`: the protocol of IR2 on a user's plans."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -99,8 +100,31 @@ def test_what_is_no_plan_is_refused(plan, tmp_path):
     Image.fromarray(np.full((40, 40), WALL, dtype=np.uint8)).save(tmp_path / "dark.png")
     with pytest.raises(MapError, match="no pixel is free"):
         load_maps(compose(f"scenario.path={tmp_path / 'dark.png'}").scenario)
+    Image.fromarray(np.pad(np.full((14, 14), GROUND, np.uint8), 5, constant_values=WALL)).save(tmp_path / "small.png")
+    for words, team in ((), 4), (["num_robots=[2,6]"], 6), (["num_robots=5", "scenario.importing.num_robots=8"], 8):
+        with pytest.raises(MapError, match=f"of num_robots={team} "):
+            load_maps(compose(f"scenario.path={tmp_path / 'small.png'}", *words).scenario)
     with pytest.raises(MapError, match="gone.png"):
         load_maps(compose(f"scenario.path={tmp_path / 'gone.png'}").scenario)
+
+
+@pytest.mark.parametrize(
+    ("gap", "told"),
+    [
+        (0, "map 2: 50% of the free space is not joined to the largest piece of it, and is left out"),
+        (2, "map 2: 50% of the free space lies behind gaps narrower than 0.6 m"),
+        (10, ""),
+    ],
+)
+def test_who_plays_is_told_of_ground_that_is_left_out(gap, told, tmp_path):
+    pixels = np.full((60, 120), WALL, dtype=np.uint8)
+    pixels[5:55, 5:55] = pixels[5:55, 65:115] = pixels[25 : 25 + gap, 55:65] = GROUND
+    Image.fromarray(pixels).save(tmp_path / "2.png")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_maps(compose(f"scenario.path={tmp_path / '2.png'}", "scenario.importing.resolution=0.1").scenario)
+    heard = [str(warning.message) for warning in caught]
+    assert len(heard) == bool(told) and all(text.startswith(told) for text in heard), heard
 
 
 def test_an_evaluation_has_their_metrics(plan, tmp_path, monkeypatch):

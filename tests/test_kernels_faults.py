@@ -139,9 +139,39 @@ def test_who_has_failed_does_not_keep_an_episode_from_its_end():
         (dict(at=[(1, 1.0), (1, 2.0)]), "names robot 1 twice"),
         (dict(at=[(1, -1.0)]), "the moment of robot 1=-1.0 must be 0 or more"),
         (dict(at=[1, 2.0]), r"faults.at=\[1, 2.0\] must be pairs"),
+        (dict(at=[(0, 10**400)]), "the moment of robot 0=1e.400 must be 0 or more seconds, and finite"),
+        (dict(at=[(10**400, 1.0)]), "names robot 1e.400: there are"),
+        (dict(at=[(0, float("inf"))]), "the moment of robot 0=inf must be"),
+        (dict(at=[(0, 1e300)]), "robot 0 fails after 1e.300 s, and an episode ends at 6 s"),
+        (dict(at=[(0, 5.99)]), "robot 0 fails after 5.99 s, and an episode ends at 6 s: give 5.9 s, when"),
+        (dict(at=[(True, 1.0)]), "names robot True"),
+        (dict(at=[(0.5, 1.0)]), "names robot 0.5"),
+        (dict(at=np.array([0.0, 1.0])), "must be pairs"),
         (dict(at="soon"), "faults.at='soon' must be pairs"),
     ],
 )
 def test_bad_settings_are_named(settings, words):
     with pytest.raises(ValueError, match=words):
         make(FaultsConfig(**settings))
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        [(np.int64(0), 3.0), (1, np.float32(0.5))],
+        np.array([[0, 3], [1, 0.5]]),
+        torch.tensor([[0.0, 3.0], [1.0, 0.5]]),
+        (np.array([0.0, 3.0]), [1, 0.5]),
+    ],
+)
+def test_moments_of_any_numbers_are_pythons(at):
+    config = FaultsConfig(at=at).checked()
+    assert config == FaultsConfig(at=((0, 3.0), (1, 0.5))) and hash(config) == hash(FaultsConfig(at=config.at))
+    assert {(type(robot), type(seconds)) for robot, seconds in config.at} == {(int, float)}
+
+
+def test_the_last_moment_comes():
+    env = make(FaultsConfig(at=[(0, 5.94)]), envs=1)
+    env.reset()
+    drive(env, 15)
+    assert env.simulation.tensors["failed"][0].tolist() == [1, 0, 0]

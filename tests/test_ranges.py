@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import fields, is_dataclass
 
+import numpy as np
 import pytest
 
 from maexp.agents.algorithms import ALGORITHMS
@@ -13,8 +14,10 @@ from maexp.agents.settings.schema import schema
 from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import (
     CommConfig,
+    FaultsConfig,
     LookaheadConfig,
     ObservationConfig,
+    OdometryConfig,
     PlannerConfig,
     RadarConfig,
     RewardConfig,
@@ -125,6 +128,25 @@ def test_every_size_of_a_network_has_its_range(name):
         (RadarConfig, "fov", 0, "radar.fov=0 must be a finite number above 0 [rad]."),
         (CommConfig, "cell", "big", "comm.cell='big' must be auto or a finite number above 0 [m]."),
         (PlannerConfig, "horizon", 2.5, "planner.horizon=2.5 must be a whole number, 1 or more."),
+        (OdometryConfig, "turn", 1e38, "odometry.turn=1e+38 must be a number from 0 to 1e+12 [rad]."),
+        (OdometryConfig, "drift", 1e300, "odometry.drift=1e+300 must be a number from 0 to 1e+12 [m]."),
+        (OdometryConfig, "jump", 1e20, "odometry.jump=1e+20 must be a number from 0 to 1e+12 [m]."),
+        (RadarConfig, "range", 1e39, "radar.range=1e+39 must be a number from 1e-12 to 1e+12 [m]."),
+        (RadarConfig, "alpha2", -1e300, "radar.alpha2=-1e+300 must be a number from -1e+12 to 1e+12 [m]."),
+        (RobotConfig, "max_speed", 1e-300, "robot.max_speed=1e-300 must be a number from 1e-12 to 1e+12 [m/s]."),
+        (RobotConfig, "length", 10**400, "robot.length=1e+400 must be a number from 1e-12 to 1e+12 [m]."),
+        (RewardConfig, "explore", 1e38, "reward.explore=1e+38 must be a number from 0 to 1e+12."),
+        (CommConfig, "cell", 1e-300, "comm.cell=1e-300 must be auto or a number from 1e-12 to 1e+12 [m]."),
+        (CommConfig, "cell", 1e300, "comm.cell=1e+300 must be auto or a number from 1e-12 to 1e+12 [m]."),
+        (CommConfig, "power", -(10**400), "comm.power=-1e+400 must be a number from -1e+12 to 1e+12 [dBm]."),
+        (CommConfig, "range", 10**400, "comm.range=1e+400 must be a number from 0 to 1.79769e+308 [m], or inf."),
+        (
+            CommConfig,
+            "period",
+            10**12,
+            "comm.period=1000000000000 must be auto or a whole number from 1 to 1000000000.",
+        ),
+        (CommConfig, "period", 10**400, "comm.period=1e+400 must be auto or a whole number from 1 to 1000000000."),
         (CommConfig, "range", math.nan, "comm.range=nan must be a number, 0 or more [m], or inf."),
         (CommConfig, "power", "loud", "comm.power='loud' must be a finite number [dBm]."),
         (CommConfig, "signal", 1, "comm.signal=1 must be true or false."),
@@ -141,6 +163,21 @@ def test_the_message_names_setting_value_range_and_unit(kind, name, value, sente
 def test_what_may_be_infinite_or_left_open_passes():
     check_settings(CommConfig(range=math.inf, cell=2.0, base_station=(1.0, 2.0)), "comm")
     check_settings(RobotConfig(wheelbase="length"), "robot")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        CommConfig(range=1e300, bandwidth=1e300, cell=0.001, power=100, period=10**6),
+        FaultsConfig(duration=1e300),
+        OdometryConfig(drift=1e6, turn=100, jump=1e6, jump_rate=10),
+        RadarConfig(range=1e9, fov=100.0),
+        RobotConfig(max_accel=1e9, max_speed=np.float32(3.0), length=np.int64(2)),
+        RewardConfig(success=1e9),
+    ],
+)
+def test_large_numbers_that_mean_something_pass(settings):
+    assert settings.checked() == settings
 
 
 @pytest.mark.parametrize("verb", SCHEMAS)

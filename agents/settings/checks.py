@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from maexp.agents.errors import UserError
 from maexp.agents.settings.groups import LAST_SEED, CollectorSettings
 from maexp.agents.settings.verbs import SCHEMAS
-from maexp.envs.fields import check_value, kinds
+from maexp.envs.fields import WHOLE_LIMIT, check_value, kinds, shown
 
 
 def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = "") -> None:
@@ -38,7 +38,7 @@ def check_ranges(cfg: DictConfig, verb: str) -> None:
 def check_seed(value: Any, name: str = "seed") -> None:
     """Raise UserError unless random numbers can start from it: other numbers would share those of a smaller one."""
     if type(value) is not int or not 0 <= value <= LAST_SEED:
-        raise UserError(f"{name}={value} must be a whole number from 0 to {LAST_SEED}.")
+        raise UserError(f"{name}={shown(value)} must be a whole number from 0 to {LAST_SEED}.")
 
 
 def check_distinct(name: str, values: Sequence) -> None:
@@ -66,7 +66,10 @@ def team_sizes(value: Any) -> list[int]:
         sizes = list(sizes)
     except TypeError:
         sizes = []
-    if not sizes or not all(type(size) is int and size >= 1 for size in sizes):
+    whole = all(type(size) is int for size in sizes)
+    if whole and (large := max(sizes, default=0)) > WHOLE_LIMIT:
+        raise UserError(f"num_robots={shown(large)} must be a whole number from 1 to {WHOLE_LIMIT}.")
+    if not sizes or not whole or min(sizes) < 1:
         raise UserError(f"num_robots={value} must be a whole number, 1 or more, or several as num_robots=1,2,6.")
     check_distinct("num_robots", sizes)
     return sizes

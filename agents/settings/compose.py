@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from dataclasses import is_dataclass
 from importlib import resources
 
 from hydra import compose, initialize_config_module
@@ -14,6 +15,8 @@ from maexp.agents.errors import UserError
 from maexp.agents.settings.checks import check_seed
 from maexp.agents.settings.runs import Recipe
 
+SWEEPING = ("train",)
+"""Verbs that run values of a setting one after another, with -m."""
 KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "text"}
 
 
@@ -82,7 +85,7 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
     Raises:
         UserError: an override that does not fit, or a seed that is none.
     """
-    from maexp.agents.settings.schema import register_schema
+    from maexp.agents.settings.schema import register_schema, schema
 
     register_schema(verb)
     GlobalHydra.instance().clear()
@@ -90,7 +93,9 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
         with initialize_config_module("maexp.conf", version_base="1.3"):
             cfg = compose(verb, [*_default_algorithm(verb, overrides), *overrides], return_hydra_config=True)
             missing = sorted(OmegaConf.missing_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])))
-    except (HydraException, OmegaConfBaseException) as error:
+            if unknown := _find_unknown(cfg, schema(verb)):
+                raise UserError(_name_unknown(unknown, verb))
+    except (HydraException, OmegaConfBaseException, OverflowError) as error:
         raise UserError(explain(error, verb)) from error
     if missing and whole:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
@@ -106,7 +111,7 @@ def explain(error: Exception, verb: str) -> str:
         group, choice = found.groups()
         return f"{group}={choice} is unknown: choose one of {', '.join(group_choices(group))}."
     if found := re.search(r"Could not override '([^']+)'", text):
-        return f"{found[1]} is not a setting of maexp {verb}{_suggest(found[1], verb)}."
+        return _name_unknown(found[1], verb)
     if found := re.search(r"Value '(.*?)' of type '\w+' could not be converted to (\w+)\s+full_key: (\S+)", text, re.S):
         value, kind, key = found.groups()
         return f"{key}={value} must be {KINDS.get(kind, kind)}."
@@ -114,9 +119,31 @@ def explain(error: Exception, verb: str) -> str:
         key = re.search(r"full_key: (\S+)", text)
         return f"{key[1] if key else 'a setting'}=null has no meaning: give it a value."
     if found := re.search(r"Ambiguous value for argument '([^']+)'", text):
-        return f"{found[1]} gives several values: add -m to run one after another, or write one value."
+        name, _, values = found[1].partition("=")
+        sweep = "add -m to run one after another, " * (verb in SWEEPING)
+        return f"{found[1]} gives several values: {sweep}write a list in brackets, {name}=[{values}], or one value."
+    if isinstance(error, OverflowError) and (found := re.search(r"full_key: (\S+)", text)):
+        return f"{found[1]} has more than 308 digits, which no number of the machine holds: give fewer."
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc/docs" not in line]
     return " ".join(dict.fromkeys(lines[:3])) + f" (see maexp {verb} --help)."
+
+
+def _name_unknown(name: str, verb: str) -> str:
+    return f"{name} is not a setting of maexp {verb}{_suggest(name, verb)}."
+
+
+def _find_unknown(node: DictConfig, kind: type, prefix: str = "") -> str | None:
+    """The first setting that `kind` does not declare, as +comm.bogus=5 adds it; Hydra's own are left out."""
+    for key in node:
+        if key not in kind.__dataclass_fields__:
+            if prefix + key != "hydra":
+                return prefix + key
+            continue
+        child = node._get_node(key)
+        if isinstance(child, DictConfig) and is_dataclass(of := OmegaConf.get_type(child)):
+            if found := _find_unknown(child, of, f"{prefix}{key}."):
+                return found
+    return None
 
 
 def _suggest(name: str, verb: str) -> str:

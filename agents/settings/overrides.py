@@ -116,6 +116,8 @@ def _make_override(verb: str, name: str, value: str, multirun: bool) -> str:
             return word
         except (OverrideParseException, HydraException):
             continue
+        except ValueError as error:  # a whole number of thousands of digits
+            raise UserError(f"{name}={value[:20]}... cannot be read as a number: give fewer digits.") from error
     raise UserError(f"{name}={value} cannot be read as a setting: write name=value (see maexp {verb} --help).")
 
 

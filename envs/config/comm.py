@@ -1,11 +1,10 @@
 """Communication: who hears whom, and what robots do to tell others what they know."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
-from maexp.envs.fields import setting, words_of
+from maexp.envs.fields import is_finite, plain_numbers, setting, shown, words_of
 from maexp.kernels.constants import DT, LOSS
 
 from .group import Group
@@ -98,13 +97,13 @@ class CommConfig(Group):
         return replace(self, base_station=_check_base(self.base_station))
 
 
-def _check_base(base: bool | Sequence[float]) -> bool | tuple[float, float]:
-    if isinstance(base, bool):
-        return base
-    place = list(base) if isinstance(base, Sequence) and not isinstance(base, str) else []
-    if len(place) != 2 or not all(isinstance(x, int | float) and math.isfinite(x) for x in place):
+def _check_base(base: Any) -> bool | tuple[float, float]:
+    place = plain_numbers(base)
+    if isinstance(place, bool):
+        return place
+    if not isinstance(place, list) or len(place) != 2 or not all(map(is_finite, place)):
         where = "true (where robot 0 starts), false or a place [x, y] in metres"
-        raise ValueError(f"comm.base_station={base!r} must be {where}")
+        raise ValueError(f"comm.base_station={shown(base)} must be {where}")
     return float(place[0]), float(place[1])
 
 

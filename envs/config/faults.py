@@ -1,12 +1,14 @@
 """Robots that fail."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from maexp.envs.fields import setting
+from maexp.envs.fields import is_finite, plain_numbers, setting, shown
+from maexp.kernels.constants import DT
 
 from .group import Group
+
+LATEST = 1e8  # moment [s]; no episode is so long, and a step's number fits in 32 bits
 
 
 @dataclass(frozen=True)
@@ -28,20 +30,32 @@ class FaultsConfig(Group):
         """Whether any robot may fail."""
         return self.probability > 0.0 or bool(self.at)
 
+    @property
+    def steps(self) -> dict[int, int]:
+        """The step before which each robot of ``at`` fails."""
+        return {robot: round(min(seconds, LATEST) / DT) for robot, seconds in self.at}
+
     def checked(self) -> "FaultsConfig":
         """Moments must be pairs of a robot and seconds, of each robot one; they become tuples."""
         super().checked()
-        pairs = self.at if isinstance(self.at, Sequence) and not isinstance(self.at, str) else [self.at]
+        pairs = plain_numbers(self.at)
         found: dict[int, float] = {}
-        for pair in pairs:
-            if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
-                raise ValueError(f"faults.at={self.at!r} must be pairs of a robot and seconds, as [[0, 30], [2, 12.5]]")
+        for pair in pairs if isinstance(pairs, list) else [pairs]:
+            if not isinstance(pair, list) or len(pair) != 2:
+                raise ValueError(
+                    f"faults.at={shown(self.at)} must be pairs of a robot and seconds, as [[0, 30], [2, 12.5]]"
+                )
             robot, seconds = pair
+            if isinstance(robot, float) and robot.is_integer():  # an array of pairs has no whole numbers
+                robot = int(robot)
             if isinstance(robot, bool) or not isinstance(robot, int) or robot < 0:
-                raise ValueError(f"faults.at names robot {robot!r}: robots have numbers from 0 on")
+                raise ValueError(f"faults.at names robot {shown(robot)}: robots have numbers from 0 on")
             if robot in found:
-                raise ValueError(f"faults.at names robot {robot} twice: it fails once in an episode")
-            if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0.0 <= seconds < math.inf:
-                raise ValueError(f"faults.at: the moment of robot {robot}={seconds!r} must be 0 or more seconds")
+                raise ValueError(f"faults.at names robot {shown(robot)} twice: it fails once in an episode")
+            if not is_finite(seconds) or seconds < 0:
+                raise ValueError(
+                    f"faults.at: the moment of robot {shown(robot)}={shown(seconds)} must be 0 or more seconds, and "
+                    "finite"
+                )
             found[robot] = float(seconds)
         return replace(self, at=tuple(found.items()))

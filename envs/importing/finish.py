@@ -22,7 +22,7 @@ STEPS_DOWN = (1.0, 0.8, 0.6, 0.4, 0.3, 0.2)  # resolutions tried, in units of th
 KEPT_SHARE = 0.85  # a resolution must keep this share of the area a finer one would
 CLEANED_CELLS = 6_000_000  # cleaning takes some 200 bytes a cell
 POINTS_IN_RANGE = 2.0  # a radar must reach this many points far
-LOST_SHARE = 0.2  # of the free space behind narrow gaps: from here on it is worth a warning
+LOST_SHARE = 0.2  # of the free space, in other pieces or behind narrow gaps: from here on it is worth a warning
 GAP = 2.0  # points farther apart than this many collision thresholds let a robot through
 
 
@@ -41,6 +41,7 @@ def finish_map(source: Source, scenario: Scenario, name: str, options: ImportOpt
     _warn_of_coarse_cells(cleaned, scenario, options, report)
     report.add("resolution", f"{cleaned.start.cell:g} m a cell, {reason}", after=cleaned.start.labels.size)
     cleaned.tell(report)
+    _warn_of_pieces(cleaned, options, report)
     _warn_of_narrow_gaps(cleaned, scenario, options, report)
     return _to_map(cleaned.grid, scenario, name, options, report)
 
@@ -82,6 +83,17 @@ def _warn_of_coarse_cells(cleaned: _Cleaned, scenario: Scenario, options: Import
     report.warn(
         f"{what} coarser than {threshold:g} m, the distance at which {_whose(options, scenario)} collides, so "
         f"robots may be lost at ragged walls; {remedy}"
+    )
+
+
+def _warn_of_pieces(cleaned: _Cleaned, options: ImportOptions, report: ImportReport) -> None:
+    """Only where nobody has chosen a piece."""
+    lost = cleaned.dropped_pieces / cleaned.free_before
+    if lost < LOST_SHARE or options.component != "largest":
+        return
+    report.warn(
+        f"{lost:.0%} of the free space is not joined to the largest piece of it, and is left out; if robots start in "
+        "another piece, name a place in it with importing.component=[x,y]"
     )
 
 
