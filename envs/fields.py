@@ -117,7 +117,10 @@ def plain_numbers(value: Any) -> Any:
 
 def is_finite(value: Any) -> bool:
     """Whether it is a number, and a float can hold it."""
-    return isinstance(value, Real) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    size: Any = abs(value)
+    return size <= sys.float_info.max
 
 
 def shown(value: Any) -> str:
