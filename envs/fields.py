@@ -117,10 +117,10 @@ def plain_numbers(value: Any) -> Any:
 
 def is_finite(value: Any) -> bool:
     """Whether it is a number, and a float can hold it."""
-    if not isinstance(value, Real) or isinstance(value, bool):
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:
         return False
-    size: Any = abs(value)
-    return size <= sys.float_info.max
 
 
 def shown(value: Any) -> str:
@@ -158,11 +158,12 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return str in allowed or value in words
     if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
+    value = int(value) if isinstance(value, Integral) else float(value)  # NumPy's would take limits for their own kind
     if infinite and value == math.inf:
         return True
     inside = (low is None or value >= low) and (high is None or value <= high)
     inside = inside and (above is None or value > above) and (below is None or value < below)
-    return inside and (isinstance(value, Integral) or math.isfinite(value))
+    return inside and (isinstance(value, int) or math.isfinite(value))
 
 
 def _wanted(allowed, unit, low, high, above, below, infinite) -> str:

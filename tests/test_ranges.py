@@ -176,6 +176,16 @@ def test_what_may_be_infinite_or_left_open_passes():
         RewardConfig(success=1e9),
     ],
 )
+@pytest.mark.filterwarnings("error")  # NumPy warns where a limit overflows in a number's own kind
+def test_numbers_of_numpy_are_compared_as_what_they_are():
+    check_settings(CommConfig(range=np.float32(8.0), period=np.int64(3), bandwidth=np.float32("inf")), "comm")
+    for range_ in (np.float32("nan"), np.float32(-1.0)):
+        with pytest.raises(ValueError, match="comm.range="):
+            check_settings(CommConfig(range=range_), "comm")
+    with pytest.raises(ValueError, match="comm.base_station="):
+        CommConfig(base_station=(np.float32("inf"), 0.0)).checked()
+
+
 def test_large_numbers_that_mean_something_pass(settings):
     assert settings.checked() == settings
 
