@@ -160,6 +160,16 @@ def test_the_message_names_setting_value_range_and_unit(kind, name, value, sente
         check_settings(kind(**{name: value}), kind.__name__.removesuffix("Config").lower())
 
 
+@pytest.mark.filterwarnings("error")  # NumPy warns where a limit overflows in a number's own kind
+def test_numbers_of_numpy_are_compared_as_what_they_are():
+    check_settings(CommConfig(range=np.float32(8.0), period=np.int64(3), bandwidth=np.float32("inf")), "comm")
+    for range_ in (np.float32("nan"), np.float32(-1.0)):
+        with pytest.raises(ValueError, match="comm.range="):
+            check_settings(CommConfig(range=range_), "comm")
+    with pytest.raises(ValueError, match="comm.base_station="):
+        CommConfig(base_station=(np.float32("inf"), 0.0)).checked()
+
+
 def test_what_may_be_infinite_or_left_open_passes():
     check_settings(CommConfig(range=math.inf, cell=2.0, base_station=(1.0, 2.0)), "comm")
     check_settings(RobotConfig(wheelbase="length"), "robot")
@@ -176,16 +186,6 @@ def test_what_may_be_infinite_or_left_open_passes():
         RewardConfig(success=1e9),
     ],
 )
-@pytest.mark.filterwarnings("error")  # NumPy warns where a limit overflows in a number's own kind
-def test_numbers_of_numpy_are_compared_as_what_they_are():
-    check_settings(CommConfig(range=np.float32(8.0), period=np.int64(3), bandwidth=np.float32("inf")), "comm")
-    for range_ in (np.float32("nan"), np.float32(-1.0)):
-        with pytest.raises(ValueError, match="comm.range="):
-            check_settings(CommConfig(range=range_), "comm")
-    with pytest.raises(ValueError, match="comm.base_station="):
-        CommConfig(base_station=(np.float32("inf"), 0.0)).checked()
-
-
 def test_large_numbers_that_mean_something_pass(settings):
     assert settings.checked() == settings
 
