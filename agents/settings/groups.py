@@ -1,10 +1,9 @@
 """The groups of settings that verbs share, as types that Hydra checks."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.model import ModelConfig
@@ -28,15 +27,6 @@ SUPPLIED = tuple(setting.name for setting in fields(Scenario) if setting.metadat
 def import_settings(**references: str) -> Any:
     """A field with the settings of the import, some of which refer to others."""
     return field(default_factory=lambda: ImportSettings(**references))
-
-
-def _largest_team(sizes: Any) -> int:
-    """The team that must find room on an imported map; where none is given or one that is none: the import's own."""
-    numbers = [size for size in (sizes if isinstance(sizes, Sequence) else [sizes]) if isinstance(size, int)]
-    return max(numbers, default=ImportOptions.num_robots)
-
-
-OmegaConf.register_new_resolver("largest_team", _largest_team, replace=True)
 
 
 def read_free_groups(cfg: DictConfig) -> dict[str, Any]:
@@ -68,9 +58,7 @@ class ScenarioSettings(optional_settings(Scenario)):
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: str = same(EnvSettings, "done")
     collision: str = same(EnvSettings, "collision")
-    importing: ImportSettings = import_settings(
-        robot_radius="${robot.radius}", num_robots="${largest_team:${num_robots}}"
-    )
+    importing: ImportSettings = import_settings(robot_radius="${robot.radius}")
 
 
 @dataclass

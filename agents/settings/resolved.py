@@ -77,10 +77,7 @@ def _resolve_scenario(scenario: ScenarioSettings, row: Scenario) -> dict[str, An
     settings = {"local_steps": scenario.local_steps or row.local_steps}
     settings["macro_steps"] = scenario.macro_steps or row.macro_steps
     if find_scenario(scenario.name).build is None:
-        importing = asdict(read(ImportOptions, scenario.importing, robot_radius=None))
-        if OmegaConf.is_interpolation(scenario.importing, "num_robots"):  # the team's, of whoever plays
-            del importing["num_robots"]
-        return settings | {"importing": importing}
+        return settings | {"importing": asdict(read(ImportOptions, scenario.importing, robot_radius=None))}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
     settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
     return settings | {"importing": None}
