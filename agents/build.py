@@ -5,7 +5,8 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -34,6 +35,9 @@ from maexp.envs import ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.config import STARTS
 from maexp.envs.scenarios import GENERATED, SCENARIOS, find_scenario
 from maexp.envs.starts import read_starts
+
+if TYPE_CHECKING:
+    from maexp.envs.importing import ImportOptions
 
 
 @dataclass
@@ -103,18 +107,29 @@ def load_maps(scenario: ScenarioSettings, train: bool = True) -> MapSuite:
     return MapSuite(build(indices) if train else [], build(held_out), unseen, lambda: build(validation or indices))
 
 
+TOLD: set[str] = set()
+"""Warnings of imports in this process: a file that is read again is told of once."""
+
+
+def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
+    """The map of a file; what its import left out is told."""
+    from maexp.envs.importing import import_map_with_report
+
+    world, report = import_map_with_report(path, options)
+    for text in (f"map {world.name}: {text}" for text in report.warnings):
+        if text not in TOLD:
+            TOLD.add(text)
+            warnings.warn(text, stacklevel=2)
+    return world
+
+
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
-    from maexp.envs.importing import ImportOptions, import_map_with_report
+    from maexp.envs.importing import ImportOptions
 
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
-    maps = []
-    for path in split_paths(scenario.path):
-        world, report = import_map_with_report(path, read(ImportOptions, scenario.importing))
-        for text in report.warnings:
-            warnings.warn(f"map {world.name}: {text}", stacklevel=2)
-        maps.append(world)
+    maps = [import_file(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
     names = [world.name for world in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")

@@ -158,7 +158,10 @@ def _fits(value, allowed, low, high, above, below, infinite) -> bool:
         return str in allowed or value in words
     if not isinstance(value, Real if float in allowed else Integral if int in allowed else ()):
         return False
-    value = int(value) if isinstance(value, Integral) else float(value)  # NumPy's would take limits for their own kind
+    if isinstance(value, Integral):
+        value = int(value)
+    elif not isinstance(value, float):  # a limit of fewer digits, as 0.99, is itself, and overflows nowhere
+        value = float(str(value)) if hasattr(value, "dtype") else float(value)
     if infinite and value == math.inf:
         return True
     inside = (low is None or value >= low) and (high is None or value <= high)

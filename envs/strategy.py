@@ -195,8 +195,8 @@ class Strategy:
         return s["duty"] | (away >= self._period(2.0 * way, self.rest + since)) | self.idle
 
     def _courier(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """As `_return_to_base`, but one goes for all: of robots that are connected and know the same, whoever has the
-        shortest way. The others take for told what it knows, and their period begins anew; also on the way, and where
+        """As `_return_to_base`, but one goes for all: of robots that are connected and know the same, whoever is
+        soonest there. The others take for told what it knows, and their period begins anew; also on the way, and where
         they meet one that is on its way.
 
         Before the end nobody sets out for another that still has time.
@@ -204,11 +204,13 @@ class Strategy:
         n, s = self.robots, self.state
         news = self._has_news(n) & (self.sim["collided"] == 0)
         due, late = self._is_due() & news, self._is_late() & news
-        way, number = self.way[..., n], torch.arange(n, device=self.at.device)
-        nearer = way.unsqueeze(1) < way.unsqueeze(2)
-        nearer |= (way.unsqueeze(1) == way.unsqueeze(2)) & (number < number.unsqueeze(-1))
+        way, number = self.way[..., n] / self.drive, torch.arange(n, device=self.at.device)  # of the way, decisions
+        sooner = way.unsqueeze(1) < way.unsqueeze(2)
+        sooner |= (way.unsqueeze(1) == way.unsqueeze(2)) & (number < number.unsqueeze(-1))
         mates = self.done[..., :n]
-        takes = mates & news.unsqueeze(1) & nearer  # [i, j]: j knows what i knows, and has a shorter way
+        if self.fades and not self.asks:  # a contact since the last decision may be over, and not know the latest
+            mates = mates & (self._shared()[..., :n] >= self.known.unsqueeze(-1))
+        takes = mates & news.unsqueeze(1) & sooner  # [i, j]: j knows what i knows, and is sooner there
         gives, heir = takes.any(-1), torch.where(takes, way.unsqueeze(1), torch.inf).argmin(-1)
         asked = torch.zeros_like(s["due"]).scatter_add_(1, heir, (due & gives).int()) > 0
         go = ((due | late) & ~gives) | asked

@@ -163,6 +163,7 @@ def test_the_message_names_setting_value_range_and_unit(kind, name, value, sente
 @pytest.mark.filterwarnings("error")  # NumPy warns where a limit overflows in a number's own kind
 def test_numbers_of_numpy_are_compared_as_what_they_are():
     check_settings(CommConfig(range=np.float32(8.0), period=np.int64(3), bandwidth=np.float32("inf")), "comm")
+    check_settings(RadarConfig(missed=np.float32(0.99)), "radar")  # the greatest
     for range_ in (np.float32("nan"), np.float32(-1.0)):
         with pytest.raises(ValueError, match="comm.range="):
             check_settings(CommConfig(range=range_), "comm")

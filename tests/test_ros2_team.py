@@ -141,6 +141,13 @@ def test_an_arena_of_other_robots_is_passed_over(own_domain):
     step_until(made, lambda: made.course.plans, again=robots.publish)
     assert len(made.told) == 1 and made.driver.episode is None
     assert f"{EPISODE}: an arena plays with robot1,robot2, and not with robots=a,b: give its robots" in made.told[0]
+    writer.write(writer.make(data=json.dumps({"over": True})))
+    plans = made.course.plans
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:
+        assert not made.step(), "that it is over ends nothing either"
+    robots.publish()
+    step_until(made, lambda: made.course.plans > plans, again=robots.publish)
 
 
 def test_an_episode_that_cannot_be_played_says_why(own_domain):

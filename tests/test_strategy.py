@@ -10,7 +10,7 @@ from torchrl.envs.utils import step_mdp
 from worlds import room
 
 from maexp.agents.policies import POLICIES
-from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig
+from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, RobotConfig, make_map
 from maexp.envs.config import STRATEGIES
 from maexp.envs.strategy import PATIENCE
 from maexp.kernels.types import REGIONS
@@ -205,6 +205,39 @@ def test_whoever_carries_the_news_hands_them_over_on_its_way():
     assert wait(env).tolist() == [True, False], "0 is nearer"
     put(env, {0: (2.0, 12.0)})
     assert wait(env).tolist() == [False, False], "and has told it all"
+
+
+def test_the_slow_do_not_carry_what_the_fast_bring_sooner():
+    """Soonest there is not nearest: the fast one is farther away."""
+    env = make("courier", robots=2, robot=[RobotConfig(max_speed=3.0), RobotConfig(max_speed=0.3)])
+    start(env, (4.0, 10.0), (6.0, 12.0))
+    wait(env)
+    put(env, {0: (20.0, 10.0), 1: (18.5, 10.0)})
+    assert wait(env, 3).tolist() == [True, False]
+    assert not wait(env)[1], "and the slow one has told it"
+
+
+def test_who_was_heard_a_while_ago_carries_nothing():
+    """Where links come and go, a contact since the last decision counts as one, but what was learned after it is not
+    told: nobody takes it for told."""
+    comm = CommConfig(signal=True, noise=13.0, base_station=True, strategy="courier")
+    shown = ObservationConfig(pictures=False)
+    env = ExplorationEnv(make_map("indoor_medium", 0), 4, 3, comm=comm, observation=shown, num_threads=1, seed=1)
+    strategy, state, eased = env.strategy, env.strategy.state, []
+    decide = strategy._courier
+
+    def watched() -> tuple[torch.Tensor, torch.Tensor]:
+        told = state["told"][..., 3].clone()
+        found = decide()
+        held = strategy.linked[..., :3] & (strategy._shared()[..., :3] >= strategy.known.unsqueeze(-1))
+        eased.extend(held.sum(-1)[state["told"][..., 3] != told].tolist())
+        return found
+
+    strategy._courier = watched
+    policy, td = POLICIES["cost_utility"](env), env.reset()
+    for _ in range(45):
+        td = step_mdp(env.step(policy(td)))
+    assert len(eased) > 5 and min(eased) > 1, "itself is one that has it"
 
 
 def test_before_the_end_the_last_to_have_time_reports():

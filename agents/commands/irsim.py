@@ -11,7 +11,7 @@ from maexp.agents.files import write_json
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import IrsimSettings
 from maexp.agents.training.named import find_player
-from maexp.envs import PointCloudMap, import_map
+from maexp.envs import PointCloudMap
 from maexp.envs.film import write_gif
 from maexp.envs.importing import ImportOptions
 from maexp.envs.scenarios import default_macro_steps, find_scenario
@@ -32,13 +32,14 @@ def check(cfg: IrsimSettings) -> None:
 
 def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
+    from maexp.agents.build import import_file
     from maexp.agents.irsim import ours
     from maexp.agents.irsim.drawing import draw_curves, draw_moment
     from maexp.agents.irsim.trial import run_trial
     from maexp.agents.irsim.trial_planners import make_planner
 
     with blame_input():
-        world = import_map(cfg.floor, read(ImportOptions, cfg.importing))
+        world = import_file(cfg.floor, read(ImportOptions, cfg.importing))
         config = make_config(cfg, world)
         player = find_player(cfg.policy)
         env = ours.make_team(world, cfg.num_robots, config, player.targets or 0)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maexp.agents.build import import_files, load_maps, make_env
+from maexp.agents.build import import_file, import_files, load_maps, make_env
 from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
@@ -18,7 +18,7 @@ from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import ViewSettings
 from maexp.agents.training.checkpoint import find_checkpoint, is_run
 from maexp.agents.training.named import check_planner, find_player, suit_observation
-from maexp.envs import PointCloudMap, import_map, make_map
+from maexp.envs import PointCloudMap, make_map
 from maexp.envs.importing import ImportOptions
 from maexp.envs.render import percent
 from maexp.envs.scenarios import SCENARIOS
@@ -180,7 +180,7 @@ def find_map(cfg: ViewSettings, place: Path | None) -> PointCloudMap:
     if place is not None:
         if cfg.index is not None:
             raise UserError(f"index={cfg.index} picks a map of a scenario, and {place} is one map: leave one out.")
-        return import_map(str(place), read(ImportOptions, cfg.scenario.importing))
+        return import_file(str(place), read(ImportOptions, cfg.scenario.importing))
     index = cfg.index or 0
     if SCENARIOS[cfg.scenario.name].build is not None:
         return make_map(cfg.scenario.name, index)

@@ -145,8 +145,8 @@ class Ros2Team:
         """What an arena tells; None: it is something else, which is told."""
         try:
             found = json.loads(text)
-            if found.get("over"):
-                return found
+            if found.get("over"):  # of an arena that plays with this team, or that it has not heard before
+                return found if self.driver.episode is not None or not self.strangers else None
             robots = found["robots"]
             named = isinstance(robots, list) and all(isinstance(name, str) for name in robots)
             if named and all(type(found[name]) in (int, float) and math.isfinite(found[name]) for name in NUMBERS):

@@ -95,7 +95,7 @@ def compose_config(verb: str, overrides: list[str], whole: bool = True) -> DictC
             missing = sorted(OmegaConf.missing_keys(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])))
             if unknown := _find_unknown(cfg, schema(verb)):
                 raise UserError(_name_unknown(unknown, verb))
-    except (HydraException, OmegaConfBaseException, OverflowError) as error:
+    except (HydraException, OmegaConfBaseException, OverflowError, ValueError) as error:
         raise UserError(explain(error, verb)) from error
     if missing and whole:
         raise UserError(f"{missing[0]} is not set: add {missing[0]}=VALUE.")
@@ -121,7 +121,8 @@ def explain(error: Exception, verb: str) -> str:
     if found := re.search(r"Ambiguous value for argument '([^']+)'", text):
         name, _, values = found[1].partition("=")
         sweep = "add -m to run one after another, " * (verb in SWEEPING)
-        return f"{found[1]} gives several values: {sweep}write a list in brackets, {name}=[{values}], or one value."
+        brackets = f"or, if it takes several, {name}=[{values}]"
+        return f"{found[1]} gives several values: {sweep}write one value, {brackets}."
     if isinstance(error, OverflowError) and (found := re.search(r"full_key: (\S+)", text)):
         return f"{found[1]} has more than 308 digits, which no number of the machine holds: give fewer."
     lines = [line.strip() for line in text.splitlines() if line.strip() and "hydra.cc/docs" not in line]
