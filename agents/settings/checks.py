@@ -38,7 +38,8 @@ def check_ranges(cfg: DictConfig, verb: str) -> None:
 def check_seed(value: Any, name: str = "seed") -> None:
     """Raise UserError unless random numbers can start from it: other numbers would share those of a smaller one."""
     if type(value) is not int or not 0 <= value <= LAST_SEED:
-        raise UserError(f"{name}={shown(value)} must be a whole number from 0 to {LAST_SEED}.")
+        given = shown(value) if isinstance(value, int) else value
+        raise UserError(f"{name}={given} must be a whole number from 0 to {LAST_SEED}.")
 
 
 def check_distinct(name: str, values: Sequence) -> None:
