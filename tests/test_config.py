@@ -125,7 +125,7 @@ def test_one_clear_sentence(word, wanted):
 @pytest.mark.parametrize("verb", ["evaluate", "view", "bench"])
 def test_a_verb_without_sweeps_names_no_flag_for_them(verb):
     message = refusal(verb, "comm.base_station=1,1")
-    assert "-m " not in message and "write a list in brackets, comm.base_station=[1,1]" in message, message
+    assert "-m " not in message and "or, if it takes several, comm.base_station=[1,1]" in message, message
 
 
 def test_a_setting_that_is_there_may_be_forced():
