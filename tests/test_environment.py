@@ -329,27 +329,6 @@ def test_a_base_in_a_wall_is_refused(maps):
         ExplorationEnv(maps[0], comm=CommConfig(base_station=(x, y)))
 
 
-@pytest.mark.parametrize(
-    "place",
-    [
-        [1, 2],
-        (np.float32(1), np.int64(2)),
-        np.array([1.0, 2.0], np.float32),
-        np.array([1, 2]),
-        torch.tensor([1.0, 2.0]),
-        [torch.tensor(1), 2.0],
-    ],
-)
-def test_a_place_of_any_numbers_is_one_of_pythons(place):
-    comm = CommConfig(base_station=place).checked()
-    assert comm == CommConfig(base_station=(1.0, 2.0)) and hash(comm) == hash(CommConfig(base_station=(1.0, 2.0)))
-    assert [type(x) for x in comm.base_station] == [float, float]
-
-
-def test_whether_there_is_a_base_may_be_numpys():
-    assert CommConfig(base_station=np.True_).checked().base_station is True
-
-
 def test_a_place_far_from_a_map_is_outside_of_it(maps):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of numbers that no whole number holds

@@ -6,6 +6,7 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
+import torch
 
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
@@ -158,6 +159,27 @@ def test_every_size_of_a_network_has_its_range(name):
 def test_the_message_names_setting_value_range_and_unit(kind, name, value, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
         check_settings(kind(**{name: value}), kind.__name__.removesuffix("Config").lower())
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        [1, 2],
+        (np.float32(1), np.int64(2)),
+        np.array([1.0, 2.0], np.float32),
+        np.array([1, 2]),
+        torch.tensor([1.0, 2.0]),
+        [torch.tensor(1), 2.0],
+    ],
+)
+def test_a_place_of_any_numbers_is_one_of_pythons(place):
+    comm = CommConfig(base_station=place).checked()
+    assert comm == CommConfig(base_station=(1.0, 2.0)) and hash(comm) == hash(CommConfig(base_station=(1.0, 2.0)))
+    assert [type(x) for x in comm.base_station] == [float, float]
+
+
+def test_whether_there_is_a_base_may_be_numpys():
+    assert CommConfig(base_station=np.True_).checked().base_station is True
 
 
 @pytest.mark.filterwarnings("error")  # NumPy warns where a limit overflows in a number's own kind
