@@ -8,9 +8,9 @@ from maexp.kernels.lazy import lazy_names
 _HOMES = {
     "make_env": "command_env",
     "make_policy": "training.make",
-    "make_critic": "algorithms.catalogue",
-    "make_loss": "algorithms.catalogue",
-    "ALGORITHMS": "algorithms.catalogue",
+    "make_critic": "algorithms.registry",
+    "make_loss": "algorithms.registry",
+    "ALGORITHMS": "algorithms.registry",
     "ModelConfig": "settings.model",
 }
 __all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_env", "make_loss", "make_policy"]

@@ -15,10 +15,10 @@ from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
-from maexp.agents.algorithms.catalogue import TRAININGS, find_algorithm
+from maexp.agents.algorithms.registry import TRAININGS, find_algorithm
 from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.errors import UserError
-from maexp.agents.networks.actor import make_policy
+from maexp.agents.models.actor import make_policy
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.env import env_settings, find_followers
 from maexp.agents.settings.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
@@ -34,10 +34,10 @@ from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.config import STARTS
 from maexp.envs.scenarios import GENERATED, SCENARIOS, find_scenario
-from maexp.envs.starts import read_starts
+from maexp.envs.spawn import read_starts
 
 if TYPE_CHECKING:
-    from maexp.envs.importing import ImportOptions
+    from maexp.envs.io import ImportOptions
 
 
 @dataclass
@@ -113,7 +113,7 @@ TOLD: set[str] = set()
 
 def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
     """The map of a file; what its import left out is told."""
-    from maexp.envs.importing import import_map_with_report
+    from maexp.envs.io import import_map_with_report
 
     world, report = import_map_with_report(path, options)
     for text in (f"map {world.name}: {text}" for text in report.warnings):
@@ -125,7 +125,7 @@ def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
 
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
-    from maexp.envs.importing import ImportOptions
+    from maexp.envs.io import ImportOptions
 
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")

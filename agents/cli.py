@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from maexp.agents.errors import UserError, describe_disk_error
+from maexp.agents.errors import STOPPED, UserError, describe_disk_error
 from maexp.agents.memory import keep_freed_memory
-from maexp.agents.signals import STOPPED
 
 if TYPE_CHECKING:  # nobody waits for Hydra to print a line of help
     from omegaconf import DictConfig
@@ -93,7 +92,7 @@ VERBS = {
         ("place",),
     ),
     "export": Verb(
-        "writes the policy of a run as a folder for robots (maexp.agents.runtime)",
+        "writes the policy of a run as a folder for robots (maexp.agents.deploy.planner)",
         ("maexp export RUN out=FOLDER", "maexp export RUN out=FOLDER results=EVALUATION,EVALUATION"),
         ("checkpoint",),
     ),

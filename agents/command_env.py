@@ -5,13 +5,13 @@ from typing import Literal
 from maexp.agents import build
 from maexp.agents.commands.evaluate import find_teams
 from maexp.agents.errors import UserError, blame_input
+from maexp.agents.policies.registry import suit_observation
 from maexp.agents.settings.checks import check_counts, team_sizes
 from maexp.agents.settings.compose import compose_recipe
 from maexp.agents.settings.overrides import find_override, make_overrides
 from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.training.checkpoint import find_checkpoint
-from maexp.agents.training.named import suit_observation
 from maexp.envs import ExplorationEnv
 
 RUNS = {"train": "resume", "evaluate": "checkpoint"}

@@ -1,13 +1,23 @@
-"""JSON, text and other files of a run, whole or not there."""
+"""Files of a run: written atomically, locked by one process at a time, maps identified by checksums."""
 
+import errno
+import fcntl
+import hashlib
 import json
 import math
+import os
 import shlex
-from collections.abc import Callable
+import socket
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from maexp.envs.whole_file import whole_file
+from maexp.agents.errors import UserError
+from maexp.envs import PointCloudMap
+from maexp.envs.atomic_write import whole_file
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -52,3 +62,107 @@ def without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+LOCK = ".lock"
+CANNOT_LOCK = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of file systems without locks, some of clusters among them."""
+
+
+@contextmanager
+def lock(where: Path, who: str, wait: bool = False) -> Iterator[None]:
+    """Hold a folder, in which `.lock` says who does; the lock ends with this process, however it ends.
+
+    Args:
+        who: holds it, as `maexp train`
+        wait: until a process that is at it has ended
+
+    Raises:
+        UserError: another process is at it.
+    """
+    handle = _take(where / LOCK, who, wait)
+    _HELD.add(handle)
+    try:
+        with suppress(OSError):  # on a full disk the lock holds all the same, but has no name
+            os.ftruncate(handle, 0)
+            me = {"pid": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+            os.pwrite(handle, json.dumps({"who": who} | me).encode(), 0)
+        yield
+    finally:
+        with suppress(OSError):
+            (where / LOCK).unlink()
+        _HELD.discard(handle)
+        os.close(handle)
+
+
+def _take(path: Path, who: str, wait: bool) -> int:
+    """The file, open and locked."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            if os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path)):
+                return handle
+            os.close(handle)  # whoever held it has removed it in the meantime
+        except BlockingIOError as error:
+            told = _describe(handle, path.parent, who)
+            os.close(handle)
+            raise UserError(told) from error
+        except OSError as error:
+            if error.errno not in CANNOT_LOCK:
+                os.close(handle)
+                raise
+            told = f"{short(path.parent)} cannot be locked ({error.strerror}): run nothing else there"
+            warnings.warn(told, stacklevel=2)
+            return handle
+
+
+def _describe(handle: int, where: Path, who: str) -> str:
+    """Who holds a folder, and what to do."""
+    try:
+        found = json.loads(os.pread(handle, 4096, 0))
+        holder = f"{found['who']}, process {int(found['pid'])} on {found['host']} since {found['since']}"
+    except (ValueError, KeyError, TypeError):
+        holder = f"another {who}"
+    return f"{short(where)} is in use by {holder}: wait until that has ended, or stop it."
+
+
+_HELD: set[int] = set()
+
+
+def _let_go() -> None:
+    """A child that outlives this process does not hold its folders."""
+    for handle in _HELD:
+        with suppress(OSError):
+            os.close(handle)
+    _HELD.clear()
+
+
+os.register_at_fork(after_in_child=_let_go)
+
+
+def checksum(world: PointCloudMap) -> str:
+    """Sixteen hexadecimal digits that follow from the points of a map."""
+    digest = hashlib.sha256()
+    for points in (world.free, world.obstacles, world.boundary):
+        digest.update(str(points.shape).encode() + points.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
+    """Name and checksum of every map."""
+    return {world.name: checksum(world) for world in maps}
+
+
+def changed_maps(saved: dict, maps: list[PointCloudMap]) -> str:
+    """Which of `maps` are not what they were when the checkpoint `saved` was written: "a and b have", "" for none."""
+    before = saved["maps"]
+    changed = [name for name, digest in checksums(maps).items() if before.get(name, digest) != digest]
+    more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+    return f"{', '.join(changed[:3])}{more} {'has' if len(changed) == 1 else 'have'}" if changed else ""
+
+
+def warn_of_changed_maps(saved: dict, maps: list[PointCloudMap]) -> None:
+    """Warn of those."""
+    if changed := changed_maps(saved, maps):
+        warnings.warn(f"{changed} changed since the run was started: its results are of other maps", stacklevel=2)

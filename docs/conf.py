@@ -31,15 +31,14 @@ def escape(app, what, name, obj, options, lines):
 
 def list_settings(app, what, name, obj, options, lines):
     """The settings of a dataclass, one a line, as its fields declare them."""
-    from maexp.envs.fields import describe
+    from maexp.envs.config_fields import describe
 
     lines += describe(obj) if isinstance(obj, type) else []
 
 
 def draw_leaderboard(app, error):
     """The page of the rows, beside their tables."""
-    from maexp.agents.suites.rows import find_rows, read_row
-    from maexp.agents.suites.site import write_page
+    from maexp.agents.benchmarks.leaderboard import find_rows, read_row, write_page
 
     if error is None and app.builder.format == "html":
         rows = [read_row(path) for path in find_rows(Path(app.srcdir) / "leaderboard")]

@@ -9,23 +9,23 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from maexp.envs.bank import MapBank, build_bank
+from maexp.envs.comm.strategy import Strategy
 from maexp.envs.config import (
     CELL_BYTES,
     STARTS,
     EnvSettings,
 )
-from maexp.envs.copies import describe, rebuild
-from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.regions import from_regions
+from maexp.envs.maps.map_batch import MapBank, build_bank
+from maexp.envs.maps.point_cloud import MapError, PointCloudMap
+from maexp.envs.pickling import describe, rebuild
+from maexp.envs.render.snapshot import take_snapshot
 from maexp.envs.scenarios import Scenario, find_scenario
 from maexp.envs.settings import complete_settings, positive_count
 from maexp.envs.simulation import build_simulation, check_memory
-from maexp.envs.snapshot import take_snapshot
+from maexp.envs.spawn import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
 from maexp.envs.specs import REWARD_TERMS, action_spec, done_spec, info_shapes, observation_spec, reward_spec
-from maexp.envs.starts import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
-from maexp.envs.strategy import Strategy
-from maexp.envs.target_view import TargetView, draw_targets
+from maexp.envs.targets.observation import TargetView, draw_targets
+from maexp.envs.targets.region_action import from_regions
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.reward import MARKS
@@ -306,7 +306,9 @@ class ExplorationEnv(EnvBase):
         room, env = int(word) // ROOM_UNIT, int(env)
         error.zero_()
         if code & ERROR_CAPACITY:
-            raise RuntimeError(f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/bank.py")
+            raise RuntimeError(
+                f"env {env}: a radar buffer overflowed; this is a bug of the bounds in envs/maps/map_batch.py"
+            )
         if code & ERROR_START:
             raise MapError(
                 f"starts drawn at random left room for {room} of num_robots={self.num_robots} robots (env {env}): "
@@ -396,7 +398,7 @@ class ExplorationEnv(EnvBase):
         TorchRL's ``PixelRenderTransform`` and ``VideoRecorder`` work with it; ``mode`` is there because they may
         name it, and has this one value.
         """
-        from maexp.envs.render import check_teams, draw_teams
+        from maexp.envs.render.frames import check_teams, draw_teams
 
         if mode != "rgb_array":
             raise ValueError(f"mode={mode!r} is unknown: this env renders rgb_array")

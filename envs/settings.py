@@ -16,9 +16,9 @@ from maexp.envs.config import (
     RadarConfig,
     RobotConfig,
 )
-from maexp.envs.fields import check_settings, shown
-from maexp.envs.map import MapError, PointCloudMap
-from maexp.envs.nav_grid import stands_free
+from maexp.envs.config_fields import check_settings, shown
+from maexp.envs.maps.nav_grid import stands_free
+from maexp.envs.maps.point_cloud import MapError, PointCloudMap
 from maexp.envs.scenarios import find_scenario
 from maexp.kernels.constants import DT
 from maexp.kernels.sensing import return_chance

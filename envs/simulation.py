@@ -8,14 +8,15 @@ import numpy as np
 import torch
 import warp as wp
 
-from maexp.envs.bank import MapBank
 from maexp.envs.config import CELLS_OF_RADAR, DONE, TIME_ON, EnvSettings, RobotConfig
-from maexp.envs.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
+from maexp.envs.maps.map_batch import MapBank
+from maexp.envs.maps.nav_grid import bank_block_sides, bank_nav_grids, build_nav_grid, grid_shape, open_cells
 from maexp.kernels.arrays import count_bytes
-from maexp.kernels.blocks import BLOCKS
 from maexp.kernels.constants import DT
 from maexp.kernels.dynamics import KINDS, Robots
-from maexp.kernels.known_grid import news_capacity
+from maexp.kernels.frontier_clusters import BLOCKS
+from maexp.kernels.occupancy_grid import news_capacity
+from maexp.kernels.path_steps import PATH_CELLS
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights
 from maexp.kernels.sensing import Sensing, return_chance
@@ -24,7 +25,6 @@ from maexp.kernels.simulation import Simulation
 from maexp.kernels.state import axis_sizes, memory_per_env
 from maexp.kernels.types import PICTURE_CHANNELS, PIXELS, TEAM_CHANNELS
 from maexp.kernels.wavefront import grid_bytes
-from maexp.kernels.ways import PATH_CELLS
 
 TRACK_LENGTH = 625
 """Local steps after which the trajectory has faded below half a grey level: 255 * 0.99^625 < 0.5."""

@@ -4,7 +4,7 @@ import torch
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from maexp.envs.config import EnvSettings
-from maexp.envs.features import feature_names
+from maexp.envs.targets.features import feature_names
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reward import MARKS, REWARD_TERMS
 from maexp.kernels.types import REGIONS

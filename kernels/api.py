@@ -7,10 +7,10 @@ import warp as wp
 
 from maexp.kernels import merge, visibility
 from maexp.kernels.dynamics import Robots
-from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, lanes_on, launch_named, launch_on
+from maexp.kernels.occlusion import BINS
+from maexp.kernels.occupancy_grid import NavGrids
 from maexp.kernels.radio import Radio, _measure_signals
-from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
 

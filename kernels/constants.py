@@ -1,7 +1,9 @@
-"""Numbers that the kernels share with what computes the same without Warp (`maexp.agents.runtime`).
+"""Numbers that the kernels share with what computes the same without Warp (`maexp.agents.deploy.planner`).
 
 Imports nothing: robots' computers have neither Warp nor torch.
 """
+
+import numpy as np
 
 DT = 0.1  # length of a local step [s]
 
@@ -27,3 +29,23 @@ NUDGE = 1e-4  # added to places on a line, in cells: rounding must not decide on
 
 # Targets.
 RAYS = 48  # rays that look around from a target
+
+
+BLOCKS_PER_SIDE = 4.0
+"""Blocks along the radar's range, or along the longer side of a map that is smaller than the range."""
+
+
+def block_sides(
+    cell: np.ndarray | float, reach: float, width: np.ndarray | float, height: np.ndarray | float
+) -> np.ndarray:
+    """Edges of blocks, int32, in cells.
+
+    A radar that reaches far beyond the map would otherwise gather all of it in one block: one target for all robots.
+
+    Args:
+        cell: edges of the grids' cells [m].
+        reach: how far the radar sees [m].
+        width, height: of the grids in cells; inf where nobody knows yet how large the place is.
+    """
+    span = np.minimum(np.float32(reach) / np.asarray(cell, np.float32), np.maximum(width, height))
+    return np.maximum(2, np.round(span / BLOCKS_PER_SIDE)).astype(np.int32)

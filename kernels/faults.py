@@ -6,8 +6,8 @@ depends on (seed, env, episode, robot) alone, so nothing has to be remembered.
 
 import warp as wp
 
+from maexp.kernels.cpp_snippets import keyed_uniform
 from maexp.kernels.launches import Launch
-from maexp.kernels.native import keyed_uniform
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 

@@ -25,8 +25,8 @@ import warp as wp
 
 from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import UNREACHED
+from maexp.kernels.cpp_snippets import search_from
 from maexp.kernels.launches import finish_filling, launch_on
-from maexp.kernels.native import search_from
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)

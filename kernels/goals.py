@@ -6,8 +6,8 @@ batch.
 
 import warp as wp
 
-from maexp.kernels.known_grid import NavGrids, nav_center
-from maexp.kernels.native import keyed_uniform
+from maexp.kernels.cpp_snippets import keyed_uniform
+from maexp.kernels.occupancy_grid import NavGrids, nav_center
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import REGIONS
 

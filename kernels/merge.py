@@ -8,10 +8,10 @@ large team. All sums are integers: weights are spacing squared in the map's unit
 
 import warp as wp
 
+from maexp.kernels.bandwidth import pass_messages
+from maexp.kernels.cpp_snippets import keyed_uniform, next_untold
 from maexp.kernels.geometry import segment_distance
 from maexp.kernels.launches import Launch, lanes_on
-from maexp.kernels.messages import pass_messages
-from maexp.kernels.native import keyed_uniform, next_untold
 from maexp.kernels.radio import radio_at, receive_signals
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS

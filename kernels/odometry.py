@@ -11,9 +11,9 @@ far from it as they are, and only the place that it drives to is off by the erro
 
 import warp as wp
 
+from maexp.kernels.cpp_snippets import keyed_uniform
 from maexp.kernels.dynamics import Robots, wrap_angle
 from maexp.kernels.launches import Launch
-from maexp.kernels.native import keyed_uniform
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import PI, Maps, point_xy

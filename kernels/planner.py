@@ -2,14 +2,14 @@
 
 import warp as wp
 
+from maexp.kernels.braking import hold_turns
 from maexp.kernels.dwa import _plan_dwa
 from maexp.kernels.dynamics import Robots, turn_limit
 from maexp.kernels.launches import Launch
 from maexp.kernels.odometry import take_aim
-from maexp.kernels.pace import fit_clearance, hold_back
 from maexp.kernels.shards import Shard
+from maexp.kernels.speed_limits import fit_clearance, hold_back
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.stopping import hold_turns
 from maexp.kernels.types import ERROR_ACTION, Maps
 
 wp.set_module_options(MODULE_OPTIONS)

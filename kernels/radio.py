@@ -12,9 +12,9 @@ logarithm is absent where nothing blocks, the second where no more than 35 cells
 import warp as wp
 
 from maexp.kernels.constants import BLOCKED_LOSS, CLEAR_CELLS, CLEAR_LOSS, LOSS, NUDGE
-from maexp.kernels.known_grid import NavGrids
+from maexp.kernels.cpp_snippets import keyed_uniform
 from maexp.kernels.launches import Launch
-from maexp.kernels.native import keyed_uniform
+from maexp.kernels.occupancy_grid import NavGrids
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps, point_xy

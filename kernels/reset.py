@@ -5,10 +5,10 @@ Random numbers are keyed by (seed, env, episode), so env i plays the same episod
 
 import warp as wp
 
+from maexp.kernels.bandwidth import forget_messages
+from maexp.kernels.drifting_maps import forget_drawings
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
-from maexp.kernels.mapping import forget_drawings
-from maexp.kernels.messages import forget_messages
 from maexp.kernels.sensing import forget_returns
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS

@@ -15,9 +15,9 @@ import math
 
 import warp as wp
 
+from maexp.kernels.cpp_snippets import keyed_uniform
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch, lanes_on
-from maexp.kernels.native import keyed_uniform
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, VIEWER_NOW, Maps

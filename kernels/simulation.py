@@ -4,11 +4,11 @@ import torch
 import warp as wp
 
 from maexp.kernels import step
+from maexp.kernels.drifting_maps import measure_maps
 from maexp.kernels.dwa import list_curvatures
 from maexp.kernels.dynamics import Robots
-from maexp.kernels.known_grid import NavGrids
 from maexp.kernels.launches import finish_filling, launch_on
-from maexp.kernels.mapping import measure_maps
+from maexp.kernels.occupancy_grid import NavGrids
 from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.radio import Radio
 from maexp.kernels.reward import RewardWeights

@@ -11,8 +11,8 @@ import warp as wp
 
 from maexp.kernels.arrays import Field, count_bytes
 from maexp.kernels.dynamics import Robots
+from maexp.kernels.occlusion import BINS
 from maexp.kernels.reward import MARKS, REWARD_TERMS
-from maexp.kernels.shadows import BINS
 from maexp.kernels.types import ROBOTS_PER_WORD
 
 AXES = {

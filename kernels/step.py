@@ -6,10 +6,10 @@ Every stage is a function of the file of its kernels: ``stage(launch, shard)`` l
 import torch
 
 from maexp.kernels.collision import detect_collisions
+from maexp.kernels.drifting_maps import draw_maps
 from maexp.kernels.dynamics import move_robots
 from maexp.kernels.faults import fail_robots
 from maexp.kernels.launches import Launch
-from maexp.kernels.mapping import draw_maps
 from maexp.kernels.merge import merge_scan, share_maps
 from maexp.kernels.neighbours import list_near
 from maexp.kernels.observe import draw_pictures, observe_pose, record_track

@@ -7,12 +7,12 @@ import warp as wp
 
 from maexp.kernels.constants import OBSTACLE, STRAIGHT, UNREACHED
 from maexp.kernels.geodesic import SKIP
-from maexp.kernels.known_grid import NavGrids, nav_cell, nav_center
-from maexp.kernels.passable import near_wall
+from maexp.kernels.greedy_assignment import squared
+from maexp.kernels.occupancy_grid import NavGrids, nav_cell, nav_center
+from maexp.kernels.path_steps import nearest_passable, step_back
 from maexp.kernels.startup import MODULE_OPTIONS
-from maexp.kernels.teamwork import squared
+from maexp.kernels.traversability import near_wall
 from maexp.kernels.types import point_xy
-from maexp.kernels.ways import nearest_passable, step_back
 
 wp.set_module_options(MODULE_OPTIONS)
 

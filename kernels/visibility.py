@@ -7,7 +7,7 @@ A free point P_f (seen from the robot's centre) is masked when some occluder P_o
 Both angular tests fold into ``dot(P_f, u_o) > c_o |P_f|`` with
 ``c_o = min(1 - alpha1, sqrt(1 - min(1, rho / |P_o|)^2))``.
 
-Most points need no pairwise test: bins of directions decide (`kernels/shadows.py`). Occluders are entered there the
+Most points need no pairwise test: bins of directions decide (`kernels/occlusion.py`). Occluders are entered there the
 nearest rows of cells first, and cells and bodies that are hidden are left out at once: with walls around, the cost
 follows what is seen, not the square of the range. In a cloud that is not ``planar`` bins do not decide alone, and
 nothing is left out.
@@ -17,8 +17,8 @@ import warp as wp
 
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch
+from maexp.kernels.occlusion import BINS, Sensor, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.sensing import sense
-from maexp.kernels.shadows import BINS, Sensor, add_occluder, add_outline, is_hidden, is_masked, keep_walls, shadow
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import (

@@ -18,16 +18,24 @@ import warp as wp
 
 from maexp.kernels.arrays import Field, count_bytes, make_arrays
 from maexp.kernels.constants import COMFORT, MARGIN_CELLS, UNREACHED
-from maexp.kernels.drawn_grids import DrawnGrids
+from maexp.kernels.drifting_grid import DrawnGrids
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.geodesic import SEARCH, SKIP, DistanceSearch
-from maexp.kernels.known_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.passable import PASSABLE, PassableGrids
+from maexp.kernels.occupancy_grid import KNOWN, KnownGrids, NavGrids, nav_cell, nav_center
+from maexp.kernels.path_steps import (
+    PATH_CELLS,
+    in_sight,
+    is_passable,
+    nearest_cell,
+    nearest_passable,
+    path_slot,
+    step_back,
+)
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
+from maexp.kernels.traversability import PASSABLE, PassableGrids
 from maexp.kernels.types import Maps, point_xy
-from maexp.kernels.ways import PATH_CELLS, in_sight, is_passable, nearest_cell, nearest_passable, path_slot, step_back
 
 wp.set_module_options(MODULE_OPTIONS)
 

@@ -4,4 +4,4 @@ from maexp.kernels.lazy import lazy_names
 
 __all__ = ["ALGORITHMS"]
 
-__getattr__ = lazy_names(__name__, {"ALGORITHMS": "catalogue"})
+__getattr__ = lazy_names(__name__, {"ALGORITHMS": "registry"})

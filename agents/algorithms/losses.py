@@ -18,10 +18,10 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import GAE
 
-from maexp.agents.algorithms.advantages import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for, write_advantages
-from maexp.agents.networks.actor import ALIVE, PARAMS, SEEN
-from maexp.agents.networks.critics import TEAM_VALUE, VALUE
-from maexp.agents.networks.distributions import Heads
+from maexp.agents.algorithms.gae import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for, write_advantages
+from maexp.agents.models.actor import ALIVE, PARAMS, SEEN
+from maexp.agents.models.critics import TEAM_VALUE, VALUE
+from maexp.agents.models.distributions import Heads
 
 ANCHOR = ("agents", "anchor")
 

@@ -7,17 +7,53 @@ holds the optimizers; its state_dict continues a run bit for bit.
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from maexp.agents.algorithms.advantages import look, write_advantages
+from maexp.agents.algorithms.gae import look, write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
-from maexp.agents.algorithms.threads import Both, at_once
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.networks.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
-from maexp.agents.networks.encoder import compact, pools_pictures
+from maexp.agents.models.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
+from maexp.agents.models.encoder import compact, pools_pictures
+
+Task = Callable[[], Any]
+Both = Callable[[Task, Task], tuple[Any, Any]]
+"""``both(first, second)`` runs two tasks and returns what they return."""
+
+
+@contextmanager
+def at_once(wanted: bool) -> Iterator[Both]:
+    """Inside, two tasks run at once: the second in a thread of its own, each with half of torch's threads.
+
+    They must not write what the other reads; random numbers are the first one's. Where it is not wanted, or torch has a
+    single thread, they run one after the other. With two threads results are those of a single one, bit for bit.
+    """
+    threads = torch.get_num_threads()
+    if not wanted or threads == 1:
+        yield lambda first, second: (first(), second())
+        return
+    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(threads // 2,)) as pool:
+        pool.submit(torch.get_num_threads).result()  # it has set its share: what follows is for this thread
+
+        def both(first: Task, second: Task) -> tuple[Any, Any]:
+            other = pool.submit(second)
+            try:
+                mine = first()
+            finally:
+                wait([other])
+            return mine, other.result()
+
+        torch.set_num_threads(threads - threads // 2)
+        try:
+            yield both
+        finally:
+            torch.set_num_threads(threads)
+
 
 CALIBRATION_ROUNDS = 5
 CHUNK = 256  # team steps at a time where memory matters more than speed

@@ -35,7 +35,7 @@ def check(cfg: BenchSettings) -> None:
 
 def run(cfg: BenchSettings, where: Path, overrides: list[str]) -> int:
     """Measure what `action` names; each has a module of its own."""
-    home = importlib.import_module(f"maexp.agents.speed.{cfg.task}")
+    home = importlib.import_module(f"maexp.agents.benchmarks.throughput.{cfg.task}")
     with blame_input():
         home.run(cfg, where, overrides)
     return 0

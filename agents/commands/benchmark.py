@@ -5,9 +5,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from maexp.agents.benchmark.cell import finished
-from maexp.agents.benchmark.estimate import Estimate, estimate_cells
-from maexp.agents.benchmark.plan import (
+from maexp.agents.benchmarks.cell import finished
+from maexp.agents.benchmarks.plan import (
     PLAN,
     Cell,
     as_list,
@@ -18,19 +17,18 @@ from maexp.agents.benchmark.plan import (
     read_plan,
     write_plan,
 )
-from maexp.agents.benchmark.pool import Outcome, WorkerPool, last_lines
-from maexp.agents.benchmark.report import SMOKE, Report
+from maexp.agents.benchmarks.pool import Outcome, WorkerPool, last_lines
+from maexp.agents.benchmarks.report import SMOKE, Report
+from maexp.agents.benchmarks.time_estimate import Estimate, estimate_cells
 from maexp.agents.build import pick_device
 from maexp.agents.commands.run_folder import check_writable
-from maexp.agents.errors import UserError
-from maexp.agents.files import command, short
-from maexp.agents.locking import lock
+from maexp.agents.errors import STOPPED, UserError, stop_on_signals
+from maexp.agents.files import command, lock, short
 from maexp.agents.progress import Progress, duration
 from maexp.agents.settings.overrides import find_override, without
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import BenchmarkSettings
-from maexp.agents.signals import STOPPED, stop_on_signals
 from maexp.agents.training.train import write_config
 
 NOTE = "What is absent here each cell has from its scenario and its algorithm: see cells/*/*/*/config.yaml."

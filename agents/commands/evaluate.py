@@ -12,7 +12,7 @@ import torch
 
 from maexp.agents.build import MapSuite, load_maps, make_env, model_settings
 from maexp.agents.commands.run_folder import check_writable
-from maexp.agents.errors import UserError, blame_input
+from maexp.agents.errors import STOPPED, UserError, blame_input
 from maexp.agents.evaluation.baseline import (
     CHANGES_FILE,
     EPISODES_FILE,
@@ -21,24 +21,20 @@ from maexp.agents.evaluation.baseline import (
     load_baseline,
     write_episodes,
 )
-from maexp.agents.evaluation.begun import begin, continue_evaluation, is_begun
-from maexp.agents.evaluation.comparison import choose_best, describe_differences, describe_training
+from maexp.agents.evaluation.cache import FOLDER, Kept, begin, continue_evaluation, identify, is_begun
+from maexp.agents.evaluation.comparison import choose_best, describe_differences, describe_training, play_once
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
-from maexp.agents.evaluation.films import EPISODES, check_render, play_teams, write_film
-from maexp.agents.evaluation.kept import FOLDER, Kept, identify
-from maexp.agents.evaluation.once import play_once
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
-from maexp.agents.files import command, short, write_json
-from maexp.agents.locking import lock
+from maexp.agents.evaluation.video import EPISODES, check_render, play_teams, write_film
+from maexp.agents.files import command, lock, short, write_json
+from maexp.agents.policies.registry import NamedPolicy, check_planner, find_players, suit_observation
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import EpisodeSettings, EvaluateSettings, ExportSettings, ViewSettings
-from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import check_action, find_checkpoint, restore_policy
-from maexp.agents.training.named import NamedPolicy, check_planner, find_players, suit_observation
 from maexp.agents.training.train import write_config
 from maexp.envs import ExplorationEnv, PointCloudMap
 
@@ -250,8 +246,8 @@ def describe_episodes(count: int, results: list[EvaluationResult], suite: MapSui
 
 def draw_ends(cfg: EvaluateSettings, maps: list, player: NamedPolicy, path: Path) -> None:
     """The last moment of the first few episodes of a policy, side by side."""
-    from maexp.envs.render import draw_teams
-    from maexp.envs.viewing.show import write_picture
+    from maexp.envs.render.frames import draw_teams
+    from maexp.envs.render.show import write_picture
 
     count = min(PICTURES, cfg.episodes)
     env = make_env(cfg, maps, team_sizes(cfg.num_robots)[0], count)

@@ -1,4 +1,4 @@
-"""`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.runtime`)."""
+"""`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.deploy.planner`)."""
 
 from pathlib import Path
 from typing import Any
@@ -8,8 +8,8 @@ from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import check_writable, remove_if_empty
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import short
-from maexp.agents.policies.card import RESULTS, find_results, write_card
 from maexp.agents.policies.export import export_policy, find_chooser
+from maexp.agents.policies.model_card import RESULTS, find_results, write_card
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run

@@ -8,12 +8,12 @@ import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
+from maexp.agents.policies.registry import find_player
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import IrsimSettings
-from maexp.agents.training.named import find_player
 from maexp.envs import PointCloudMap
-from maexp.envs.film import write_gif
-from maexp.envs.importing import ImportOptions
+from maexp.envs.io import ImportOptions
+from maexp.envs.render.video import write_gif
 from maexp.envs.scenarios import default_macro_steps, find_scenario
 
 FILM_SPEED = 4.0  # frames a second; one a decision
@@ -23,7 +23,7 @@ def check(cfg: IrsimSettings) -> None:
     """Raise UserError for what is missing, before a folder is made."""
     if not cfg.floor:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
-    from maexp.agents.irsim.trial_planners import check_player
+    from maexp.agents.deploy.irsim.policies import check_player
 
     check_player(cfg.policy, find_player(cfg.policy))
     if importlib.util.find_spec("irsim") is None:
@@ -33,17 +33,17 @@ def check(cfg: IrsimSettings) -> None:
 def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     """Play the trial, then the same in our simulator; write what happened."""
     from maexp.agents.build import import_file
-    from maexp.agents.irsim import ours
-    from maexp.agents.irsim.drawing import draw_curves, draw_moment
-    from maexp.agents.irsim.trial import run_trial
-    from maexp.agents.irsim.trial_planners import make_planner
+    from maexp.agents.deploy.irsim import policies
+    from maexp.agents.deploy.irsim.policies import make_planner
+    from maexp.agents.deploy.irsim.trial import run_trial
+    from maexp.agents.deploy.irsim.video import draw_curves, draw_moment
 
     with blame_input():
         world = import_file(cfg.floor, read(ImportOptions, cfg.importing))
         config = make_config(cfg, world)
         player = find_player(cfg.policy)
-        env = ours.make_team(world, cfg.num_robots, config, player.targets or 0)
-        starts = ours.draw_starts(env, cfg.episode)
+        env = policies.make_team(world, cfg.num_robots, config, player.targets or 0)
+        starts = policies.draw_starts(env, cfg.episode)
         frames: list[np.ndarray] = []
         planner = make_planner(cfg.policy, player, config, env, where)
         trial = run_trial(
@@ -52,7 +52,7 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     curves = {"ir-sim": trial.coverage}
     rows = {"ir-sim": measure(trial.coverage, config.seconds) | {"collisions": int(trial.collided.sum())}}
     if cfg.ours:
-        curve, collided = ours.run_ours(env, player.make(env), cfg.episode)
+        curve, collided = policies.run_ours(env, player.make(env), cfg.episode)
         curves["ours"] = curve
         rows["ours"] = measure(curve, config.seconds) | {"collisions": int(collided.sum())}
     rows["ir-sim"] |= {
@@ -76,7 +76,7 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
 
 def make_config(cfg: IrsimSettings, world: PointCloudMap):
     """The trial of these settings; what is not given is that of the floor's scenario."""
-    from maexp.agents.irsim.config import TOLERANCE, TrialConfig
+    from maexp.agents.deploy.irsim.config import TOLERANCE, TrialConfig
     from maexp.kernels.constants import DT
 
     scenario = find_scenario(world.scenario)

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from maexp.agents.benchmarks.suites.suite import RESULTS
 from maexp.agents.commands.run_folder import check_writable
 from maexp.agents.errors import UserError
 from maexp.agents.files import short
 from maexp.agents.progress import Progress
 from maexp.agents.settings.verbs import LeaderboardSettings
-from maexp.agents.suites.suite import RESULTS
 
 # What needs torch is imported where it is used.
 
@@ -58,18 +58,18 @@ def find_kind(place: Path) -> str:
 
 def run(cfg: LeaderboardSettings, where: None, overrides: list[str]) -> int:
     """Add the rows of all places to `out`, then draw its page."""
-    from maexp.agents.suites import rows, site
+    from maexp.agents.benchmarks import leaderboard
 
     out = Path(cfg.out).expanduser()
     for row in _read_all(cfg):
         row |= {} if cfg.note is None else {"note": " ".join(str(cfg.note).split())}
-        path = out / rows.file_of(row)
-        if path.exists() and (before := rows.read_row(path)) != row:
+        path = out / leaderboard.file_of(row)
+        if path.exists() and (before := leaderboard.read_row(path)) != row:
             _tell_replaced(path, before, row)
-        rows.write_row(out, row)  # at once: what is done stays, should a later place be damaged
-    kept = [rows.read_row(path) for path in rows.find_rows(out)]
-    written = site.write_site(out, kept)
-    suites = len(site.group(kept))
+        leaderboard.write_row(out, row)  # at once: what is done stays, should a later place be damaged
+    kept = [leaderboard.read_row(path) for path in leaderboard.find_rows(out)]
+    written = leaderboard.write_site(out, kept)
+    suites = len(leaderboard.group(kept))
     print(f"{len(kept)} rows on {suites} suite{'s' * (suites != 1)}. Written: {', '.join(map(short, written))}")
     return 0
 
@@ -85,15 +85,15 @@ def _tell_replaced(path: Path, before: dict, row: dict) -> None:
 
 def _read_all(cfg: LeaderboardSettings) -> Iterator[dict]:
     """The rows of all places, one by one."""
-    from maexp.agents.suites import rows
-    from maexp.agents.suites.run_files import read_json
+    from maexp.agents.benchmarks import leaderboard
+    from maexp.agents.benchmarks.suites.run_files import read_json
 
     for place in _places(cfg):
         kind = find_kind(place)
         if kind != "run":
-            yield from map(rows.read_row, [place] if kind == "row" else rows.find_rows(place))
+            yield from map(leaderboard.read_row, [place] if kind == "row" else leaderboard.find_rows(place))
             continue
         count = sum(len(part["decisions"]) for part in read_json(place / RESULTS)["episodes"].values())
         with Progress(f"playing {place} again", count) as progress:
-            row = rows.make_row(place, cfg.suite, cfg.verify, progress.advance)
+            row = leaderboard.make_row(place, cfg.suite, cfg.verify, progress.advance)
         yield row

@@ -14,12 +14,12 @@ from maexp.agents.map_sets import set_names
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import MapsSettings
-from maexp.envs.checker import check_map, repair_map
-from maexp.envs.importing import ImportOptions, ImportReport, draw_import, export_ros_map, import_map_with_report
-from maexp.envs.importing.bags import is_bag
-from maexp.envs.importing.options import make_options
-from maexp.envs.map import PointCloudMap
-from maexp.envs.map_plot import draw_map
+from maexp.envs.io import ImportOptions, ImportReport, draw_import, export_ros_map, import_map_with_report
+from maexp.envs.io.bags import is_bag
+from maexp.envs.io.options import make_options
+from maexp.envs.maps.checker import check_map, repair_map
+from maexp.envs.maps.plot import draw_map
+from maexp.envs.maps.point_cloud import PointCloudMap
 from maexp.envs.scenarios import GENERATED, SCENARIOS, make_map
 
 UNUSABLE = 1

@@ -10,8 +10,7 @@ import yaml
 
 from maexp.agents.commands import maps_folder
 from maexp.agents.errors import UserError
-from maexp.agents.files import short, write_text
-from maexp.agents.locking import lock
+from maexp.agents.files import lock, short, write_text
 from maexp.agents.map_sets import FILES, LICENCES, MAPS, SPLITS, Entry, MapSet, find_cache, load_set
 from maexp.agents.progress import Progress
 
@@ -41,7 +40,7 @@ def run(name: str, out: str | None, mirror: str | None, options: dict[str, Any])
 
 def _fetch(found: MapSet, where: Path, address: str) -> None:
     """Licences first, so that no map is there without its own."""
-    from maexp.envs.importing.download import download
+    from maexp.envs.io.download import download
 
     entries = sorted(found.entries, key=lambda entry: entry.split != LICENCES)
     with Progress(f"fetching {found.name}", sum(entry.bytes for entry in entries)) as progress:
@@ -61,7 +60,7 @@ def _fetch(found: MapSet, where: Path, address: str) -> None:
 @contextmanager
 def _blame_source() -> Iterator[None]:
     """What the source does wrong in a sentence; the disk's errors go on."""
-    from maexp.envs.importing.download import DownloadError
+    from maexp.envs.io.download import DownloadError
 
     try:
         yield

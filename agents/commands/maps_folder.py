@@ -11,12 +11,12 @@ from typing import Any
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import short, write_text
 from maexp.agents.tables import markdown_table
-from maexp.envs.checker import check_map
-from maexp.envs.importing import draw_import, import_map_with_report
-from maexp.envs.importing.bags import BAGS, is_bag
-from maexp.envs.importing.clouds import CLOUDS
-from maexp.envs.importing.formats import GRIDS, POINTS
-from maexp.envs.importing.occupancy import find_image
+from maexp.envs.io import draw_import, import_map_with_report
+from maexp.envs.io.bags import BAGS, is_bag
+from maexp.envs.io.clouds import CLOUDS
+from maexp.envs.io.formats import GRIDS, POINTS
+from maexp.envs.io.occupancy import find_image
+from maexp.envs.maps.checker import check_map
 
 YAMLS = (".yaml", ".yml")
 IMAGES = tuple(suffix for suffix in GRIDS if suffix not in YAMLS)

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from maexp.agents.deploy.planner.bundle import CARD, SHIPPED, find_policy, read_contract, shipped_names
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.runtime.folder import CARD, read_contract
-from maexp.agents.runtime.shipped import SHIPPED, find_policy, shipped_names
 from maexp.agents.settings.verbs import PoliciesSettings
 
 

@@ -6,15 +6,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from maexp.agents.benchmarks.suites.suite import load_suite, suite_names
 from maexp.agents.command_words import as_list
 from maexp.agents.commands.suite import claim_for, play, prepare_again
+from maexp.agents.deploy.planner.drivers import make_driver
+from maexp.agents.deploy.planner.team_driver import DriverSettings, check_name, read_settings
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.runtime.base_driver import make_driver
-from maexp.agents.runtime.driver import DriverSettings, check_name, read_settings
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import Ros2Settings
-from maexp.agents.suites.suite import load_suite, suite_names
 from maexp.envs.config.comm import CommConfig
 
 KEPT = ("place", "seed", "name")
@@ -53,7 +53,7 @@ def check(cfg: Ros2Settings) -> None:
             raise UserError(f"{name}={cfg[name]} is unknown: choose {' or '.join(choices)}.")
     if importlib.util.find_spec("cyclonedds") is None:
         raise UserError('maexp ros2 speaks DDS by cyclonedds: pip install "maexp[ros2]".')
-    from maexp.agents.ros2.dds import read_domain
+    from maexp.agents.deploy.ros2.dds import read_domain
 
     with blame_input():
         read_domain(cfg.domain)
@@ -81,7 +81,7 @@ def _number(name: str, value: Any) -> float:
 
 def run(cfg: Ros2Settings, where: Path | None, overrides: list[str]) -> int:
     """Do the task."""
-    from maexp.agents.ros2.dds import Wire
+    from maexp.agents.deploy.ros2.dds import Wire
 
     with blame_input():
         wire = Wire(cfg.domain)
@@ -89,7 +89,7 @@ def run(cfg: Ros2Settings, where: Path | None, overrides: list[str]) -> int:
 
 
 def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
-    from maexp.agents.ros2.serve import WORD, Ros2Player, Serving
+    from maexp.agents.deploy.ros2.serve import WORD, Ros2Player, Serving
 
     suite = load_suite(cfg.place)
     suite.check()
@@ -104,7 +104,7 @@ def _serve(cfg: Ros2Settings, where: Path, wire: Any) -> int:
 
 
 def _team(cfg: Ros2Settings, wire: Any) -> int:
-    from maexp.agents.ros2.robot import make_team
+    from maexp.agents.deploy.ros2.robot import make_team
 
     course = make_team(make_driver(driver_settings(cfg)), wire, cfg.answer, _tell, cfg.goals).run()
     each = f", {1e3 * course.seconds / course.plans:.1f} ms of processor time each" if course.plans else ""

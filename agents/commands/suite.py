@@ -7,15 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import command, short, write_text
-from maexp.agents.locking import lock
+from maexp.agents.benchmarks.suites.suite import Suite, load_suite, suite_names
+from maexp.agents.errors import STOPPED, UserError, blame_input, ended_by_signals
+from maexp.agents.files import command, lock, short, write_text
 from maexp.agents.progress import Progress
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe
 from maexp.agents.settings.verbs import SuiteSettings
-from maexp.agents.signals import STOPPED, ended_by_signals
-from maexp.agents.suites.suite import Suite, load_suite, suite_names
 
 # What needs torch is imported where it is used: `list` and `show` answer at once.
 
@@ -34,7 +32,7 @@ def prepare_again(overrides: list[str], kept: tuple[str, ...]) -> Recipe:
     place = find_override(overrides, "resume")
     if place is None:
         return Recipe(overrides)
-    from maexp.agents.suites import run_files
+    from maexp.agents.benchmarks.suites import run_files
 
     if changed := [name for name in (*kept, "hydra.run.dir") if find_override(overrides, name) is not None]:
         raise UserError(f"resume={place} keeps what was played and where: leave {changed[0]} out.")
@@ -90,14 +88,14 @@ def _list(cfg: SuiteSettings, where: None) -> int:
 
 
 def _show(cfg: SuiteSettings, where: None) -> int:
-    from maexp.agents.suites import report
+    from maexp.agents.benchmarks.suites import score
 
-    print("\n".join(report.describe_suite(load_suite(cfg.place))))
+    print("\n".join(score.describe_suite(load_suite(cfg.place))))
     return 0
 
 
 def _run(cfg: SuiteSettings, where: Path) -> int:
-    from maexp.agents.suites.players import Player
+    from maexp.agents.benchmarks.suites.play import Player
 
     suite = load_suite(cfg.place)
     suite.check()
@@ -113,13 +111,13 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
     """Play a suite, or what is left of it, and say what came of it.
 
     Args:
-        player: as `maexp.agents.suites.players.Player`.
+        player: as `maexp.agents.benchmarks.suites.play.Player`.
         settings: what a resumed run keeps, with `seed` and `num_envs`.
         words: that go on with it, as "suite run".
     """
+    from maexp.agents.benchmarks.suites import run_files, score
+    from maexp.agents.benchmarks.suites.run import SuiteRun
     from maexp.agents.build import pick_device
-    from maexp.agents.suites import report, run_files
-    from maexp.agents.suites.run import SuiteRun
 
     seed = settings["seed"]
     with blame_input():
@@ -141,17 +139,17 @@ def play(suite: Suite, player: Any, where: Path, settings: dict[str, Any], devic
             again = command(*words.split(), f"resume={short(where)}")
             print(f"maexp: stopped. Go on with: {again}", file=sys.stderr)
             return STOPPED
-        report.print_results(suite, results)
-        for sentence in report.describe_results(suite, results):
+        score.print_results(suite, results)
+        for sentence in score.describe_results(suite, results):
             print(sentence)
-        report.draw_profiles(suite, results, where / "profile.png")
+        score.draw_profiles(suite, results, where / "profile.png")
     print(f"Written to {short(where)}: {run_files.RESULTS}, {run_files.ACTIONS}/, profile.png, {run_files.RUN}")
     print(f"Next: {command('suite', 'verify', short(where))}")
     return 0
 
 
 def _check_same_suite(where: Path, suite: Suite) -> None:
-    from maexp.agents.suites import run_files
+    from maexp.agents.benchmarks.suites import run_files
 
     before = run_files.read_json(where / run_files.RUN)["suite"]
     if before["checksum"] != suite.checksum:
@@ -163,7 +161,7 @@ def _check_same_suite(where: Path, suite: Suite) -> None:
 
 def _verify(cfg: SuiteSettings, where: None) -> int:
     """Print the report as JSON, and what it says in a sentence on stderr; 0: all follows, 1: not."""
-    from maexp.agents.suites.verify import verify
+    from maexp.agents.benchmarks.suites.verify import verify
 
     place = Path(cfg.place).expanduser()
     found = verify(place, cfg.suite)
@@ -181,13 +179,13 @@ def _verify(cfg: SuiteSettings, where: None) -> int:
 
 
 def _freeze(cfg: SuiteSettings, where: None) -> int:
-    from maexp.agents.suites import report, run_files
-    from maexp.agents.suites.frozen import freeze
+    from maexp.agents.benchmarks.suites import run_files, score
+    from maexp.agents.benchmarks.suites.frozen import freeze
 
     suite = load_suite(cfg.place)
     made = run_files.describe_code() | {"machine": run_files.describe_machine(), "date": time.strftime("%Y-%m-%d")}
     with Progress(f"random and {suite.reference} on {suite.name}", 2 * len(suite.parts) * suite.episodes) as progress:
         with blame_input():
             frozen = freeze(suite, made, progress.advance)
-    print("\n".join(report.describe_suite(frozen)))
+    print("\n".join(score.describe_suite(frozen)))
     return 0

@@ -14,18 +14,16 @@ from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents.commands import train
 from maexp.agents.commands.run_folder import claim_folder
-from maexp.agents.errors import UserError
-from maexp.agents.evaluation.once import keeping_episodes
-from maexp.agents.evaluation.sweeps import tell_runs
-from maexp.agents.files import command, short, write_json
-from maexp.agents.locking import lock
+from maexp.agents.errors import STOPPED, UserError
+from maexp.agents.evaluation.comparison import keeping_episodes
+from maexp.agents.evaluation.sweep_table import tell_runs
+from maexp.agents.files import command, lock, short, write_json
 from maexp.agents.settings.checks import check_ranges
 from maexp.agents.settings.compose import compose_config, compose_recipe, explain
 from maexp.agents.settings.overrides import find_override, find_sweeps, quote, set_names, without
 from maexp.agents.settings.resolved import without_hydra
 from maexp.agents.settings.schema import register_schema
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import list_checkpoints
 
 SWEEP, FORMAT = "sweep.json", "maexp-sweep-1"
@@ -103,7 +101,7 @@ def swept_words(folder: Path, names: list[str]) -> dict[Path, list[str]]:
 
 def combine_curves(runs: dict[Path, list[str]], path: Path) -> None:
     """The learning curves of all runs: one line per setting, the seeds averaged."""
-    from maexp.agents.evaluation.learning import draw_curves
+    from maexp.agents.evaluation.learning_curves import draw_curves
 
     settings: dict[str, list[Path]] = {}
     for folder, words in runs.items():

@@ -10,21 +10,19 @@ from pathlib import Path
 from maexp.agents.build import choose_device, make_env, model_settings
 from maexp.agents.commands.evaluate import draw_results, evaluate_all, report
 from maexp.agents.commands.run_folder import check_writable
-from maexp.agents.errors import UserError
+from maexp.agents.errors import STOPPED, UserError
+from maexp.agents.evaluation.cache import FOLDER
 from maexp.agents.evaluation.comparison import find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.evaluation.kept import FOLDER
-from maexp.agents.files import command, short
-from maexp.agents.locking import lock
+from maexp.agents.files import command, lock, short
+from maexp.agents.policies.registry import NamedPolicy, find_players, suit_observation
 from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.signals import STOPPED
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, starts_as, warm_start
 from maexp.agents.training.logs import check_logger, log_results
-from maexp.agents.training.named import NamedPolicy, find_players, suit_observation
 from maexp.agents.training.prepare import check_collector, check_expert, describe_workers
 from maexp.agents.training.train import (
     TrainingRun,
@@ -184,7 +182,7 @@ def start_players(done: TrainingRun) -> list[NamedPolicy]:
 
 def draw_curves(where: Path, rival: str, results: list[EvaluationResult], beside: list[NamedPolicy]) -> None:
     """curves.png from metrics.csv, and from what the players `beside` the trained one did in the end."""
-    from maexp.agents.evaluation.learning import draw_curves as draw
+    from maexp.agents.evaluation.learning_curves import draw_curves as draw
 
     names = [player.name for player in beside]
     ends = {result.policy: (result.times, result.coverage, result.maps) for result in results if result.policy in names}
@@ -199,8 +197,8 @@ def draw_rollout(
 
     All teams of `env` play, as in the evaluation: so whoever draws actions draws the same ones.
     """
-    from maexp.agents.evaluation.films import draw_film, play_teams
-    from maexp.envs.film import write_gif
+    from maexp.agents.evaluation.video import draw_film, play_teams
+    from maexp.envs.render.video import write_gif
 
     known = {result.policy: result for result in results if result.num_robots == env.num_robots}
     number, caption = 0, []

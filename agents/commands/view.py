@@ -9,22 +9,22 @@ from maexp.agents.build import import_file, import_files, load_maps, make_env
 from maexp.agents.commands.evaluate import find_trained
 from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluation.films import EPISODES, play_teams
+from maexp.agents.evaluation.video import EPISODES, play_teams
 from maexp.agents.files import command, short
+from maexp.agents.policies.registry import check_planner, find_player, suit_observation
 from maexp.agents.settings.groups import MOST_TEAMS
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import ViewSettings
 from maexp.agents.training.checkpoint import find_checkpoint, is_run
-from maexp.agents.training.named import check_planner, find_player, suit_observation
 from maexp.envs import PointCloudMap, make_map
-from maexp.envs.importing import ImportOptions
-from maexp.envs.render import percent
+from maexp.envs.io import ImportOptions
+from maexp.envs.render import show
+from maexp.envs.render.episode import Episode
+from maexp.envs.render.frames import percent
+from maexp.envs.render.stage import Stage
 from maexp.envs.scenarios import SCENARIOS
-from maexp.envs.viewing import show
-from maexp.envs.viewing.episode import Episode
-from maexp.envs.viewing.stage import Stage
 
 CUT_SHARE = 0.06  # walls of an episode's picture are cut here, a share of the map's longer side: robots stay in sight
 ENDINGS = (".png", ".html")
@@ -60,7 +60,7 @@ def check(cfg: ViewSettings) -> None:
     if cfg.out is not None:
         check_out(Path(cfg.out))
     if wants_page(cfg):
-        from maexp.envs.viewing.page import import_viser
+        from maexp.envs.render.page import import_viser
 
         with blame_input():
             import_viser()
@@ -258,7 +258,7 @@ def make_stage(cfg: ViewSettings, world: PointCloudMap, has_team: bool) -> Stage
 
 def show_page(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap | None) -> int:
     """The page in the browser until interrupted, or the page as a file."""
-    from maexp.envs.viewing.page import Page, write_page
+    from maexp.envs.render.page import Page, write_page
 
     stages = [make_stage(cfg, episode.map, True) for episode in episodes] or [make_stage(cfg, world, False)]
     if cfg.out is not None:

@@ -11,9 +11,9 @@ import numpy as np
 
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import EvaluationResult
+from maexp.agents.evaluation.metric_format import compared
 from maexp.agents.evaluation.results import FORMAT, result_names
 from maexp.agents.files import short, write_text
-from maexp.agents.measures import compared
 
 EPISODES_FILE, CHANGES_FILE = "episodes.csv", "changes.json"
 KEY = ("policy", "num_robots", "map")  # columns before those of the metrics

@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.evaluation.evidence import Evidence
-from maexp.agents.evaluation.kept import Kept, go_on_with_random_numbers, random_numbers
+from maexp.agents.evaluation.cache import Kept, go_on_with_random_numbers, random_numbers
+from maexp.agents.evaluation.metric_format import Evidence
 from maexp.envs.metrics import episode_metrics, label_copies, resample_weights, summarise
 from maexp.envs.recorder import CoverageRecorder
 

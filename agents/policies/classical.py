@@ -2,8 +2,8 @@
 
 A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
 All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way from
-every robot to every target. They differ in which targets each robot likes best (`envs/choices.py`). That the robots of
-a team go to different ones, and how a target is approached, they share (`envs/targets.py`).
+every robot to every target. They differ in which targets each robot likes best (`envs/targets/heuristics.py`). That the robots of
+a team go to different ones, and how a target is approached, they share (`envs/targets/tracker.py`).
 
 Sources: docs/planners.md. Tuning: docs/log/2026-11-22-planner-constants.md.
 """
@@ -18,10 +18,10 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from maexp.envs import ExplorationEnv
-from maexp.envs.choices import CLASSICAL, rank_by_utility
-from maexp.envs.nav_grid import build_nav_grid, open_cells
-from maexp.envs.regions import to_regions
-from maexp.envs.targets import TargetTracker, TensorScene, keyed_uniform
+from maexp.envs.maps.nav_grid import build_nav_grid, open_cells
+from maexp.envs.targets.heuristics import CLASSICAL, rank_by_utility
+from maexp.envs.targets.region_action import to_regions
+from maexp.envs.targets.tracker import TargetTracker, TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.types import REGIONS
 

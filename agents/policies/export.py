@@ -1,4 +1,4 @@
-"""A trained policy as a folder that `maexp.agents.runtime` plans with, on computers without torch."""
+"""A trained policy as a folder that `maexp.agents.deploy.planner` plans with, on computers without torch."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any
 import torch
 from torch import nn
 
+from maexp.agents.deploy.planner.bundle import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_json, write_text
-from maexp.agents.networks.target_chooser import TargetChooser
-from maexp.agents.runtime.folder import CARD, CONTRACT, FORMAT, NETWORK, WEIGHTS
+from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
-from maexp.envs.features import RADIO_TABLE, TABLE, feature_names
 from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.envs.targets.features import RADIO_TABLE, TABLE, feature_names
 from maexp.kernels.constants import DT
 
 OPSET = 18

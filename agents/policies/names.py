@@ -4,9 +4,9 @@ import os
 import re
 from importlib import metadata
 
+from maexp.agents.deploy.planner.bundle import CONTRACT, advise, shipped_names
 from maexp.agents.errors import UserError
-from maexp.agents.policies.guest import GROUP
-from maexp.agents.runtime.shipped import CONTRACT, advise, shipped_names
+from maexp.agents.policies.remote.worker import GROUP
 from maexp.agents.settings.verbs.evaluate import NAMES
 
 

@@ -1,6 +1,6 @@
 """Rollouts: what comes of a decision in copies of a team that a rollout policy plays on with.
 
-The copies live in a world of what the robots know, or in the true one (`maexp.envs.belief`, `maexp.envs.branches`).
+The copies live in a world of what the robots know, or in the true one (`maexp.envs.imagined.maps`, `maexp.envs.imagined.branches`).
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from collections.abc import Callable
 
 import torch
 
-from maexp.agents.networks.map_predictor import predict
+from maexp.agents.deploy.planner.bundle import shipped_names
+from maexp.agents.models.map_predictor import predict
 from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner, rank_by_utility
-from maexp.agents.policies.load import is_exported
-from maexp.agents.runtime.shipped import shipped_names
+from maexp.agents.policies.pretrained import is_exported
 from maexp.envs import ExplorationEnv, LookaheadConfig
-from maexp.envs.belief import Beliefs, Guess, guess_nearest
-from maexp.envs.branches import Branches
-from maexp.envs.target_view import pick_places
-from maexp.envs.targets import TargetTracker
+from maexp.envs.imagined.branches import Branches
+from maexp.envs.imagined.maps import Beliefs, Guess, guess_nearest
+from maexp.envs.targets.observation import pick_places
+from maexp.envs.targets.tracker import TargetTracker
 
 ROLLOUT_POLICY = "lookahead.rollout_policy"
 BRANCHES = 256  # teams' branches that are played at once, at most

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Literal
 
 from maexp.envs.config.env import Knower
-from maexp.envs.fields import check_settings, replaced, setting
+from maexp.envs.config_fields import check_settings, replaced, setting
 
 
 @dataclass(frozen=True)

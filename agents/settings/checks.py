@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from maexp.agents.errors import UserError
 from maexp.agents.settings.groups import LAST_SEED, CollectorSettings
 from maexp.agents.settings.verbs import SCHEMAS
-from maexp.envs.fields import WHOLE_LIMIT, check_value, kinds, shown
+from maexp.envs.config_fields import WHOLE_LIMIT, check_value, kinds, shown
 
 
 def check_counts(node: DictConfig, *names: str, least: int = 1, prefix: str = "") -> None:

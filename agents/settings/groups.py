@@ -9,8 +9,8 @@ from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.storable import optional_settings, read, storable
 from maexp.envs.config import GROUPS, EnvSettings, supplied
-from maexp.envs.fields import same, setting
-from maexp.envs.importing.options import ImportOptions
+from maexp.envs.config_fields import same, setting
+from maexp.envs.io.options import ImportOptions
 from maexp.envs.scenarios import Scenario
 
 MOST_TEAMS = 64  # in one film or on one page

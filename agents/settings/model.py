@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from maexp.envs.fields import check_settings, setting
+from maexp.envs.config_fields import check_settings, setting
 
 
 @dataclass(frozen=True)

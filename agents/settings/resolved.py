@@ -16,7 +16,7 @@ from maexp.agents.settings.model import ModelConfig
 from maexp.agents.settings.schema import schema
 from maexp.agents.settings.storable import helps, read
 from maexp.envs.config import GROUPS, PlannerConfig, RadarConfig
-from maexp.envs.importing.options import ImportOptions
+from maexp.envs.io.options import ImportOptions
 from maexp.envs.scenarios import Scenario, find_scenario
 
 PLANNER_LACKS = {

@@ -1,6 +1,6 @@
 """Dataclasses of settings as Hydra checks them: a misspelt name or a word in a number's place is refused.
 
-A setting is declared once, as a field of a dataclass (`maexp.envs.fields`). Where settings belong to a class of the
+A setting is declared once, as a field of a dataclass (`maexp.envs.config_fields`). Where settings belong to a class of the
 layers below (`RobotConfig`, `ModelConfig`, ...), their names, types and help are read from that class.
 """
 
@@ -12,7 +12,7 @@ from typing import Any, Literal, get_origin
 from omegaconf import MISSING, DictConfig
 
 from maexp.agents.settings.algorithms import find_tunings
-from maexp.envs.fields import explain, kinds
+from maexp.envs.config_fields import explain, kinds
 
 PRIMITIVES = (int, float, bool, str)  # in the order of the unions below
 

@@ -15,8 +15,7 @@ from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.errors import UserError, advise_on_disk
 from maexp.agents.files import command, short, write_file
-from maexp.agents.networks.actor import make_policy
-from maexp.agents.networks.weights import load_matching
+from maexp.agents.models.actor import load_matching, make_policy
 from maexp.agents.settings.groups import LearnerSettings
 from maexp.agents.settings.model import SIZES, ModelConfig
 from maexp.agents.settings.resolved import flatten

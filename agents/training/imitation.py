@@ -19,14 +19,13 @@ from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.build import Learner, choose_device, make_env
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
-from maexp.agents.networks.actor import ALIVE
-from maexp.agents.networks.distributions import ACTION
-from maexp.agents.networks.weights import load_matching
+from maexp.agents.models.actor import ALIVE, load_matching
+from maexp.agents.models.distributions import ACTION
+from maexp.agents.policies.registry import NamedPolicy, check_planner, find_player, suit_observation
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.training.collect import batch_statistics, divide_teams
-from maexp.agents.training.named import NamedPolicy, check_planner, find_player, suit_observation
+from maexp.agents.training.collectors import batch_statistics, divide_teams
 from maexp.agents.training.train import TrainingRun
 
 LEARNING_RATE = 2e-3

@@ -8,9 +8,9 @@ from typing import overload
 
 from torchrl.modules import ProbabilisticActor
 
-from maexp.agents.networks import actor
+from maexp.agents.models import actor
+from maexp.agents.policies.registry import find_player
 from maexp.agents.settings.model import ModelConfig
-from maexp.agents.training.named import find_player
 from maexp.envs import ExplorationEnv
 
 
@@ -30,7 +30,7 @@ def make_policy(what=None, /, env=None, model=None):
     tensordicts of `env`, which must show what it looks at (``env.observation_config``).
 
     `make_policy(env, model="small")`: new networks of that size for the specs of `env`
-    (`maexp.agents.networks.actor.make_policy`).
+    (`maexp.agents.models.actor.make_policy`).
 
     Raises:
         UserError: no policy of that name, a damaged one, or one that does not fit the env.

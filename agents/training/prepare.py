@@ -18,7 +18,7 @@ from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.resolved import algorithm_settings, model_settings
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.training.collect import Experience, divide_teams, make_collector
+from maexp.agents.training.collectors import Experience, divide_teams, make_collector
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 BACKENDS = ("single", "processes", "ray")
@@ -78,7 +78,7 @@ def make_actor(cfg: TrainSettings, policy: TensorDictModuleBase, env: Exploratio
     settings = algorithm_settings(cfg)
     if not isinstance(settings, ExpertSettings):
         return policy
-    from maexp.agents.training.branching import BranchingActor  # builds on the planners
+    from maexp.agents.training.branch_rollouts import BranchingActor  # builds on the planners
 
     return BranchingActor(policy, env, settings)
 

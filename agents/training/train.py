@@ -15,10 +15,9 @@ from maexp.agents.build import (
     MapSuite,
     load_maps,
 )
-from maexp.agents.checksums import changed_maps, checksums
-from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import command, short, write_text
-from maexp.agents.networks.weights import load_matching
+from maexp.agents.errors import UserError, blame_input, stop_on_signals
+from maexp.agents.files import changed_maps, checksums, command, short, write_text
+from maexp.agents.models.actor import load_matching
 from maexp.agents.progress import Progress
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.compose import compose_config
@@ -28,7 +27,6 @@ from maexp.agents.settings.overrides import without
 from maexp.agents.settings.resolved import model_settings, resolve, to_yaml
 from maexp.agents.settings.runs import PLAYED
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.signals import stop_on_signals
 from maexp.agents.tables import brackets
 from maexp.agents.training.checkpoint import (
     check_action,
@@ -38,7 +36,7 @@ from maexp.agents.training.checkpoint import (
     seed_everything,
     set_random_state,
 )
-from maexp.agents.training.collect import Experience, WorkerLost, batch_statistics
+from maexp.agents.training.collectors import Experience, WorkerLost, batch_statistics
 from maexp.agents.training.logs import MetricsLog
 from maexp.agents.training.prepare import describe_teams, describe_workers, make_both
 from maexp.agents.training.validation import COLUMNS, ENDS, Validation, judged

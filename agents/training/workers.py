@@ -26,7 +26,7 @@ from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
 from maexp.agents.settings.groups import CollectorSettings
 from maexp.agents.settings.verbs import TrainSettings
-from maexp.agents.training.collect import Experience, TeamCollector, Teams, WorkerLost
+from maexp.agents.training.collectors import Experience, TeamCollector, Teams, WorkerLost
 from maexp.envs import PointCloudMap
 
 if TYPE_CHECKING:  # needs Ray

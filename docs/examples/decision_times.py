@@ -16,11 +16,10 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maexp.agents.policies.foreign import as_policy
-from maexp.agents.runtime.agent import TeamAgent
-from maexp.agents.suites.play import build_env, build_maps, play_batch
-from maexp.agents.suites.players import Player
-from maexp.agents.suites.suite import load_suite
+from maexp.agents.benchmarks.suites.play import Player, build_env, build_maps, play_batch
+from maexp.agents.benchmarks.suites.suite import load_suite
+from maexp.agents.deploy.planner.arena_policy import TeamAgent
+from maexp.agents.policies.remote.numpy_policy import as_policy
 from maexp.envs import ObservationConfig
 
 SUITE, PART, EPISODES = "minival", "outdoor", 3
@@ -91,7 +90,7 @@ def at_a_socket(name, suite):
     """The same behind TCP; its process belongs to the one that listens."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         address = f"127.0.0.1:{listener.getsockname()[1]}"
-    command = [sys.executable, "-m", "maexp.agents.policies.connection", address, f"process:{name}"]
+    command = [sys.executable, "-m", "maexp.agents.policies.remote.server", address, f"process:{name}"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         server.stdout.readline()  # it listens
@@ -105,8 +104,8 @@ def at_a_socket(name, suite):
 @contextmanager
 def over_dds(name, suite):
     """The same as `maexp ros2 team`."""
-    from maexp.agents.ros2.dds import Wire
-    from maexp.agents.ros2.serve import Ros2Player, Serving
+    from maexp.agents.deploy.ros2.dds import Wire
+    from maexp.agents.deploy.ros2.serve import Ros2Player, Serving
 
     names = [f"robot{k + 1}" for k in range(suite.parts[PART].num_robots)]
     words = ["ros2", "team", f"policy={name}", f"robots={','.join(names)}", "answer=300"]

@@ -3,18 +3,17 @@
 Imports neither torch nor Warp.
 """
 
-from .comm import CELL_BYTES, CELLS_OF_RADAR, STRATEGIES, CommConfig
-from .env import DONE, GROUPS, STARTS, EnvSettings
-from .faults import FaultsConfig
-from .group import Group, supplied
-from .lookahead import LookaheadConfig
-from .observation import ObservationConfig
-from .odometry import OdometryConfig
-from .planner import CLEARANCE, PLANNERS, PlannerConfig
-from .radar import RadarConfig
-from .reward import TIME_ON, RewardConfig
-from .robot import BODY, ROBOT_KINDS, RobotConfig
-from .targets import TargetsConfig
+from maexp.envs.config.comm import CELL_BYTES, CELLS_OF_RADAR, STRATEGIES, CommConfig
+from maexp.envs.config.conditions import FaultsConfig, OdometryConfig
+from maexp.envs.config.env import DONE, GROUPS, STARTS, EnvSettings
+from maexp.envs.config.group import Group, supplied
+from maexp.envs.config.lookahead import LookaheadConfig
+from maexp.envs.config.observation import ObservationConfig
+from maexp.envs.config.planner import CLEARANCE, PLANNERS, PlannerConfig
+from maexp.envs.config.radar import RadarConfig
+from maexp.envs.config.reward import TIME_ON, RewardConfig
+from maexp.envs.config.robot import BODY, ROBOT_KINDS, RobotConfig
+from maexp.envs.config.targets import TargetsConfig
 
 __all__ = [
     "BODY",

@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from maexp.envs.fields import is_finite, plain_numbers, setting, shown, words_of
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import is_finite, plain_numbers, setting, shown, words_of
 from maexp.kernels.constants import DT, LOSS
-
-from .group import Group
 
 CELL_BYTES = 4  # of a message that tell of a cell: its number and what it is
 LONGEST_DELAY = 25.0  # of a message [s]
@@ -19,8 +18,8 @@ class CommConfig(Group):
     """Who hears whom (docs/conditions.md).
 
     Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
-    (`maexp.kernels.radio`). Messages may take room and time (`maexp.kernels.messages`). ``strategy`` is what robots do
-    to tell others what they know, whatever their policy (`maexp.envs.strategy`): nothing but to talk when they meet
+    (`maexp.kernels.radio`). Messages may take room and time (`maexp.kernels.bandwidth`). ``strategy`` is what robots do
+    to tell others what they know, whatever their policy (`maexp.envs.comm.strategy`): nothing but to talk when they meet
     (``opportunistic``), or to report or meet after ``period`` decisions. A base station is a radio with a map of its
     own.
     """

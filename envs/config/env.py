@@ -4,23 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from maexp.envs.fields import setting, words_of
+from maexp.envs.config.comm import CommConfig
+from maexp.envs.config.conditions import FaultsConfig, OdometryConfig
+from maexp.envs.config.group import Group
+from maexp.envs.config.lookahead import LookaheadConfig
+from maexp.envs.config.observation import ObservationConfig
+from maexp.envs.config.planner import PlannerConfig
+from maexp.envs.config.radar import RadarConfig
+from maexp.envs.config.reward import RewardConfig
+from maexp.envs.config.robot import RobotConfig
+from maexp.envs.config.targets import TargetsConfig
+from maexp.envs.config_fields import setting, words_of
 from maexp.envs.scenarios import Scenario, default_macro_steps
 
-from .comm import CommConfig
-from .faults import FaultsConfig
-from .group import Group
-from .lookahead import LookaheadConfig
-from .observation import ObservationConfig
-from .odometry import OdometryConfig
-from .planner import PlannerConfig
-from .radar import RadarConfig
-from .reward import RewardConfig
-from .robot import RobotConfig
-from .targets import TargetsConfig
-
 if TYPE_CHECKING:
-    from maexp.envs.map import PointCloudMap
+    from maexp.envs.maps.point_cloud import PointCloudMap
 
 Knower = Literal["union", "base", "everyone"]
 """Whose knowledge counts: what the team has seen together, what the base station knows, or what every robot knows that

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
-from maexp.envs.fields import check_settings
+from maexp.envs.config_fields import check_settings
 from maexp.envs.scenarios import SCENARIOS, Scenario
 
 

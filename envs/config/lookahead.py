@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from maexp.envs.fields import setting
-
-from .group import Group
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import setting
 
 MOST_CANDIDATES = 64
 MOST_HORIZON = 100

@@ -3,16 +3,15 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from maexp.envs.fields import setting
-
-from .group import Group
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import setting
 
 MOST_TARGETS = 256  # that a robot is shown
 
 
 @dataclass(frozen=True)
 class ObservationConfig(Group):
-    """What a robot sees; its frontier targets are those of `maexp.envs.target_view`."""
+    """What a robot sees; its frontier targets are those of `maexp.envs.targets.observation`."""
 
     group = "observation"
 

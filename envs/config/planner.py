@@ -3,10 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from maexp.envs.fields import setting
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import setting
 from maexp.envs.scenarios import Scenario
-
-from .group import Group
 
 PLANNERS = {
     "dwa": "dynamic window: straight to the goal, around what is near (paper)",

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from maexp.envs.fields import setting
-
-from .group import Group
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import setting
 
 MOST_MISSED = 0.99  # of a radar's returns
 MOST_FALSE = 0.4  # of a free point's returns: walls that are none must be found out

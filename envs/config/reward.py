@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from maexp.envs.fields import setting, words_of
-
-from .group import Group
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import setting, words_of
 
 
 @dataclass(frozen=True)

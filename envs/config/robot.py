@@ -4,10 +4,9 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-from maexp.envs.fields import check_value, kinds, setting, words_of
+from maexp.envs.config.group import Group
+from maexp.envs.config_fields import check_value, kinds, setting, words_of
 from maexp.envs.scenarios import Scenario
-
-from .group import Group
 
 RobotKind = Literal["ackermann", "differential", "omnidirectional"]
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from maexp.envs.map import PointCloudMap
-
-from .furniture import CELL, CLEARANCE, Furnisher, Room, cells
-from .lattice import grid_points, largest_component, make_generator
+from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.scenarios.furniture import CELL, CLEARANCE, Furnisher, Room, cells
+from maexp.envs.scenarios.lattice import grid_points, largest_component, make_generator
 
 OUTER_WALL = 3  # cells
 INNER_WALL = 1

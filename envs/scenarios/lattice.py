@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 from scipy import ndimage
 
-from maexp.envs.map import PointCloudMap
+from maexp.envs.maps.point_cloud import PointCloudMap
 
 
 def make_generator(scenario: str, index: int) -> np.random.Generator:

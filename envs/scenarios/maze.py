@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from maexp.envs.map import PointCloudMap
-
-from .lattice import grid_map, make_generator
+from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.scenarios.lattice import grid_map, make_generator
 
 
 def spanning_tree(cells: int, rng: np.random.Generator) -> list[tuple[tuple[int, int], tuple[int, int]]]:

@@ -7,9 +7,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from maexp.envs.map import PointCloudMap
-
-from .lattice import grid_points, largest_component, make_generator, wall_points
+from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.scenarios.lattice import grid_points, largest_component, make_generator, wall_points
 
 SIZE = 288.0  # [m]
 RESOLUTIONS = (1.5, 1.6, 1.8, 2.0)  # [m]; each divides the tile

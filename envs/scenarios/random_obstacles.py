@@ -3,9 +3,8 @@
 import numpy as np
 from scipy import ndimage
 
-from maexp.envs.map import PointCloudMap
-
-from .lattice import grid_map, grid_points, largest_component, make_generator
+from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.scenarios.lattice import grid_map, grid_points, largest_component, make_generator
 
 # All lengths below are in lattice points (1 m). A robot keeps 2.25 m away from what it can, so a passage of
 # four free points (2.5 m on either side of its middle line) is the narrowest one made.

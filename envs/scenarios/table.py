@@ -7,14 +7,13 @@ from functools import partial
 from numbers import Integral
 from typing import Any
 
-from maexp.envs.fields import setting
-from maexp.envs.map import PointCloudMap
+from maexp.envs.config_fields import setting
+from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.scenarios.indoor import build_indoor
+from maexp.envs.scenarios.maze import build_maze
+from maexp.envs.scenarios.outdoor import build_outdoor
+from maexp.envs.scenarios.random_obstacles import build_adaptive, build_random_obstacles
 from maexp.kernels.constants import DT
-
-from .indoor import build_indoor
-from .maze import build_maze
-from .outdoor import build_outdoor
-from .random_obstacles import build_adaptive, build_random_obstacles
 
 LEAST_MACRO_STEPS = 10
 SWEEPS = 2.0

@@ -15,10 +15,11 @@ import torch
 
 from maexp.agents.evaluation.evaluate import evaluate, play
 from maexp.agents.policies.classical import POLICIES, FrontierPlanner, as_module
-from maexp.agents.policies.trained_rank import TrainedRank
-from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, choices, make_map
-from maexp.envs.features import FEATURES
+from maexp.agents.policies.lookahead import TrainedRank
+from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.scenarios import GENERATED
+from maexp.envs.targets import heuristics
+from maexp.envs.targets.features import FEATURES
 
 FIRST, MAPS, TEAMS = 2000, 48, 96  # no table reports maps from there on
 TERMS = {
@@ -93,11 +94,11 @@ def tell(scenario: str, episodes: int, changes: list[str]) -> None:
     env = make_env(scenario, min(episodes, TEAMS), FIRST + MAPS)
     base = evaluate(POLICIES["cost_utility"](env), env, episodes)
     for change in ["", *changes]:
-        name, value = change.split("=") if change else ("WAY", choices.WAY)
-        kept = getattr(choices, name)
-        setattr(choices, name, float(value))
+        name, value = change.split("=") if change else ("WAY", heuristics.WAY)
+        kept = getattr(heuristics, name)
+        setattr(heuristics, name, float(value))
         apart = evaluate(POLICIES["multi_criteria"](env), env, episodes).minus(base)
-        setattr(choices, name, kept)
+        setattr(heuristics, name, kept)
         points = 100.0 * np.array([apart["coverage_auc"]["mean"], *apart["coverage_auc"]["ci95"]])
         lost = apart["collisions"]["mean"]
         print(

@@ -2,19 +2,19 @@
 
 `python tests/tools/distinct_irsim.py FLOOR.yaml cost_utility 3 240` plays three starts of three robots, at most 240 s
 each. Before is without distinct targets. Needless duplicates are counted as in
-`python -m maexp.agents.runtime simulate`.
+`python -m maexp.agents.deploy.planner simulate`.
 """
 
 import sys
 
 import numpy as np
 
-from maexp.agents.irsim.config import TrialConfig
-from maexp.agents.irsim.trial import Trial, run_trial
-from maexp.agents.runtime import TeamPlanner
-from maexp.agents.runtime.simulate import MARKS, count_close
+from maexp.agents.deploy.irsim.config import TrialConfig
+from maexp.agents.deploy.irsim.trial import Trial, run_trial
+from maexp.agents.deploy.planner import TeamPlanner
+from maexp.agents.deploy.planner.simulate import MARKS, count_close
 from maexp.envs import ExplorationEnv, RobotConfig
-from maexp.envs.importing import import_map
+from maexp.envs.io import import_map
 
 ROBOTS, RADIUS, REACH, SPEED, DT = 3, 0.2, 4.0, 0.6, 0.1
 

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
-from maexp.envs.map import PointCloudMap
+from maexp.envs.maps.point_cloud import PointCloudMap
 from maexp.envs.scenarios import SCENARIOS, make_map
 
 PANEL = 420  # pixels a side

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 
 from maexp.agents.cli import main
 from maexp.agents.policies import rollouts
-from maexp.envs.belief import FULL, Beliefs
+from maexp.envs.imagined.maps import FULL, Beliefs
 from maexp.kernels.constants import FREE, OBSTACLE
 
 

@@ -8,7 +8,7 @@ from scipy import ndimage
 from skimage.measure import euler_number
 from skimage.morphology import remove_small_holes, skeletonize
 
-from maexp.envs.map import PointCloudMap
+from maexp.envs.maps.point_cloud import PointCloudMap
 from maexp.envs.scenarios import SCENARIOS, find_scenario, make_map
 
 EIGHT = np.ones((3, 3), dtype=int)
@@ -146,7 +146,7 @@ def main() -> None:
         if scenario.build is not None:
             print(table_row(f"`{name}`", [measure_map(make_map(name, k)) for k in range(MAPS)]), flush=True)
     for path in sys.argv[1:]:
-        from maexp.envs.importing import import_map  # needs the table of scenarios itself
+        from maexp.envs.io import import_map  # needs the table of scenarios itself
 
         world = import_map(path)
         print(table_row(world.name, [measure_map(world)]), flush=True)

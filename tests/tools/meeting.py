@@ -10,11 +10,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.evaluation.figures import COLOURS, panels
+from maexp.agents.evaluation.plots import COLOURS, panels
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, PointCloudMap, make_map
-from maexp.envs.film import write_gif
-from maexp.envs.whole_file import whole_file
+from maexp.envs.atomic_write import whole_file
+from maexp.envs.render.video import write_gif
 from maexp.kernels import unpack_flags
 
 SCENARIO, MAPS, EPISODE = "indoor_medium", range(26, 38), 6

@@ -7,11 +7,11 @@ import torch
 from matplotlib.colors import ListedColormap
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.evaluation.figures import COLOURS, panels
+from maexp.agents.evaluation.plots import COLOURS, panels
 from maexp.agents.policies import POLICIES
 from maexp.envs import CommConfig, ExplorationEnv, OdometryConfig, make_map
-from maexp.envs.navigation import Navigation
-from maexp.envs.whole_file import whole_file
+from maexp.envs.atomic_write import whole_file
+from maexp.envs.targets.navigation import Navigation
 
 SCENARIO, INDEX, DECISIONS = "random_obstacles", 30, 25
 SHADES = ListedColormap(["#C8C8C8", "white", "black"])  # unknown, free, wall

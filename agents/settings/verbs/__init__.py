@@ -4,18 +4,18 @@ Hydra hands on a `DictConfig` of these types. A function that reads settings by 
 one sees what there is; one that looks settings up by name, or takes any verb's, says `DictConfig`.
 """
 
-from .bench import BenchSettings
-from .benchmark import BenchmarkSettings
-from .evaluate import EvaluateSettings
-from .export import ExportSettings
-from .irsim import IrsimSettings
-from .leaderboard import LeaderboardSettings
-from .maps import MapsSettings
-from .policies import PoliciesSettings
-from .ros2 import Ros2Settings
-from .suite import SuiteSettings
-from .train import TrainSettings
-from .view import ViewSettings
+from maexp.agents.settings.verbs.bench import BenchSettings
+from maexp.agents.settings.verbs.benchmark import BenchmarkSettings
+from maexp.agents.settings.verbs.evaluate import EvaluateSettings
+from maexp.agents.settings.verbs.export import ExportSettings
+from maexp.agents.settings.verbs.irsim import IrsimSettings
+from maexp.agents.settings.verbs.leaderboard import LeaderboardSettings
+from maexp.agents.settings.verbs.maps import MapsSettings
+from maexp.agents.settings.verbs.policies import PoliciesSettings
+from maexp.agents.settings.verbs.ros2 import Ros2Settings
+from maexp.agents.settings.verbs.suite import SuiteSettings
+from maexp.agents.settings.verbs.train import TrainSettings
+from maexp.agents.settings.verbs.view import ViewSettings
 
 SCHEMAS = {
     "train": TrainSettings,

@@ -6,8 +6,8 @@ from typing import Any
 from omegaconf import MISSING
 
 from maexp.agents.settings.groups import CollectorSettings, LearnerSettings
-from maexp.envs.choices import CLASSICAL
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
+from maexp.envs.targets.heuristics import CLASSICAL
 
 
 @dataclass

@@ -5,9 +5,9 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from maexp.agents.runtime.choices import CHOICES
+from maexp.agents.deploy.planner.scene import CHOICES
 from maexp.agents.settings.groups import MOST_TEAMS, LearnerSettings
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 NAMES = (*CHOICES, "lookahead", "oracle", "clairvoyant")
 """Of the policies that come with the package and are not trained."""

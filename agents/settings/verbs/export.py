@@ -6,7 +6,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from maexp.agents.settings.groups import LearnerSettings
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 
 @dataclass

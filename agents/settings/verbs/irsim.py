@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from maexp.agents.settings.groups import LAST_SEED, ImportSettings, import_settings
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 
 @dataclass

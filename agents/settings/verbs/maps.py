@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from omegaconf import MISSING
 
 from maexp.agents.settings.groups import ImportSettings, import_settings
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 
 @dataclass

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from omegaconf import MISSING
 
-from maexp.envs.fields import setting
+from maexp.envs.config_fields import setting
 
 
 @dataclass

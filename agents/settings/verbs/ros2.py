@@ -5,11 +5,11 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from maexp.agents.runtime.driver import DriverSettings
+from maexp.agents.deploy.planner.team_driver import DriverSettings
 from maexp.agents.settings.groups import LAST_SEED
 from maexp.agents.settings.storable import storable
 from maexp.envs.config.comm import CommConfig
-from maexp.envs.fields import explain, setting
+from maexp.envs.config_fields import explain, setting
 
 CommSettings = storable(CommConfig)
 

@@ -14,7 +14,7 @@ from ariadne import FEATURES, HEADS, LAYERS, SEES, WIDTH, Ariadne, edges_of
 from torch import nn
 
 from maexp.agents import make_env, make_policy
-from maexp.agents.policies.foreign import TeamSight
+from maexp.agents.policies.remote.numpy_policy import TeamSight
 
 SCENARIOS = ("maze_small", "random_obstacles", "indoor_small", "outdoor")  # their training maps
 EXPERT, TEAMS = "cost_utility", 8

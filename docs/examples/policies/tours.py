@@ -7,9 +7,9 @@ helps. `Tours` makes the longest tour short, `GainTours` wants to see much soon.
 
 import numpy as np
 
-from maexp.agents.runtime.agent import TeamAgent
-from maexp.agents.runtime.choices import CHOICES
-from maexp.agents.runtime.ways import flood
+from maexp.agents.deploy.planner.arena_policy import TeamAgent
+from maexp.agents.deploy.planner.grid_search import flood
+from maexp.agents.deploy.planner.scene import CHOICES
 from maexp.kernels.constants import STRAIGHT, UNREACHED
 
 MOST = 40  # targets on tours, those with the most to see; planning takes about 20 ms then

@@ -22,18 +22,17 @@ from maexp.agents.errors import UserError
 from maexp.agents.files import write_file
 from maexp.agents.policies.classical import FrontierPlanner, as_module, rank_by_utility
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, make_map
-from maexp.envs.fields import check_settings, setting
-from maexp.envs.importing.finish import crop_grid, finish_map
-from maexp.envs.importing.import_report import ImportReport
-from maexp.envs.importing.occupancy import read_occupancy
-from maexp.envs.importing.options import ImportOptions
-from maexp.envs.importing.sources import GridSource
-from maexp.envs.nav_grid import build_nav_grid, open_cells
+from maexp.envs.config_fields import check_settings, setting
+from maexp.envs.io.occupancy import read_occupancy
+from maexp.envs.io.options import ImportOptions
+from maexp.envs.io.postprocess import crop_grid, finish_map
+from maexp.envs.io.report import ImportReport
+from maexp.envs.io.sources import GridSource
+from maexp.envs.maps.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import GENERATED, cut_last_fifth, default_macro_steps, find_scenario, split
-from maexp.envs.targets import TensorScene, keyed_uniform
+from maexp.envs.targets.tracker import TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-
-from .command import run
+from maexp.tests.tools.predictor.command import run
 
 NEVER = 255  # a cell that does not get known
 LONGER = 2.0  # episodes go on for so many times the scenario's decisions: late beliefs count too

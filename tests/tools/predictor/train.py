@@ -20,12 +20,11 @@ from torch.nn import functional as F
 
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
-from maexp.agents.networks.map_predictor import MapPredictor
-from maexp.envs.fields import check_settings, setting
+from maexp.agents.models.map_predictor import MapPredictor
+from maexp.envs.config_fields import check_settings, setting
 from maexp.kernels.constants import FREE, UNKNOWN
-
-from .beliefs import BeliefEpisode, load_groups
-from .command import run
+from maexp.tests.tools.predictor.beliefs import BeliefEpisode, load_groups
+from maexp.tests.tools.predictor.command import run
 
 BAND = 2.0  # radar ranges from known free ground within which cells count
 EDGE = 8  # cells at the edge of a crop that do not count: what is known beyond is cut off

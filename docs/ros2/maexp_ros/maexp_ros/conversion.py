@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from maexp.agents.runtime.frames import fill_pose
+from maexp.agents.deploy.planner.frames import fill_pose
 
 COLOURS = ((0.84, 0.37, 0.0), (0.42, 0.12, 0.59), (0.84, 0.2, 0.51), (0.0, 0.24, 0.55), (0.0, 0.35, 0.24))
 SPHERE, LINE_STRIP, SPHERE_LIST = 2, 4, 7  # of visualization_msgs/Marker

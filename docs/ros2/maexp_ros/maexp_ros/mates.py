@@ -1,4 +1,4 @@
-"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.runtime."""
+"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.deploy.planner."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import String
 
-from maexp.agents.runtime.frames import fill_grid
-from maexp.agents.runtime.radio_driver import RadioDriver, map_topic
-from maexp.agents.runtime.words import write_word
+from maexp.agents.deploy.planner.drivers import RadioDriver, map_topic
+from maexp.agents.deploy.planner.frames import fill_grid
+from maexp.agents.deploy.planner.messages import write_word
 
 
 class Mates:

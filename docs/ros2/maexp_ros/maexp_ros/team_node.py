@@ -1,4 +1,4 @@
-"""The node: maps and frames in, goals for nav2 out. All thinking is in maexp.agents.runtime."""
+"""The node: maps and frames in, goals for nav2 out. All thinking is in maexp.agents.deploy.planner."""
 
 from __future__ import annotations
 
@@ -15,15 +15,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from maexp.agents.runtime.base_driver import make_driver
-from maexp.agents.runtime.contacts import USED
-from maexp.agents.runtime.driver import DriverSettings, Order, read_settings
-from maexp.agents.runtime.frames import fill_pose
-from maexp.agents.runtime.radio_driver import RadioDriver
+from maexp.agents.deploy.planner.drivers import RadioDriver, make_driver
+from maexp.agents.deploy.planner.frames import fill_pose
+from maexp.agents.deploy.planner.radio_features import USED
+from maexp.agents.deploy.planner.team_driver import DriverSettings, Order, read_settings
+from maexp.docs.ros2.maexp_ros.maexp_ros import conversion
+from maexp.docs.ros2.maexp_ros.maexp_ros.mates import Mates
 from maexp.envs.config.comm import CommConfig
-
-from . import conversion
-from .mates import Mates
 
 OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
 COMM = asdict(CommConfig()) | {"cell": 0.0, "base_station": [0.0]}

@@ -1,0 +1,258 @@
+"""Any policy by the word that names it, with one meaning wherever a policy is named.
+
+A classical name, a policy that ships, a folder of `maexp export`, a run of `maexp train` or one of its checkpoints,
+module:function, or a plug-in by the name of its entry point: in this order, where a word could be several.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from maexp.agents.errors import UserError
+from maexp.agents.evaluation.comparison import STARTS
+from maexp.agents.files import warn_of_changed_maps
+from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
+from maexp.agents.policies.names import describe_unknown, plug_ins
+from maexp.agents.policies.pretrained import is_exported, load_policy_folder, open_policy, read_model
+from maexp.agents.policies.remote.user_policy import find_own, is_foreign, is_reference, make_own, source_of
+from maexp.agents.settings.checks import check_distinct
+from maexp.agents.settings.groups import CommonSettings
+from maexp.agents.settings.model import ModelConfig
+from maexp.agents.settings.resolved import flatten
+from maexp.agents.training.checkpoint import (
+    BEST,
+    NAME,
+    find_checkpoint,
+    is_run,
+    looks_at_radios,
+    model_of,
+    restore_policy,
+)
+from maexp.envs import ExplorationEnv, PointCloudMap
+
+Kind = Literal["classical", "exported", "checkpoint", "start", "own"]
+TAKEN = ("run", "difference", "headroom_share", "trained", *STARTS, "best_classical")
+"""What results call something else."""
+
+
+@dataclass(frozen=True)
+class NamedPolicy:
+    """A policy that can be played in any env that shows what it looks at.
+
+    Attributes:
+        name: in tables and file names.
+        build: env -> policy on tensordicts.
+        kind: what its word named.
+        targets: frontier targets that it is shown; None: it takes what there is.
+        radio: it looks at what these tell of radios.
+        pictures: whether it looks, or may look, at pictures; `map` is what these show, None: as set.
+        direct: whether it gives controls (planner=direct) and no goals; None: not known.
+        source: text that changes with the policy itself, "" for what comes with the package.
+        saved: the checkpoint that it comes from.
+        model: sizes of its network, of a trained one.
+        found: what one's own word stands for.
+    """
+
+    name: str
+    build: Callable[[ExplorationEnv], Callable]
+    kind: Kind
+    targets: int | None = None
+    radio: bool = False
+    pictures: bool = False
+    map: str | None = None
+    direct: bool | None = False
+    source: str = ""
+    saved: dict[str, Any] | None = field(default=None, repr=False)
+    found: Callable | None = None
+    model: ModelConfig | None = None
+
+    @property
+    def learned(self) -> bool:
+        """Whether it competes with the classical planners, which differences are told to."""
+        if self.kind == "start":
+            return False
+        return self.kind != "classical" or self.name not in (*CLASSICAL, *REFERENCES)
+
+    def make(self, env: ExplorationEnv) -> Callable:
+        """The policy for an env.
+
+        Raises:
+            UserError: the env does not show what it looks at, takes another action, or making it fails.
+            ValueError: as UserError.
+        """
+        shown = env.observation_config
+        if self.targets not in (None, shown.targets):
+            raise UserError(
+                f"policy {self.name} looks at {self.targets} targets, and the env shows {shown.targets}: "
+                f"make it with observation=ObservationConfig(targets={self.targets}), as a word "
+                f"observation.targets={self.targets}."
+            )
+        if self.radio and not shown.radio:
+            raise UserError(
+                f"policy {self.name} was trained with observation.radio=true, and the env shows nothing of radios: "
+                "add observation.radio=true."
+            )
+        check_planner(env.planner_config.name, [self])
+        return self.build(env)
+
+    def check_maps(self, maps: list[PointCloudMap]) -> None:
+        """Say which maps of its training have changed since."""
+        if self.saved is not None:
+            warn_of_changed_maps(self.saved, maps)
+
+
+def find_player(word: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
+    """The policy that a word names.
+
+    Args:
+        setting: what messages call the word.
+        name: in tables; None: from the word.
+
+    Raises:
+        UserError: there is none, or it is damaged.
+    """
+    name = name or short_name(word)
+    if word in POLICIES:
+        return NamedPolicy(name, POLICIES[word], "classical")
+    if not is_exported(word) and word in plug_ins():
+        return _own(word, setting, name)
+    if not is_exported(word) and is_run(Path(word)):
+        return _from_checkpoint(word, name)
+    if is_reference(word) and not os.path.exists(word):
+        return _own(word, setting, name)
+    if not is_exported(word):
+        raise UserError(describe_unknown(word, setting))
+    _, contract = open_policy(word, setting)
+    return NamedPolicy(
+        name,
+        lambda env: load_policy_folder(word, env, setting),
+        "exported",
+        targets=contract.candidates,
+        radio=contract.radio,
+        source=str(contract.content["sha256"]),
+        model=read_model(word, setting),
+    )
+
+
+def _from_checkpoint(word: str, name: str) -> NamedPolicy:
+    path, saved = find_checkpoint(word)
+    settings, model = flatten(saved["settings"]), model_of(saved)
+    regions, direct = model.action == "regions", settings["planner.name"] == "direct"
+    return NamedPolicy(
+        name,
+        lambda env: restore_policy(env, model, saved).to(env.device),
+        "checkpoint",
+        targets=None if regions else settings["observation.targets"],
+        radio=not regions and looks_at_radios(saved),
+        pictures=regions,
+        map=settings.get("observation.map") if regions else None,
+        direct=direct,
+        source=f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
+        saved=saved,
+        model=model,
+    )
+
+
+def _own(word: str, setting: str, name: str) -> NamedPolicy:
+    found = find_own(word, setting)
+    foreign = is_foreign(found)
+    return NamedPolicy(
+        name,
+        lambda env: make_own(found, env, name),
+        "own",
+        pictures=not foreign,
+        direct=False if foreign else None,
+        source=f"{word} {source_of(found)}",
+        found=found,
+    )
+
+
+def find_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
+    """The policies of several words, with names of their own.
+
+    Raises:
+        UserError: as `find_player`; or a policy is named twice.
+    """
+    return [find_player(word, setting, name) for word, name in name_players(words, setting, taken).items()]
+
+
+def name_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> dict[str, str]:
+    """word -> its name in tables: the short one, with the folders above it where that is another's.
+
+    Raises:
+        UserError: a policy is named twice.
+    """
+    check_distinct(setting, [str(Path(word).absolute()) if os.path.exists(word) else word for word in words])
+    names, used = {}, {*TAKEN, *taken, *(word for word in words if word in POLICIES)}
+    for word in words:
+        name, above = short_name(word), list(Path(word).absolute().parents)
+        while name in used and word not in POLICIES:
+            if not above or not above[0].name:
+                raise UserError(f"{setting}={word} cannot be told from {name}: rename its folder.")
+            name = f"{above.pop(0).name}-{name}"
+        names[word] = name
+        used.add(name)
+    return names
+
+
+def short_name(word: str) -> str:
+    """What tables and files call a policy: its own name, that of its folder, or module.function."""
+    path = Path(word)
+    is_path = os.sep in word or path.suffix == ".pt" or os.path.exists(word)
+    if word in POLICIES or word in plug_ins() or not is_path:
+        name = word.replace(":", ".") if is_reference(word) else word
+    elif path.suffix == ".pt":
+        run = path.absolute().parent
+        run = run.parent if run.name == "checkpoints" else run
+        number = NAME.fullmatch(path.name)
+        mark = "best" if path.name == BEST else f"iteration_{int(number[1])}" if number else path.stem
+        name = f"{run.name}_{mark}"
+    else:
+        name = path.absolute().name
+    return re.sub(r"[^\w.+-]", "_", name)
+
+
+def check_planner(planner: str, players: Sequence[NamedPolicy]) -> None:
+    """Raise UserError where policies that pick goals meet a planner that takes controls, or the other way round."""
+    goals = [player.name for player in players if player.direct is False]
+    if goals and planner == "direct":
+        raise UserError(
+            f"planner=direct takes controls, and {', '.join(goals)} pick{'s' if len(goals) == 1 else ''} goals: "
+            "use planner=dwa or wavefront."
+        )
+    controls = [player.name for player in players if player.direct]
+    if controls and planner != "direct":
+        raise UserError(
+            f"{', '.join(controls)} {'was' if len(controls) == 1 else 'were'} trained with planner=direct, and "
+            f"planner={planner} takes another action: add planner=direct."
+        )
+
+
+def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> None:
+    """Let the env of the settings show what the policies look at, and nothing that nobody does.
+
+    Raises:
+        UserError: they look at different things, or the settings show another number of targets.
+    """
+    counts = {player.name: player.targets for player in players if player.targets is not None}
+    if counts:
+        counts |= {"observation.targets": cfg.observation.targets} if cfg.observation.targets else {}
+        if len(set(counts.values())) > 1:
+            told = ", ".join(f"{word} {count}" for word, count in counts.items())
+            raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
+        cfg.observation.targets = next(iter(counts.values()))
+    cfg.observation.radio = cfg.observation.radio or any(player.radio for player in players)
+    shown = {player.name: player.map for player in players if player.map is not None}
+    if len(set(shown.values())) > 1:
+        told = ", ".join(f"{word} {what}" for word, what in shown.items())
+        raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
+    if shown:
+        cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True
+    elif not any(player.pictures for player in players):
+        cfg.observation.pictures = False

@@ -1,0 +1,1 @@
+"""Communication: strategies under limited radios, and what targets are worth to it."""

@@ -1,0 +1,1 @@
+"""Maps: point clouds, their checks, rasters and navigation grids, and batches of them for the kernels."""
