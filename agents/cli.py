@@ -92,7 +92,7 @@ VERBS = {
         ("place",),
     ),
     "export": Verb(
-        "writes the policy of a run as a folder for robots (maexp.agents.deploy.planner)",
+        "writes the policy of a run as a folder for robots (maexp.agents.runtime)",
         ("maexp export RUN out=FOLDER", "maexp export RUN out=FOLDER results=EVALUATION,EVALUATION"),
         ("checkpoint",),
     ),

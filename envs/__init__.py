@@ -4,6 +4,7 @@ Names are looked up on first use, so that a command line or a robot's computer n
 """
 
 from maexp.kernels.lazy import lazy_names
+from maexp.kernels.moved import redirect_modules
 
 _HOMES = {
     "SCENARIOS": "scenarios",
@@ -55,3 +56,20 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__, _HOMES)
+
+redirect_modules(
+    __name__,
+    {
+        "apis": "wrappers",
+        "checker": "maps.checker",
+        "choices": "targets.heuristics",
+        "contacts": "comm.radio_features",
+        "features": "targets.features",
+        "fields": "config_fields",
+        "film": "render.video",
+        "importing": "io",
+        "map": "maps.point_cloud",
+        "starts": "spawn",
+        "viewing": "render",
+    },
+)

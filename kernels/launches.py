@@ -5,6 +5,7 @@ filled, or is about to read, would be met too early or too late.
 """
 
 import ctypes
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
@@ -16,6 +17,9 @@ from maexp.kernels.startup import KNOWN
 
 Launch = Callable[[wp.Kernel, int | tuple[int, ...], Sequence], None]
 """``launch(kernel, dim, arguments)`` launches a kernel at once, or records it."""
+
+EAGER = os.environ.get("MAEXP_EAGER", "0") not in ("", "0")
+"""Debugging: every stage runs anew instead of being replayed, so that a breakpoint in it stops. Same results, slower."""
 
 CPU_LANES = 1
 """Threads that share the work of a robot or a row on the CPU, where a thread costs more than an item."""
@@ -94,14 +98,26 @@ class RecordedLaunch:
             self.call()
 
 
-def record(stage: Callable[[Launch], None], device: wp.Device) -> list[RecordedLaunch]:
+class EagerStage:
+    """A stage in the place of its recorded launches: it runs from its first line each time (`EAGER`)."""
+
+    def __init__(self, stage: Callable[[Launch], None], device: wp.Device):
+        self.stage, self.device = stage, device
+
+    def launch(self, stream: wp.Stream | None = None) -> None:
+        self.stage(launch_on(self.device))
+
+
+def record(stage: Callable[[Launch], None], device: wp.Device) -> list[RecordedLaunch] | list[EagerStage]:
     """The launches of ``stage(launch)``, for `replay`."""
+    if EAGER:
+        return [EagerStage(stage, device)]
     launches: list[RecordedLaunch] = []
     stage(lambda kernel, dim, arguments: launches.append(RecordedLaunch(kernel, dim, arguments, device)))
     return launches
 
 
-def replay(launches: list[RecordedLaunch]) -> None:
+def replay(launches: list[RecordedLaunch] | list[EagerStage]) -> None:
     """Launch again, one after the other, in order with what torch does there."""
     stream = current_stream(launches[0].device) if launches else None
     for launch in launches:

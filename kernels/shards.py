@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from maexp.kernels.constants import DT
-from maexp.kernels.launches import Launch, RecordedLaunch, lanes_on, launch_named, record, replay
+from maexp.kernels.launches import EagerStage, Launch, RecordedLaunch, lanes_on, launch_named, record, replay
 
 Stage = Callable[[Launch, "Shard"], None]
 """``stage(launch, shard)`` launches kernels over the envs of a shard."""
@@ -100,7 +100,7 @@ class Shard:
         }
         self.values = numbers | vars(view) | {"robots": robots, "lanes": self.lanes} | more
         self._make_wavefront = make_wavefront
-        self._recorded: dict[Stage, list[RecordedLaunch]] = {}
+        self._recorded: dict[Stage, list[RecordedLaunch] | list[EagerStage]] = {}
 
     @cached_property
     def wavefront(self) -> Any:
@@ -138,7 +138,7 @@ class Shard:
         """
         launch_named(launch, kernel, self.shape if dim is None else dim, self.values | given)
 
-    def record(self, stage: Stage) -> list[RecordedLaunch]:
+    def record(self, stage: Stage) -> list[RecordedLaunch] | list[EagerStage]:
         """The launches of a stage, recorded when first asked for."""
         if stage not in self._recorded:
             self._recorded[stage] = record(lambda launch: stage(launch, self), self.device)

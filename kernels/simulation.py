@@ -7,7 +7,7 @@ from maexp.kernels import step
 from maexp.kernels.drifting_maps import measure_maps
 from maexp.kernels.dwa import list_curvatures
 from maexp.kernels.dynamics import Robots
-from maexp.kernels.launches import finish_filling, launch_on
+from maexp.kernels.launches import EAGER, finish_filling, launch_on
 from maexp.kernels.occupancy_grid import NavGrids
 from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.radio import Radio
@@ -99,7 +99,7 @@ class Simulation:
             "grids": self.nav_grids,
             "open": None if open_cells is None else wp.from_torch(open_cells),
         }
-        count = max(1, min(num_shards, sizes["E"]))
+        count = 1 if EAGER else max(1, min(num_shards, sizes["E"]))  # threads must not load kernels at the same time
         self.shards = self._split(count)
         per_thread = blocks_per_thread(sizes, self.device, count)
         self.blocks = self.shards if per_thread == 1 else self._split(count * per_thread)

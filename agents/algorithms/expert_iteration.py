@@ -1,7 +1,8 @@
 """Expert iteration: a policy learns what its choices are worth from branches of its own episodes.
 
-The expert is a search in the true simulator (`maexp.agents.training.branch_rollouts`): at some decisions every robot tries a
-few of its targets, and what comes of each is its label. The policy learns these by regression, acts by what it has
+The expert is a search in the true simulator (`maexp.agents.training.branch_rollouts`): at some decisions every robot
+tries a few of its targets, and what comes of each is its label. The policy learns these by regression, acts by what it
+has
 learned, and is branched again: rollout-based policy iteration (Lagoudakis and Parr 2003; Anthony et al. 2017). Labels
 stay true while the policy changes, for they compare targets, not policies: all that were found are learned from again.
 """

@@ -1,4 +1,5 @@
-"""`python -m maexp.agents.benchmarks.conditions out=FOLDER`: what radios and failures cost, as one table (docs/conditions.md).
+"""`python -m maexp.agents.benchmarks.conditions out=FOLDER`: what radios and failures cost, as one table
+(docs/conditions.md).
 
 Every condition is an evaluation of its own (`maexp evaluate`) below `out`, of the same episodes. A command that was
 stopped goes on where it was when it is given again; more conditions, scenarios, teams or policies may join. Maps of

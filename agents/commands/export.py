@@ -1,4 +1,4 @@
-"""`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.deploy.planner`)."""
+"""`maexp export`: the policy of a run as a folder that robots plan with (`maexp.agents.runtime`)."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A trained policy as a folder that `maexp.agents.deploy.planner` plans with, on computers without torch."""
+"""A trained policy as a folder that `maexp.agents.runtime` plans with, on computers without torch."""
 
 from __future__ import annotations
 

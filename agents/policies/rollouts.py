@@ -1,6 +1,7 @@
 """Rollouts: what comes of a decision in copies of a team that a rollout policy plays on with.
 
-The copies live in a world of what the robots know, or in the true one (`maexp.envs.imagined.maps`, `maexp.envs.imagined.branches`).
+The copies live in a world of what the robots know, or in the true one (`maexp.envs.imagined.maps`,
+`maexp.envs.imagined.branches`).
 """
 
 from __future__ import annotations

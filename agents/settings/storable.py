@@ -1,7 +1,7 @@
 """Dataclasses of settings as Hydra checks them: a misspelt name or a word in a number's place is refused.
 
-A setting is declared once, as a field of a dataclass (`maexp.envs.config_fields`). Where settings belong to a class of the
-layers below (`RobotConfig`, `ModelConfig`, ...), their names, types and help are read from that class.
+A setting is declared once, as a field of a dataclass (`maexp.envs.config_fields`). Where settings belong to a class of
+the layers below (`RobotConfig`, `ModelConfig`, ...), their names, types and help are read from that class.
 """
 
 from dataclasses import MISSING as NO_DEFAULT

@@ -1,7 +1,8 @@
 """Branches that are worth what the base station, or the robot that knows least, learns: `algorithm.learn_from`.
 
-They are played in the true world with its radios, and with what robots do to tell others (`maexp.envs.comm.strategy`). Where
-only chance tells the base station (`comm.strategy=opportunistic`), robots report to it after the first decision as with
+They are played in the true world with its radios, and with what robots do to tell others (`maexp.envs.comm.strategy`).
+Where only chance tells the base station (`comm.strategy=opportunistic`), robots report to it after the first decision
+as with
 `return_to_base`: else nothing that is seen in a branch would ever be worth anything.
 """
 

@@ -1,8 +1,8 @@
 """What targets tell of radios (``observation.radio``): what a robot knows of who has heard what, and the target to go
 and tell the base station.
 
-Robots know what `maexp.envs.comm.strategy` remembers for them, where the base station is, and their own map. Nothing here
-is of the true map, or of what others have learned since they were last heard.
+Robots know what `maexp.envs.comm.strategy` remembers for them, where the base station is, and their own map. Nothing
+here is of the true map, or of what others have learned since they were last heard.
 """
 
 from __future__ import annotations

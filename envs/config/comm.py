@@ -19,9 +19,9 @@ class CommConfig(Group):
 
     Robots within ``range``, in line of sight if asked, and with ``signal`` those whose signal arrives
     (`maexp.kernels.radio`). Messages may take room and time (`maexp.kernels.bandwidth`). ``strategy`` is what robots do
-    to tell others what they know, whatever their policy (`maexp.envs.comm.strategy`): nothing but to talk when they meet
-    (``opportunistic``), or to report or meet after ``period`` decisions. A base station is a radio with a map of its
-    own.
+    to tell others what they know, whatever their policy (`maexp.envs.comm.strategy`): nothing but to talk when they
+    meet (``opportunistic``), or to report or meet after ``period`` decisions. A base station is a radio with a map of
+    its own.
     """
 
     group = "comm"

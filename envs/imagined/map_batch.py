@@ -1,4 +1,5 @@
-"""Room for imagined worlds (`maexp.envs.imagined.maps`): their grids, and a bank of maps that every team writes anew."""
+"""Room for imagined worlds (`maexp.envs.imagined.maps`): their grids, and a bank of maps that every team writes
+anew."""
 
 from __future__ import annotations
 

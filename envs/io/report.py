@@ -31,7 +31,7 @@ class ScannedPoints:
     points: np.ndarray
 
     @classmethod
-    def some_of(cls, points: np.ndarray) -> "ScannedPoints":
+    def some_of(cls, points: np.ndarray) -> ScannedPoints:
         """A fair sample, moved so that float32 holds it where coordinates are large."""
         some = points[:: -(-len(points) // SHOWN_POINTS)]
         far = np.abs(some).max() > 1e5

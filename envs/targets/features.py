@@ -5,8 +5,8 @@ features of a candidate contain what the classical planner `cost_utility` would 
 policy starts from there.
 
 A feature is a row of `TABLE`: a name, what a function makes of the `Moment`, a unit and a line of meaning. Simulator
-(`maexp.envs.targets.observation`) and robots (`maexp.agents.deploy.planner.features`) fill in the moment. Imports neither torch nor
-Warp.
+(`maexp.envs.targets.observation`) and robots (`maexp.agents.deploy.planner.features`) fill in the moment. Imports
+neither torch nor Warp.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ FAR_AWAY = ("plan_gap", "own_last", "mates_last", "rival")
 
 @dataclass(frozen=True)
 class Contacts:
-    """What robots know of who was connected when, by their own memory (`maexp.envs.comm.strategy`), and of the base station.
-    Where there is none, or nobody else, its numbers are 0. Connected is also who is so over others.
+    """What robots know of who was connected when, by their own memory (`maexp.envs.comm.strategy`), and of the base
+    station. Where there is none, or nobody else, its numbers are 0. Connected is also who is so over others.
 
     Attributes:
         tells: bool [..., N, M], the candidate that is no frontier: to go to the base station and tell it.

@@ -1,8 +1,9 @@
 """The classical planners: what robots think of targets, for tensors of many teams as for NumPy arrays of one.
 
-A planner is a function of a scene and a row of `CLASSICAL`. Scenes are `maexp.envs.targets.tracker.TensorScene`, in torch, and
-`maexp.agents.deploy.planner.scene.ArrayScene`, in NumPy; `Scene` here says what both give. `scene.xp` is the array library:
-use what torch and NumPy call by the same name. Imports neither torch nor Warp.
+A planner is a function of a scene and a row of `CLASSICAL`. Scenes are `maexp.envs.targets.tracker.TensorScene`, in
+torch, and `maexp.agents.deploy.planner.scene.ArrayScene`, in NumPy; `Scene` here says what both give. `scene.xp` is the
+array
+library: use what torch and NumPy call by the same name. Imports neither torch nor Warp.
 
 Sources: docs/planners.md.
 """

@@ -23,7 +23,8 @@ class TargetView:
     """The candidates of every robot of an env: `observe` lists them, `take` drives to some.
 
     M candidates per robot, those of the highest value first; masked where there are fewer. With `observation.radio`
-    one more follows, the last: to go to the base station and tell it what it does not know (`maexp.envs.comm.radio_features`).
+    one more follows, the last: to go to the base station and tell it what it does not know
+        (`maexp.envs.comm.radio_features`).
 
     Args:
         env: only read.

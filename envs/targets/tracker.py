@@ -29,8 +29,8 @@ SIGHT = 3.0  # goals for plain DWA lie at most so many radar ranges away
 
 @dataclass(frozen=True)
 class TensorScene:
-    """What targets are chosen from, a `maexp.envs.targets.heuristics.Scene`. K targets per robot; those that are absent are
-    infinitely far.
+    """What targets are chosen from, a `maexp.envs.targets.heuristics.Scene`. K targets per robot; those that are absent
+    are infinitely far.
 
     Attributes:
         travel: float32 [E, N, K], way from robot to target [m].
@@ -245,8 +245,8 @@ class TargetTracker:
     def _rest(self) -> torch.Tensor:
         """Where robots wait for which no target is left [m], float32 [E, N, 2].
 
-        Who stands on the way of another to a target is nearer to it, and has got it (`maexp.kernels.distinct_targets`): a robot
-        that waits where it is stands in nobody's way.
+        Who stands on the way of another to a target is nearer to it, and has got it (`maexp.kernels.distinct_targets`):
+        a robot that waits where it is stands in nobody's way.
         """
         return self.state["home"] if self.env.targets_config.spare == "home" else self.nav.centers()
 

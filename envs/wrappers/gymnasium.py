@@ -27,8 +27,8 @@ class TeamVectorEnv(VectorEnv):
         num_envs: teams in the batch, E.
         num_robots: robots of a team, N.
         seed: key of all random numbers until ``reset(seed=...)`` gives another.
-        action: "targets", "region_offset", "region" or "goal"; see `maexp.envs.wrappers.spaces`. With targets, observation
-            and info hold ``action_mask``, int8 [E, N, M]: which there are.
+        action: "targets", "region_offset", "region" or "goal"; see `maexp.envs.wrappers.spaces`. With targets,
+            observation and info hold ``action_mask``, int8 [E, N, M]: which there are.
         autoreset_mode: when a team that is done starts anew: in the next step, in the same one, or not by itself.
         render_mode: "rgb_array" or None.
         settings: those of `ExplorationEnv` (radar, planner, macro_steps, ...).

@@ -77,7 +77,7 @@ NOT_OURS = (
     "pip ",
     "sphinx-build ",
     "ray ",
-    "python -m maexp.agents.deploy.planner",
+    "python -m maexp.agents.runtime",
     "python -m build",
 )
 """Lines that begin so are other programs, which .ci/run or a test of its own calls."""

@@ -1,7 +1,7 @@
 """Random configurations of the env, stepped with random actions, every invariant of `invariants.py` checked.
 
-A few small examples by default. By hand: `pytest tests/envs/test_env_fuzz.py --hypothesis-profile=long -s` plays episodes
-of 200 macro steps until MAEXP_FUZZ_MINUTES (30) are over, and prints how many it tried.
+A few small examples by default. By hand: `pytest tests/envs/test_env_fuzz.py --hypothesis-profile=long -s` plays
+episodes of 200 macro steps until MAEXP_FUZZ_MINUTES (30) are over, and prints how many it tried.
 """
 
 import hashlib

@@ -5,7 +5,7 @@ from pathlib import Path
 
 PLAN_WITH_A_POLICY = """
 import importlib.util, numpy as np
-import maexp.agents.deploy.planner as runtime
+import maexp.agents.runtime as runtime
 for name in ("torch", "warp", "tensordict", "omegaconf"):
     assert importlib.util.find_spec(name) is None, name
 grid = np.full((100, 150), -1)

@@ -11,8 +11,8 @@ import numpy as np
 
 from maexp.agents.deploy.irsim.config import TrialConfig
 from maexp.agents.deploy.irsim.trial import Trial, run_trial
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner.simulate import MARKS, count_close
+from maexp.agents.runtime import TeamPlanner
 from maexp.envs import ExplorationEnv, RobotConfig
 from maexp.envs.io import import_map
 

@@ -39,9 +39,9 @@ class Player:
     """A policy by the word that names it.
 
     Args:
-        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks `maexp.agents.policies.remote.protocol`;
-            `socket:HOST:PORT`, where one listens; or `process:NAME`, one of ours as if it were a stranger's. A class
-            with `act` always plays in processes.
+        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks
+            `maexp.agents.policies.remote.protocol`; `socket:HOST:PORT`, where one listens; or `process:NAME`, one of
+            ours as if it were a stranger's. A class with `act` always plays in processes.
         limit: processor time that a decision may take a policy in processes of its own, or time elsewhere [s].
         patience: how long an answer of such a one may take otherwise [s].
         name: what tables call it; None: by its word.

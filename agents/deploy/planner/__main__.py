@@ -1,4 +1,4 @@
-"""`python -m maexp.agents.deploy.planner`: how long a plan takes on this computer, for every planner and shipped policy.
+"""`python -m maexp.agents.runtime`: how long a plan takes on this computer, for every planner and shipped policy.
 
 `python -m maexp.agents.deploy.planner simulate` lets a team explore a floor in closed loop, and counts what goes wrong.
 Policies need onnxruntime, lookahead needs torch and Warp; they are left out where these are not installed.
@@ -35,7 +35,7 @@ ROOM = 8.0  # side of a room of our own floors [m]
 
 @dataclass(frozen=True)
 class MeasureSettings:
-    """`python -m maexp.agents.deploy.planner`."""
+    """`python -m maexp.agents.runtime`."""
 
     metres: float = setting(50.0, "side of the floor", unit="m", above=0)
     resolution: float = setting(0.1, "edge of a cell, at least", unit="m", above=0)
@@ -194,7 +194,7 @@ def read_words(words: list[str]) -> MeasureSettings | SimulateSettings:
     """The command line; ends with a sentence for what is out of its range, or a picture that cannot be written."""
     simulates = bool(words) and words[0] == "simulate"
     parser = argparse.ArgumentParser(
-        prog="python -m maexp.agents.deploy.planner" + " simulate" * simulates,
+        prog="python -m maexp.agents.runtime" + " simulate" * simulates,
         description=simulate.__doc__ if simulates else __doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

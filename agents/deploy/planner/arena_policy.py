@@ -14,7 +14,8 @@ from maexp.envs.targets.features import drive_until_next
 
 
 class TeamAgent:
-    """A `TeamPlanner` for the episodes of the arena (`maexp.agents.policies.remote.numpy_policy` tells what these hold).
+    """A `TeamPlanner` for the episodes of the arena (`maexp.agents.policies.remote.numpy_policy` tells what these
+    hold).
 
     Args:
         policy: a classical planner, a trained policy that ships, or the folder of one.

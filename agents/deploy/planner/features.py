@@ -1,4 +1,5 @@
-"""What a learned choice among targets sees: the candidates of every robot, as `maexp.envs.targets.observation` lists them."""
+"""What a learned choice among targets sees: the candidates of every robot, as `maexp.envs.targets.observation` lists
+them."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def list_candidates(
         last: where each robot's latest target was on the grid, [n, 2] [m]; NaN = it had none.
         time_left: share of the time for the whole exploration.
         motion: how the robots move.
-        telling: adds what is known of radios (`maexp.agents.deploy.planner.radio_features.ContactBook.add_to`); None: nothing.
+        telling: adds what is known of radios (`maexp.agents.deploy.planner.radio_features.ContactBook.add_to`); None:
+            nothing.
     """
     value = value_targets(scene).astype(np.float32)
     best = np.argsort(-value, axis=1, kind="stable")[:, :count]

@@ -1,5 +1,5 @@
-"""What robots know of radios, call by call, for policies that look at it (``observation.radio``): `maexp.envs.comm.radio_features`
-and what `maexp.envs.comm.strategy` remembers, in NumPy."""
+"""What robots know of radios, call by call, for policies that look at it (``observation.radio``):
+`maexp.envs.comm.radio_features` and what `maexp.envs.comm.strategy` remembers, in NumPy."""
 
 from __future__ import annotations
 

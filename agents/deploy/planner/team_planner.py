@@ -62,8 +62,8 @@ class TeamPlanner:
     """Chooses where each robot of a team should go next, call by call.
 
     Args:
-        policy: one of the classical planners, `maexp.agents.deploy.planner.CHOICES`, a trained policy that ships, by its name
-            (`shipped_names()`), the folder of another one, or "lookahead", which needs Warp and torch.
+        policy: one of the classical planners, `maexp.agents.deploy.planner.CHOICES`, a trained policy that ships, by
+            its name (`shipped_names()`), the folder of another one, or "lookahead", which needs Warp and torch.
         radar_range: how far robots see [m]; None: as the policy was trained, 5 m for planners.
         robot_radius: distance that a robot's centre keeps from obstacles [m]: one for all, {name: radius} or a list;
             None: as the policy was trained, 0.3 m for planners.

@@ -1,4 +1,4 @@
-"""A ROS 2 team driven over DDS: maps, frames and odometry in, goals out. All thinking is in `maexp.agents.deploy.planner`."""
+"""A ROS 2 team driven over DDS: maps, frames and odometry in, goals out. All thinking is in `maexp.agents.runtime`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from maexp.agents.errors import UserError, printable
 
 POLL = 0.1  # seconds between two looks where nothing comes
 NUMBERS = ("begins", "radar_range", "robot_radius", "max_speed", "max_accel", "seconds", "decision_seconds", "seed")
-"""Of an episode that an arena tells of: what is read of it here, and by `maexp.agents.deploy.planner`."""
+"""Of an episode that an arena tells of: what is read of it here, and by `maexp.agents.runtime`."""
 
 
 @dataclass

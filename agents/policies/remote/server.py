@@ -1,7 +1,7 @@
 """A policy elsewhere, in a container or on another machine: `socket:HOST:PORT`, the messages of `wire` over TCP.
 
-`python -m maexp.agents.policies.remote.server HOST:PORT WORD` is the other side of it, for what a process can play: WORD
-is module:Class, a name, or exec:COMMAND. Every connection gets a process of its own, which ends with it; whoever
+`python -m maexp.agents.policies.remote.server HOST:PORT WORD` is the other side of it, for what a process can play:
+WORD is module:Class, a name, or exec:COMMAND. Every connection gets a process of its own, which ends with it; whoever
 reaches the port can have it think. HOST is an address of this machine, 0.0.0.0 all of them. Needs NumPy and msgpack.
 """
 

@@ -1,7 +1,8 @@
 """A policy of the arena in Python, in a process of its own: `python -m maexp.agents.policies.remote.worker WORD`.
 
 WORD is module:Class, the name of a plug-in (entry point of the group `maexp.policies`), or what
-`maexp.agents.deploy.planner.TeamPlanner` takes. Needs NumPy and msgpack, and what the policy itself imports. What the policy
+`maexp.agents.deploy.planner.TeamPlanner` takes. Needs NumPy and msgpack, and what the policy itself imports. What the
+policy
 prints goes to standard error: standard output is the wire's.
 """
 

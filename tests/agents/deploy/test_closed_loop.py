@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner import __main__ as runtime
 from maexp.agents.deploy.planner.simulate import SimulatedFloor, explore, make_floor, place_team, read_floor
+from maexp.agents.runtime import TeamPlanner
 
 CELL, RADIUS, REACH = 0.2, 0.3, 4.0
 
@@ -79,13 +79,13 @@ def test_robots_begin_beside_each_other():
 def test_the_command(tmp_path):
     words = ["simulate", "--metres", "8.1", "--resolution", "0.2", "--seconds", "20", "--picture", tmp_path / "a.png"]
     done = subprocess.run(
-        [sys.executable, "-m", "maexp.agents.deploy.planner", *map(str, words)], capture_output=True, text=True
+        [sys.executable, "-m", "maexp.agents.runtime", *map(str, words)], capture_output=True, text=True
     )
     lines = done.stdout.splitlines()
     assert done.returncode == 0 and lines[0].endswith("3 robots of 0.35 m start together"), done.stderr
     assert "needless duplicates 0" in lines[1] and (tmp_path / "a.png").stat().st_size > 5000
     wrong = subprocess.run(
-        [sys.executable, "-m", "maexp.agents.deploy.planner", "simulate", tmp_path / "no.yaml"],
+        [sys.executable, "-m", "maexp.agents.runtime", "simulate", tmp_path / "no.yaml"],
         capture_output=True,
         text=True,
     )

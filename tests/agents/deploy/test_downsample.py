@@ -6,10 +6,10 @@ import time
 import numpy as np
 import pytest
 
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner import grid_search as module
 from maexp.agents.deploy.planner.grid import KnownGrid
 from maexp.agents.deploy.planner.grid_search import coarsen
+from maexp.agents.runtime import TeamPlanner
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 POSES = [(10.5, 7.0, 0.0), (11.5, 7.0, 0.0), (12.5, 7.0, 0.0)]

@@ -9,9 +9,9 @@ import pytest
 from test_robot_planner import AT, seen
 from test_stall_monitor import CELL, SETTINGS
 
-from maexp.agents.deploy.planner import RobotPlanner, Word
 from maexp.agents.deploy.planner.frames import OccupancyGrid
 from maexp.agents.deploy.planner.radio_features import BASE, Contact, Memory
+from maexp.agents.runtime import RobotPlanner, Word
 
 
 def seen_by_mate() -> OccupancyGrid:

@@ -11,11 +11,12 @@ import torch
 from runtime_cases import Moment, moments
 from worlds import ways_to_blocks
 
-from maexp.agents.deploy.planner import CHOICES, TeamPlanner, grid_search
+from maexp.agents.deploy.planner import grid_search
 from maexp.agents.deploy.planner.grid import read_grid
 from maexp.agents.deploy.planner.grid_search import grow_trees
 from maexp.agents.deploy.planner.team import read_team
 from maexp.agents.policies import classical
+from maexp.agents.runtime import CHOICES, TeamPlanner
 from maexp.envs import RobotConfig
 from maexp.envs.targets.heuristics import RRT_SAMPLES
 from maexp.kernels.constants import FREE, UNKNOWN
@@ -43,7 +44,7 @@ def survey(now: Moment):
 
 def test_imports_neither_torch_nor_warp():
     code = (
-        "import sys, numpy as np\nfrom maexp.agents.deploy.planner import TeamPlanner\n"
+        "import sys, numpy as np\nfrom maexp.agents.runtime import TeamPlanner\n"
         "grid = np.zeros((20, 30), np.int8); grid[:, 20:] = -1\n"
         "plan = TeamPlanner().plan(grid, 0.2, (0, 0), [(1.0, 1.0, 0.0)])\nassert plan.active.all(), plan\n"
         "print([m for m in ('torch', 'warp', 'tensordict', 'torchrl', 'skimage', 'hydra') if m in sys.modules])"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt, label
 
-from maexp.agents.deploy.planner import CHOICES, TeamPlanner
 from maexp.agents.deploy.planner.grid import KnownGrid
 from maexp.agents.deploy.planner.grid_search import flood, trace, trace_from
+from maexp.agents.runtime import CHOICES, TeamPlanner
 from maexp.kernels.constants import BLOCKED, OPEN, UNREACHED
 
 POSES = {"a": (1.0, 1.0, 0.0), "b": (1.5, 1.0, 0.0)}

@@ -10,7 +10,7 @@ import pytest
 from isolated_packages import PLAN_WITH_A_POLICY, share_packages
 from paths import ROOT
 
-from maexp.agents.deploy.planner import CHOICES
+from maexp.agents.runtime import CHOICES
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_a_policy_that_ships(alone):
 
 
 def test_the_measurement(alone):
-    done = alone("-m", "maexp.agents.deploy.planner", "--metres", "20", "--calls", "2")
+    done = alone("-m", "maexp.agents.runtime", "--metres", "20", "--calls", "2")
     lines = done.stdout.splitlines()
     assert done.returncode == 0 and lines[0] == "3 robots, 200 x 200 cells of 0.1 m", done.stderr
     assert len(lines) == 1 + len(CHOICES) and all(" ms, at most " in line for line in lines[1:])

@@ -12,12 +12,12 @@ from test_radio_features import ACTION, BASE, COUNT, HERE, PLACE, TELL, make
 from test_stall_monitor import CELL, SETTINGS, World
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.deploy.planner import RobotPlanner, TeamPlanner, Word
 from maexp.agents.deploy.planner.frames import OccupancyGrid
 from maexp.agents.deploy.planner.grid import KnownGrid
 from maexp.agents.deploy.planner.radio_features import BASE as STATION
 from maexp.agents.deploy.planner.radio_features import Memory, count_blocked, read_comm
 from maexp.agents.models.actor import TARGETS, TARGETS_MASK
+from maexp.agents.runtime import RobotPlanner, TeamPlanner, Word
 from maexp.envs import CommConfig, ExplorationEnv
 from maexp.envs.targets.features import FEATURES, RADIO_TABLE, feature_names
 from maexp.kernels.constants import DT, FREE

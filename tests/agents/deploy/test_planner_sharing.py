@@ -6,11 +6,11 @@ import pytest
 from oracle.sharing import share
 from test_stall_monitor import SETTINGS, World, explore
 
-from maexp.agents.deploy.planner import CHOICES, TeamPlanner
 from maexp.agents.deploy.planner import team_planner as planner_module
 from maexp.agents.deploy.planner.assignment import Shares, share_targets
 from maexp.agents.deploy.planner.stall_monitor import Track, Watch
 from maexp.agents.deploy.planner.team import Team
+from maexp.agents.runtime import CHOICES, TeamPlanner
 
 
 def test_targets_are_shared_out_as_they_should():

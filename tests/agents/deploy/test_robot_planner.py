@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from test_stall_monitor import CELL, SETTINGS, World
 
-from maexp.agents.deploy.planner import CHOICES, RobotPlanner, TeamPlanner, Word
 from maexp.agents.deploy.planner.frames import OccupancyGrid, merge_grids
+from maexp.agents.runtime import CHOICES, RobotPlanner, TeamPlanner, Word
 
 NAMES = ("a", "b")
 

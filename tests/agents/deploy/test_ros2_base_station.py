@@ -16,7 +16,6 @@ from test_ros2_maps import PERSON, look, message, seen
 from test_ros2_robot import PROGRAM
 
 from maexp.agents.cli import main
-from maexp.agents.deploy.planner import Word
 from maexp.agents.deploy.planner.drivers import BaseDriver, RadioDriver, RobotDriver, make_driver
 from maexp.agents.deploy.planner.frames import read_map, read_time
 from maexp.agents.deploy.planner.messages import read_word, write_word
@@ -26,6 +25,7 @@ from maexp.agents.deploy.ros2.dds import Wire
 from maexp.agents.deploy.ros2.robot import Ros2Base, make_team
 from maexp.agents.deploy.ros2.team import Outing
 from maexp.agents.errors import UserError
+from maexp.agents.runtime import Word
 from maexp.envs import CommConfig
 
 NAMES = ("a", "b")

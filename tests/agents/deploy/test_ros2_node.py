@@ -11,8 +11,9 @@ import pytest
 import yaml
 from paths import ROOT
 
-from maexp.agents.deploy.planner import TeamPlanner, Word, frames
+from maexp.agents.deploy.planner import frames
 from maexp.agents.deploy.planner.messages import read_word, write_word
+from maexp.agents.runtime import TeamPlanner, Word
 from maexp.envs.io.ros_messages import read_yaw
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")

@@ -17,7 +17,6 @@ pytest.importorskip("cyclonedds", reason="THE EXTRA maexp[ros2] IS NOT INSTALLED
 from small_suite import make_small_suite
 
 from maexp.agents.cli import main
-from maexp.agents.deploy.planner import RobotPlanner, Word
 from maexp.agents.deploy.planner.drivers import RobotDriver
 from maexp.agents.deploy.planner.frames import read_map
 from maexp.agents.deploy.planner.messages import read_word, write_word
@@ -26,6 +25,7 @@ from maexp.agents.deploy.planner.team_driver import DriverSettings
 from maexp.agents.deploy.ros2.dds import Wire
 from maexp.agents.deploy.ros2.robot import Ros2Robot
 from maexp.agents.errors import UserError
+from maexp.agents.runtime import RobotPlanner, Word
 
 MEMORY = Memory((1.0, 0.1 + 0.2), 3.0, 4.5, False, True, {"b": Contact(0.25, (1.0, 2.0), 3.0, 1.5)})
 TIME = 1764057600.123456789

@@ -5,8 +5,8 @@ import logging
 import numpy as np
 import pytest
 
-from maexp.agents.deploy.planner import CHOICES, TeamPlanner
 from maexp.agents.deploy.planner import team_planner as planner_module
+from maexp.agents.runtime import CHOICES, TeamPlanner
 
 CELL, SIGHT, SPEED = 0.25, 2.0, 0.5
 SETTINGS = {"radar_range": SIGHT, "robot_radius": 0.2, "patience": 5.0, "pause": 20.0}

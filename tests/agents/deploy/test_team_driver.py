@@ -6,10 +6,10 @@ import pytest
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
 from bag_writer import STORE, grid, header, kind, transforms, turn
 
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner.arena_policy import TeamAgent
 from maexp.agents.deploy.planner.frames import compose, invert
 from maexp.agents.deploy.planner.team_driver import DriverSettings, TeamDriver, read_settings
+from maexp.agents.runtime import TeamPlanner
 
 TEAM = {"robots": ("a", "b"), "radar_range": 3.0, "robot_radius": (0.2,), "map_topics": ("/map",)}
 

@@ -12,11 +12,11 @@ from test_planner import survey
 
 from maexp.agents import ModelConfig, make_policy
 from maexp.agents.cli import main
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner.bundle import LearnedChoice
 from maexp.agents.deploy.planner.features import Candidates, Motion, list_candidates
 from maexp.agents.errors import UserError
 from maexp.agents.policies.export import export_policy, find_chooser
+from maexp.agents.runtime import TeamPlanner
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.targets.features import FEATURES, TABLE, Feature
 from maexp.envs.targets.heuristics import LEAST_GAIN

@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from maexp.agents.deploy.planner import RobotPlanner, TeamPlanner
 from maexp.agents.deploy.planner.features import Motion
 from maexp.agents.policies.grid_lookahead import AHEAD, MOST_STEPS, WHEELBASE, Foresight, imagined_steps
 from maexp.agents.policies.lookahead import LookaheadPlanner
 from maexp.agents.policies.remote.numpy_policy import TeamSight
+from maexp.agents.runtime import RobotPlanner, TeamPlanner
 from maexp.envs import ExplorationEnv, LookaheadConfig, RobotConfig, make_map
 from maexp.envs.imagined.grid_team import GridTeam
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN

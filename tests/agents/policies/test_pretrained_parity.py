@@ -11,10 +11,10 @@ import pytest
 import torch
 from runtime_cases import moment
 
-from maexp.agents.deploy.planner import TeamPlanner, shipped_names
 from maexp.agents.deploy.planner.bundle import SHIPPED
 from maexp.agents.policies.export import find_chooser
 from maexp.agents.policies.pretrained import load_policy_folder
+from maexp.agents.runtime import TeamPlanner, shipped_names
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, TargetsConfig, make_map
 from maexp.envs.targets.navigation import Navigation
 

@@ -14,12 +14,12 @@ from mazes import make_env
 from subprocess_episodes import ENVS, STEPS, TESTS, alive, play_hosted, wait_for
 
 from maexp.agents.benchmarks.suites.play import Player
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies.remote import subprocess_policy
 from maexp.agents.policies.remote.process import Lost, Process, ask_all
 from maexp.agents.policies.remote.subprocess_policy import HostedPolicy, greet, guest_of
+from maexp.agents.runtime import TeamPlanner
 
 pytestmark = pytest.mark.slow  # processes
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from paths import ROOT
 
-from maexp.agents.deploy.planner import CHOICES
 from maexp.agents.deploy.planner.scene import ArrayScene
+from maexp.agents.runtime import CHOICES
 from maexp.kernels.constants import OPEN
 
 EXAMPLE = ROOT / "docs" / "examples" / "policies" / "tours.py"

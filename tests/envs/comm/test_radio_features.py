@@ -11,7 +11,6 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from worlds import room
 
 from maexp.agents import make_policy
-from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner.bundle import read_contract
 from maexp.agents.errors import UserError
 from maexp.agents.models.actor import TARGETS, TARGETS_MASK
@@ -19,6 +18,7 @@ from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.lookahead import LookaheadPlanner
 from maexp.agents.policies.registry import find_player, suit_observation
+from maexp.agents.runtime import TeamPlanner
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.imitation import widened

@@ -1,4 +1,4 @@
-"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.deploy.planner."""
+"""What the node of a robot or the base station tells others, and hears. All thinking is in maexp.agents.runtime."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node: maps and frames in, goals for nav2 out. All thinking is in maexp.agents.deploy.planner."""
+"""The node: maps and frames in, goals for nav2 out. All thinking is in maexp.agents.runtime."""
 
 from __future__ import annotations
 
