@@ -7,6 +7,7 @@ from maexp.kernels.lazy import lazy_names
 from maexp.kernels.moved import redirect_modules
 
 _HOMES = {
+    "load_policy": "training.make",
     "make_env": "command_env",
     "make_policy": "training.make",
     "make_critic": "algorithms.registry",
@@ -14,7 +15,7 @@ _HOMES = {
     "ALGORITHMS": "algorithms.registry",
     "ModelConfig": "settings.model",
 }
-__all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_env", "make_loss", "make_policy"]
+__all__ = ["ALGORITHMS", "ModelConfig", "load_policy", "make_critic", "make_env", "make_loss", "make_policy"]
 
 __getattr__ = lazy_names(__name__, _HOMES)
 

@@ -1,4 +1,4 @@
-"""`make_policy`: a policy for an env, by its name or new."""
+"""Policies for an env: `make_policy` makes a new one, `load_policy` loads one by its name."""
 
 from __future__ import annotations
 
@@ -23,20 +23,32 @@ def make_policy(name: str | PathLike, env: ExplorationEnv) -> Callable: ...
 
 
 def make_policy(what=None, /, env=None, model=None):
-    """The policy that a name stands for, or a new one that can be trained.
+    """A new policy that can be trained: networks of a size for the specs of `env` (`maexp.agents.models.actor`).
 
-    `make_policy(name, env)`: a classical planner, a policy that ships, the folder of an exported one, a run or a
-    checkpoint, `module:function`, or a plug-in: what `policy=` takes on the command line. It reads and writes
-    tensordicts of `env`, which must show what it looks at (``env.observation_config``).
+    Args:
+        env: the environment.
+        model: "small", "paper" or a `ModelConfig`.
 
-    `make_policy(env, model="small")`: new networks of that size for the specs of `env`
-    (`maexp.agents.models.actor.make_policy`).
+    `make_policy(name, env)` is `load_policy(name, env)`.
 
     Raises:
-        UserError: no policy of that name, a damaged one, or one that does not fit the env.
         ValueError: the env shows nothing that the networks could read.
     """
     if isinstance(what, str | PathLike):
-        return find_player(fspath(what)).make(env)
+        return load_policy(what, env)
     what, size = (env, None) if what is None else (what, env)
     return actor.make_policy(what, model or size or "small")
+
+
+def load_policy(name: str | PathLike, env: ExplorationEnv) -> Callable:
+    """The policy of that name, which reads and writes tensordicts of `env`.
+
+    Args:
+        name: what `policy=` takes on the command line: a classical planner, a policy that ships, the folder of an
+            exported one, a run or a checkpoint, `module:function`, or a plug-in.
+        env: it must show what the policy looks at (``env.observation_config``).
+
+    Raises:
+        UserError: no policy of that name, a damaged one, or one that does not fit the env.
+    """
+    return find_player(fspath(name)).make(env)
