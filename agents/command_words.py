@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.policies.names import check_name
 from maexp.agents.settings.algorithms import TUNINGS
-from maexp.agents.settings.checks import team_sizes, words_of
+from maexp.agents.settings.checks import choices_of, team_sizes
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import POLICIES, find_override, find_sweeps
 from maexp.agents.settings.resolved import resolve, without_hydra
@@ -25,7 +25,7 @@ def check_words(verb: str, overrides: list[str]) -> None:
     alone = all(find_override(overrides, name) is None for name in RUNS)
     cfg = without_hydra(compose_config(verb, overrides, whole=alone))
     for setting in POLICIES.get(verb, ()):
-        for word in words_of(cfg[setting]):
+        for word in choices_of(cfg[setting]):
             check_name(word, setting)
     if verb == "benchmark":
         check_names(cfg)

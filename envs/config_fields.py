@@ -73,7 +73,7 @@ def describe(cls: type) -> list[str]:
     return ["", *rows, ""] if rows else []
 
 
-def words_of(cls: type, name: str) -> tuple[str, ...]:
+def choices_of(cls: type, name: str) -> tuple[str, ...]:
     """The words that a setting may be, as its type names them."""
     return tuple(word for kind in kinds(cls)[name] if get_origin(kind) is Literal for word in get_args(kind))
 

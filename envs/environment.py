@@ -110,13 +110,13 @@ class ExplorationEnv(EnvBase):
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
         shown = settings.observation.targets
         acts = settings.comm.strategy != "opportunistic"
-        self.strategy = Strategy(self) if acts or settings.tells_of_radios else None
+        self.strategy = Strategy(self) if acts or settings.observes_radios else None
         self.target_view = TargetView(self, shown) if shown else None
         if shown:  # of this object: where a class draws its own, TorchRL refuses transforms such as ActionMask
             self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
         info, pictures = info_shapes(settings), settings.observation.pictures
-        shown, radio = (shown and self.target_view.shown), settings.tells_of_radios
+        shown, radio = (shown and self.target_view.shown), settings.observes_radios
         self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown, radio)
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
@@ -268,9 +268,9 @@ class ExplorationEnv(EnvBase):
             info[f"path_length_{mark}"] = s["milestone_path"][:, :, k].clone()
         for k, term in enumerate(REWARD_TERMS):
             info[f"reward_{term}"] = s["terms"][:, :, k].clone()
-        if self.settings.faults.some:
+        if self.settings.faults.enabled:
             info["failed"] = s["failed"] != 0
-        if self.settings.odometry.some:
+        if self.settings.odometry.enabled:
             info["odometry_error"] = (self.simulation.believed["center"] - s["center"]).norm(dim=-1)
         if self.settings.odometry.map_errors:
             info["map_error"] = self.simulation.map_error().unsqueeze(-1)

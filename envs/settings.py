@@ -68,7 +68,7 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
         local_steps=int(settings.local_steps),
         macro_steps=int(settings.macro_steps),
         success_coverage=float(settings.success_coverage),
-        limited=settings.limited or comm.limited or faults.some,
+        limited=settings.limited or comm.limited or faults.enabled,
     )
 
 
@@ -153,10 +153,10 @@ def check_done(done: str, comm: CommConfig) -> None:
 
 def check_failing(config: FaultsConfig, num_robots: int, steps: int) -> None:
     """Raise ValueError if a robot fails that is not there, or after the episode's last step."""
-    for robot, moment in config.at:
+    for robot, inputs in config.at:
         if config.steps[robot] >= steps:
             raise ValueError(
-                f"faults.at: robot {shown(robot)} fails after {moment:g} s, and an episode ends at {steps * DT:g} s: "
+                f"faults.at: robot {shown(robot)} fails after {inputs:g} s, and an episode ends at {steps * DT:g} s: "
                 f"give {(steps - 1) * DT:g} s, when its last step begins, or less"
             )
         if robot >= num_robots:

@@ -54,9 +54,9 @@ def info_shapes(settings: EnvSettings) -> tuple[dict[str, torch.dtype], dict[str
         base, counted = settings.comm.has_base, settings.done != "union"
         team |= INFO_RADIO | (INFO_BASE if base else {}) | (INFO_COUNTED if counted else {})
         robot["connected"] = torch.float32
-    if settings.faults.some:
+    if settings.faults.enabled:
         robot["failed"] = torch.bool
-    if settings.odometry.some:
+    if settings.odometry.enabled:
         robot["odometry_error"] = torch.float32
     if settings.odometry.map_errors:
         team |= INFO_MAPS

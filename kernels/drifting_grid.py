@@ -7,7 +7,7 @@ import warp as wp
 
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.occupancy_grid import KnownGrids, NavGrids, _clear_stale, enter_cell, wall_words
+from maexp.kernels.occupancy_grid import KnownGrids, NavGrids, _clear_stale, enter_cell, wall_bits
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
 
@@ -80,7 +80,7 @@ def _copy_drawn(
         if value != before:
             if before == wp.uint8(OBSTACLE):
                 x = cell % w
-                wp.atomic_and(walls, row, cell / w * wall_words(w) + x / 32, ~(1 << (x % 32)))
+                wp.atomic_and(walls, row, cell / w * wall_bits(w) + x / 32, ~(1 << (x % 32)))
             if before == wp.uint8(OBSTACLE) or value == wp.uint8(UNKNOWN):
                 stale[row] = 1
             enter_cell(row, cell, w, value, True, known, walls, news, news_count)

@@ -12,7 +12,7 @@ from maexp.kernels.constants import MARGIN_CELLS, UNREACHED
 from maexp.kernels.cpp_snippets import has_wall
 from maexp.kernels.frontier import is_frontier
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.occupancy_grid import NavGrids, wall_words
+from maexp.kernels.occupancy_grid import NavGrids, wall_bits
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.wavefront import PathSearch
 
@@ -72,7 +72,7 @@ def _note_changes(
     w = width[map_of_row[row]]
     for k in range(lane, news_count[row], lanes):
         x = news[row, k] % w
-        wp.atomic_or(changed, row, news[row, k] / w * wall_words(w) + x / 32, 1 << (x % 32))
+        wp.atomic_or(changed, row, news[row, k] / w * wall_bits(w) + x / 32, 1 << (x % 32))
     if grid_of_row[row] >= 0 and (anew or renewed[row] != 0):
         for k in range(lane, size.shape[1], lanes):
             size[row, k] = 0
@@ -123,7 +123,7 @@ def _sum_frontier(
     h = grids.height[m]
     if y >= h:
         return
-    across = wall_words(w)
+    across = wall_bits(w)
     b = block[m]
     first = y / b * ((w + b - 1) / b)
     for word in range(across):
@@ -227,7 +227,7 @@ def place_target(
 def has_changed(changed: wp.array2d(dtype=wp.int32), row: int, low: int, high: int, w: int) -> bool:
     """Whether a cell has changed in the box between two."""
     for y in range(low / w, high / w + 1):
-        if has_wall(changed, row, y * wall_words(w), low % w, high % w):
+        if has_wall(changed, row, y * wall_bits(w), low % w, high % w):
             return True
     return False
 
@@ -245,14 +245,14 @@ def _place_targets(
     distance: wp.array2d(dtype=wp.int32),  # [item, cell]
     changed: wp.array2d(dtype=wp.int32),  # [row, word]
     renewed: wp.array(dtype=wp.int32),  # [row], what was kept is of another map
-    looked_at: wp.array3d(dtype=wp.int32),  # [row, block, 2], corners of what was looked at from there
+    cached_window: wp.array3d(dtype=wp.int32),  # [row, block, 2], corners of what was looked at from there
     # Settings:
     rows_per_env: int,
     robots: int,
     lanes: int,
     # Out:
     target_cell: wp.array2d(dtype=wp.int32),  # [row, block], cell to go to; -1 = none
-    looked_from: wp.array2d(dtype=wp.int32),  # [row, block], the cell whose outlook still holds; -1 = none
+    cached_from: wp.array2d(dtype=wp.int32),  # [row, block], the cell whose outlook still holds; -1 = none
 ):
     """Where to go for each block with frontier cells."""
     row, lane = wp.tid()
@@ -267,11 +267,11 @@ def _place_targets(
                 row, k, w, grids.height[m], block[m], search[m], size, sums, distance, rows_per_env, robots
             )
         target_cell[row, k] = cell
-        if looked_from[row, k] >= 0:
-            if looked_from[row, k] != cell or renewed[row] != 0:
-                looked_from[row, k] = -1
-            elif has_changed(changed, row, looked_at[row, k, 0], looked_at[row, k, 1], w):
-                looked_from[row, k] = -1
+        if cached_from[row, k] >= 0:
+            if cached_from[row, k] != cell or renewed[row] != 0:
+                cached_from[row, k] = -1
+            elif has_changed(changed, row, cached_window[row, k, 0], cached_window[row, k, 1], w):
+                cached_from[row, k] = -1
 
 
 @wp.kernel
@@ -312,10 +312,10 @@ BLOCKS = {
     "target_cell": Field(wp.int32, "row block", "", "the cell to go to; -1 = none"),
     "listed": Field(wp.int32, "env block", "", "the blocks with a target in some row of the env, in order"),
     "count": Field(wp.int32, "env", "", "how many those are"),
-    "looked_from": Field(wp.int32, "row block", "", "the target whose outlook still holds; -1 = none", -1),
-    "looked_at": Field(wp.int32, "row block two", "", "lower and upper corner of what was looked at from there"),
-    "kept_area": Field(wp.float32, "row block", "cells", "unknown ones seen from there"),
-    "kept_middle": Field(wp.vec2, "row block", "m", "their middle, from there"),
+    "cached_from": Field(wp.int32, "row block", "", "the target whose outlook still holds; -1 = none", -1),
+    "cached_window": Field(wp.int32, "row block two", "", "lower and upper corner of what was looked at from there"),
+    "cached_area": Field(wp.float32, "row block", "cells", "unknown ones seen from there"),
+    "cached_middle": Field(wp.vec2, "row block", "m", "their middle, from there"),
 }
 """Arrays of `FrontierBlocks`; rows are those of `KNOWN`."""
 

@@ -179,7 +179,7 @@ def _compare_with_others(
         mates_last[e, i, k] = wp.sqrt(mates_last[e, i, k])
 
 
-def compare_with_others(
+def compare_with_mates(
     point: torch.Tensor,
     best: torch.Tensor,
     ways: torch.Tensor,

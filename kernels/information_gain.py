@@ -100,11 +100,11 @@ def _look_from_targets(
     ray_cell: wp.array2d(dtype=wp.vec2i),  # [ray, step]
     ray_part: wp.array2d(dtype=wp.vec3),  # [ray, step]
     # In and out:
-    looked_from: wp.array2d(dtype=wp.int32),  # [row, block], the cell whose outlook still holds; -1 = none
-    kept_area: wp.array2d(dtype=wp.float32),  # [row, block]
-    kept_middle: wp.array2d(dtype=wp.vec2),  # [row, block]
+    cached_from: wp.array2d(dtype=wp.int32),  # [row, block], the cell whose outlook still holds; -1 = none
+    cached_area: wp.array2d(dtype=wp.float32),  # [row, block]
+    cached_middle: wp.array2d(dtype=wp.vec2),  # [row, block]
     # Out:
-    looked_at: wp.array3d(dtype=wp.int32),  # [row, block, 2], corners of what was looked at
+    cached_window: wp.array3d(dtype=wp.int32),  # [row, block, 2], corners of what was looked at
     area: wp.array3d(dtype=wp.float32),  # [look, row, slot]
     middle: wp.array3d(dtype=wp.vec2),  # [look, row, slot]
 ):
@@ -116,12 +116,12 @@ def _look_from_targets(
     if at >= 0:
         row = env[s] * rows_per_env + r
         k = int(block[s, 0, slot])
-        if looked_from[row, k] != at:
+        if cached_from[row, k] != at:
             total, way, low, high = look_from(grids, map_id[env[s]], known, row, at, ray_cell, ray_part, radius)
-            kept_area[row, k] = total
-            kept_middle[row, k] = way
-            looked_at[row, k, 0] = low
-            looked_at[row, k, 1] = high
-            looked_from[row, k] = at
-        area[s, r, slot] = kept_area[row, k]
-        middle[s, r, slot] = kept_middle[row, k]
+            cached_area[row, k] = total
+            cached_middle[row, k] = way
+            cached_window[row, k, 0] = low
+            cached_window[row, k, 1] = high
+            cached_from[row, k] = at
+        area[s, r, slot] = cached_area[row, k]
+        middle[s, r, slot] = cached_middle[row, k]

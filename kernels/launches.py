@@ -19,7 +19,8 @@ Launch = Callable[[wp.Kernel, int | tuple[int, ...], Sequence], None]
 """``launch(kernel, dim, arguments)`` launches a kernel at once, or records it."""
 
 EAGER = os.environ.get("MAEXP_EAGER", "0") not in ("", "0")
-"""Debugging: every stage runs anew instead of being replayed, so that a breakpoint in it stops. Same results, slower."""
+"""Debugging: every stage runs anew instead of being replayed, so that a breakpoint in it stops. Same results,
+slower."""
 
 CPU_LANES = 1
 """Threads that share the work of a robot or a row on the CPU, where a thread costs more than an item."""

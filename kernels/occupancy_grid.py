@@ -59,7 +59,7 @@ def nav_center(grids: NavGrids, m: int, cell: int) -> wp.vec2:
 
 
 @wp.func
-def wall_words(width: int) -> int:
+def wall_bits(width: int) -> int:
     """Words of a row of the bitmap of walls."""
     return (width + 31) / 32
 
@@ -91,7 +91,7 @@ def enter_cell(
     known[row, cell] = value
     if value == wp.uint8(OBSTACLE):
         x = cell % w
-        wp.atomic_or(walls, row, cell / w * wall_words(w) + x / 32, 1 << (x % 32))
+        wp.atomic_or(walls, row, cell / w * wall_bits(w) + x / 32, 1 << (x % 32))
     if listed:
         slot = wp.atomic_add(news_count, row, 1)
         if slot < news.shape[1]:

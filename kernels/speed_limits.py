@@ -10,7 +10,7 @@ import warp as wp
 from maexp.kernels.cpp_snippets import nearest_wall
 from maexp.kernels.dynamics import Robots
 from maexp.kernels.launches import Launch
-from maexp.kernels.occupancy_grid import NavGrids, nav_center, wall_words
+from maexp.kernels.occupancy_grid import NavGrids, nav_center, wall_bits
 from maexp.kernels.path_steps import PATH_CELLS, path_slot
 from maexp.kernels.shards import Shard
 from maexp.kernels.startup import MODULE_OPTIONS
@@ -61,7 +61,7 @@ def nearest_obstacle(grids: NavGrids, m: int, walls: wp.array2d(dtype=wp.int32),
     """Distance to the nearest known obstacle cell [m], `LOOK_CELLS` cells at most."""
     p = (at - grids.origin[m]) / grids.cell[m]
     w = grids.width[m]
-    return nearest_wall(walls, row, p, w, grids.height[m], wall_words(w)) * grids.cell[m]
+    return nearest_wall(walls, row, p, w, grids.height[m], wall_bits(w)) * grids.cell[m]
 
 
 @wp.func

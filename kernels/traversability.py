@@ -11,7 +11,7 @@ from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import BLOCKED, FREE, OBSTACLE, TIGHT, UNKNOWN
 from maexp.kernels.cpp_snippets import has_wall
 from maexp.kernels.launches import Launch, launch_named
-from maexp.kernels.occupancy_grid import KnownGrids, NavGrids, wall_words
+from maexp.kernels.occupancy_grid import KnownGrids, NavGrids, wall_bits
 from maexp.kernels.startup import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
@@ -70,7 +70,7 @@ def half_chord(gap: int, radius: float, most: int) -> int:
 @wp.func
 def near_wall(walls: wp.array2d(dtype=wp.int32), row: int, x: int, y: int, w: int, h: int, radius: float) -> bool:
     """Whether a known obstacle lies nearer to a cell than a radius, in cells."""
-    across = wall_words(w)
+    across = wall_bits(w)
     half = int(wp.ceil(radius))
     for gap in range(int(wp.ceil(radius)) + 1):
         half = half_chord(gap, radius, half)

@@ -15,14 +15,14 @@ from maexp.agents.benchmarks.plan import (
     Cell,
     cell_config,
     cell_folder,
-    find_cell_player,
+    find_cell_policy,
     is_learned,
     training_cell,
     word_names,
 )
 from maexp.agents.build import load_maps, make_env, model_settings
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.evaluation.cache import FOLDER, Kept, identify
+from maexp.agents.evaluation.cache import FOLDER, EpisodeCache, identify
 from maexp.agents.evaluation.comparison import CHOOSING
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded
 from maexp.agents.evaluation.results import FORMAT, describe_run
@@ -117,7 +117,7 @@ def play_suite(
     """
     with blame_input():
         maps = getattr(load_maps(settings.scenario, train=suite == "trained"), _ATTRIBUTE[suite])
-        player = find_cell_player(cfg, cell) if team is None else None
+        player = find_cell_policy(cfg, cell) if team is None else None
         if player is not None:
             show_what_it_looks_at(settings, player, maps)
         key = f"{cell.scenario} {cell.seed} {cell.map} {suite} {settings.observation}"
@@ -129,7 +129,7 @@ def play_suite(
         if suite != VALIDATION and not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
             write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
     source = "" if player is None else player.source
-    kept = Kept(folder / FOLDER / suite, identify(settings, env, episodes, policy, cell.policy, source))
+    kept = EpisodeCache(folder / FOLDER / suite, identify(settings, env, episodes, policy, cell.policy, source))
     begin = time.perf_counter()
     with Progress(f"evaluating on {suite}", episodes) as progress:
         how = {"name": cell.policy, "seed": cell.seed, "advance": progress.advance, "kept": kept}

@@ -14,7 +14,7 @@ from maexp.agents.command_words import as_list, check_names
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.registry import NamedPolicy, check_planner, find_player, name_players
+from maexp.agents.policies.registry import NamedPolicy, check_planner, find_named_policy, name_policies
 from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import quote
@@ -146,23 +146,23 @@ def policy_names(cfg: BenchmarkSettings) -> list[str]:
 def word_names(cfg: BenchmarkSettings) -> dict[str, str]:
     """The words that name policies, and what the tables call these."""
     words = [str(word) for word in dict.fromkeys(as_list(cfg.algorithms) + as_list(cfg.policies))]
-    return name_players([word for word in words if word not in TRAININGS], "policies", TRAININGS)
+    return name_policies([word for word in words if word not in TRAININGS], "policies", TRAININGS)
 
 
-def find_cell_player(cfg: BenchmarkSettings, cell: Cell) -> NamedPolicy:
+def find_cell_policy(cfg: BenchmarkSettings, cell: Cell) -> NamedPolicy:
     """The policy of a cell that is not trained.
 
     Raises:
         UserError: it is damaged, or gone.
     """
     word = next(word for word, name in word_names(cfg).items() if name == cell.policy)
-    return find_player(word, "policies", cell.policy)
+    return find_named_policy(word, "policies", cell.policy)
 
 
 def policy_sources(cfg: BenchmarkSettings) -> dict[str, str]:
     """By its name, what changes with a policy that does not come with the package."""
-    players = [find_player(word, "policies", name) for word, name in word_names(cfg).items()]
-    return {player.name: player.source for player in players if player.source}
+    policies = [find_named_policy(word, "policies", name) for word, name in word_names(cfg).items()]
+    return {policy.name: policy.source for policy in policies if policy.source}
 
 
 def check_lists(cfg: DictConfig) -> None:
@@ -180,8 +180,8 @@ def check_lists(cfg: DictConfig) -> None:
         check_distinct(name, as_list(cfg[name]))
     for seed in as_list(cfg.seeds):
         check_seed(seed, "seeds")
-    players = [find_player(word, "policies", name) for word, name in word_names(cfg).items()]
-    check_planner(cfg.planner.name, players)
+    policies = [find_named_policy(word, "policies", name) for word, name in word_names(cfg).items()]
+    check_planner(cfg.planner.name, policies)
     _check_policy_per_map(cfg)
     _check_together(cfg)
 

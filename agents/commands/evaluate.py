@@ -21,15 +21,15 @@ from maexp.agents.evaluation.baseline import (
     load_baseline,
     write_episodes,
 )
-from maexp.agents.evaluation.cache import FOLDER, Kept, begin, continue_evaluation, identify, is_begun
+from maexp.agents.evaluation.cache import FOLDER, EpisodeCache, begin, continue_evaluation, identify, is_begun
 from maexp.agents.evaluation.comparison import choose_best, describe_differences, describe_training, play_once
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate_recorded, play, pool
 from maexp.agents.evaluation.results import describe_run, print_results, result_names, write_results
 from maexp.agents.evaluation.video import EPISODES, check_render, play_teams, write_film
 from maexp.agents.files import command, lock, short, write_json
-from maexp.agents.policies.registry import NamedPolicy, check_planner, find_players, suit_observation
+from maexp.agents.policies.registry import NamedPolicy, check_planner, find_named_policies, suit_observation
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import team_sizes, words_of
+from maexp.agents.settings.checks import choices_of, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.resolved import resolve
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -66,7 +66,7 @@ def folder(overrides: list[str], claim: Callable[[], Path]) -> Path:
 def check(cfg: EvaluateSettings) -> None:
     """Raise UserError for team sizes that are none and unknown policies."""
     team_sizes(cfg.num_robots)
-    check_planner(cfg.planner.name, find_players(words_of(cfg.policy)))
+    check_planner(cfg.planner.name, find_named_policies(choices_of(cfg.policy)))
     check_render(cfg)
 
 
@@ -127,7 +127,7 @@ def run_locked(cfg: EvaluateSettings, where: Path, overrides: list[str]) -> int:
 def find_teams(cfg: EvaluateSettings) -> list[NamedPolicy]:
     """Who is evaluated: the policy of `checkpoint`, then those of `policy`."""
     trained = [] if cfg.checkpoint is None else [find_trained(cfg)]
-    return trained + find_players(words_of(cfg.policy))
+    return trained + find_named_policies(choices_of(cfg.policy))
 
 
 def find_trained(cfg: EvaluateSettings | ViewSettings | ExportSettings) -> NamedPolicy:
@@ -148,7 +148,7 @@ def evaluate_all(
     for player in players:
         policy = player.make(env)
         identity = identify(cfg, env, cfg.episodes, policy, player.name, player.source)
-        kept = Kept(where / f"{player.name}_N{env.num_robots}", identity)
+        kept = EpisodeCache(where / f"{player.name}_N{env.num_robots}", identity)
         with Progress(f"{player.name}, {env.num_robots} robot{'s' * (env.num_robots > 1)}", cfg.episodes) as progress:
             settings = {"name": player.name, "seed": cfg.seed, "advance": progress.advance, "kept": kept}
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_json
-from maexp.agents.policies.registry import find_player
+from maexp.agents.policies.registry import find_named_policy
 from maexp.agents.settings.storable import read
 from maexp.agents.settings.verbs import IrsimSettings
 from maexp.envs import PointCloudMap
@@ -25,7 +25,7 @@ def check(cfg: IrsimSettings) -> None:
         raise UserError("maexp irsim needs a floor after it: a floor plan, a scan or a saved map.")
     from maexp.agents.deploy.irsim.policies import check_player
 
-    check_player(cfg.policy, find_player(cfg.policy))
+    check_player(cfg.policy, find_named_policy(cfg.policy))
     if importlib.util.find_spec("irsim") is None:
         raise UserError('maexp irsim needs the simulator ir-sim: pip install "maexp[irsim]".')
 
@@ -41,13 +41,13 @@ def run(cfg: IrsimSettings, where: Path, overrides: list[str]) -> int:
     with blame_input():
         world = import_file(cfg.floor, read(ImportOptions, cfg.importing))
         config = make_config(cfg, world)
-        player = find_player(cfg.policy)
+        player = find_named_policy(cfg.policy)
         env = policies.make_team(world, cfg.num_robots, config, player.targets or 0)
         starts = policies.draw_starts(env, cfg.episode)
         frames: list[np.ndarray] = []
         planner = make_planner(cfg.policy, player, config, env, where)
         trial = run_trial(
-            world, planner, starts, config, lambda moment: frames.append(draw_moment(moment, config.body_radius))
+            world, planner, starts, config, lambda inputs: frames.append(draw_moment(inputs, config.body_radius))
         )
     curves = {"ir-sim": trial.coverage}
     rows = {"ir-sim": measure(trial.coverage, config.seconds) | {"collisions": int(trial.collided.sum())}}

@@ -95,12 +95,12 @@ def _show(cfg: SuiteSettings, where: None) -> int:
 
 
 def _run(cfg: SuiteSettings, where: Path) -> int:
-    from maexp.agents.benchmarks.suites.play import Player
+    from maexp.agents.benchmarks.suites.play import SuitePolicy
 
     suite = load_suite(cfg.place)
     suite.check()
     limit = suite.decision_limit if cfg.decision_limit is None else cfg.decision_limit
-    player = Player(cfg.policy, limit, cfg.patience, cfg.name)
+    player = SuitePolicy(cfg.policy, limit, cfg.patience, cfg.name)
     settings = {name: cfg[name] for name in KEPT} | {"decision_limit": limit}
     if player.hosted and not cfg.resume:
         settings["num_envs"] = min(cfg.num_envs, cfg.workers or player.most_teams)

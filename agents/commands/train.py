@@ -15,8 +15,8 @@ from maexp.agents.evaluation.cache import FOLDER
 from maexp.agents.evaluation.comparison import find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import command, lock, short
-from maexp.agents.policies.registry import NamedPolicy, find_players, suit_observation
-from maexp.agents.settings.checks import team_sizes, words_of
+from maexp.agents.policies.registry import NamedPolicy, find_named_policies, suit_observation
+from maexp.agents.settings.checks import choices_of, team_sizes
 from maexp.agents.settings.overrides import find_override
 from maexp.agents.settings.runs import Recipe, continue_run
 from maexp.agents.settings.verbs import TrainSettings
@@ -80,8 +80,8 @@ def check(cfg: TrainSettings) -> None:
 
 def find_others(cfg: TrainSettings) -> list[NamedPolicy]:
     """The policies played at the end beside the trained one."""
-    words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
-    others = find_players(words, "classical")
+    words = list(dict.fromkeys(["random", *choices_of(cfg.classical)]))
+    others = find_named_policies(words, "classical")
     return (
         [player for player in others if player.direct] if cfg.planner.name == "direct" else others
     )  # the rest pick goals
@@ -139,7 +139,7 @@ def finish(done: TrainingRun) -> None:
     """Evaluate the trained team beside what it started from and others; write the summary and the pictures."""
     cfg, where = judged(done.cfg), done.folder
     written, results = ["config.yaml", "metrics.csv", "checkpoints/"], []
-    players = [trained_player(done), *start_players(done), *find_others(cfg)]
+    players = [trained_policy(done), *starting_policies(done), *find_others(cfg)]
     best = done.validation.best if cfg.episodes or cfg.evaluate_every else {}
     shown = copy.deepcopy(cfg)
     suit_observation(shown, players)
@@ -162,20 +162,20 @@ def finish(done: TrainingRun) -> None:
     print(f"Next: {evaluate}, or {command('view', short(where))}")
 
 
-def trained_player(done: TrainingRun) -> NamedPolicy:
+def trained_policy(done: TrainingRun) -> NamedPolicy:
     """The team that was trained."""
     looks, direct = model_settings(done.cfg).action == "regions", done.cfg.planner.name == "direct"
     return NamedPolicy("trained", lambda env: done.learner.policy, "checkpoint", pictures=looks, direct=direct)
 
 
-def start_players(done: TrainingRun) -> list[NamedPolicy]:
+def starting_policies(done: TrainingRun) -> list[NamedPolicy]:
     """The team as it was before its training; none where that checkpoint is gone."""
     try:
         saved = load_checkpoint(done.folder / "checkpoints" / START)
     except UserError as error:
         warnings.warn(f"what the training started from is left out: {error}", stacklevel=2)
         return []
-    model, like = model_settings(done.cfg), trained_player(done)
+    model, like = model_settings(done.cfg), trained_policy(done)
     name = "warm_start" if done.cfg.warm_start else "untrained"
     return [replace(like, name=name, kind="start", build=lambda env: restore_policy(env, model, saved))]
 

@@ -11,7 +11,7 @@ from maexp.agents.commands.run_folder import remove_if_empty
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.video import EPISODES, play_teams
 from maexp.agents.files import command, short
-from maexp.agents.policies.registry import check_planner, find_player, suit_observation
+from maexp.agents.policies.registry import check_planner, find_named_policy, suit_observation
 from maexp.agents.settings.groups import MOST_TEAMS
 from maexp.agents.settings.overrides import find_override, quote, without
 from maexp.agents.settings.runs import Recipe, continue_run
@@ -52,7 +52,7 @@ def check(cfg: ViewSettings) -> None:
     if cfg.episode is not None and not 0 <= cfg.episode <= last:
         raise UserError(f"episode={cfg.episode} must be a whole number from 0 to {last}.")
     if cfg.policy is not None and not holds_episodes(cfg.place):  # there it only picks some of what was recorded
-        check_planner(cfg.planner.name, [find_player(cfg.policy)])
+        check_planner(cfg.planner.name, [find_named_policy(cfg.policy)])
     if cfg.policy is not None and cfg.checkpoint is not None:
         raise UserError(f"policy={cfg.policy} and the run {cfg.checkpoint} were both given: give one of them.")
     if cfg.renderer not in show.RENDERERS:
@@ -115,7 +115,7 @@ def find_subject(cfg: ViewSettings, where: Path) -> tuple[list[Episode], PointCl
         return [], find_map(cfg, place)
     given_map = place is not None or cfg.index is not None
     maps = [find_map(cfg, place)] if given_map else load_maps(cfg.scenario, train=False).held_out
-    player = find_trained(cfg) if cfg.checkpoint is not None else find_player(cfg.policy)
+    player = find_trained(cfg) if cfg.checkpoint is not None else find_named_policy(cfg.policy)
     suit_observation(cfg, [player])
     player.check_maps(maps)
     env, first, name = make_env(cfg, maps, cfg.num_robots), cfg.episode or 0, player.name
@@ -221,7 +221,7 @@ def show_scene(cfg: ViewSettings, episodes: list[Episode], world: PointCloudMap 
     snapshot = None
     if episodes:
         snapshot = episodes[0].snapshot(record_at(episodes[0], cfg.seconds))
-        scene = make_stage(cfg, episodes[0].map, True).moment(snapshot, cfg.seen_by)
+        scene = make_stage(cfg, episodes[0].map, True).inputs(snapshot, cfg.seen_by)
     else:
         scene = make_stage(cfg, world, False).empty()
     view = {"azimuth": cfg.azimuth, "elevation": cfg.elevation}

@@ -27,7 +27,7 @@ FOLDER = "batches"
 """Of a run; gone when its results are written."""
 
 
-class Kept:
+class EpisodeCache:
     """The batches of one policy in one env.
 
     Args:

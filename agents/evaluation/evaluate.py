@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from maexp.agents.evaluation.cache import Kept, go_on_with_random_numbers, random_numbers
+from maexp.agents.evaluation.cache import EpisodeCache, go_on_with_random_numbers, random_numbers
 from maexp.agents.evaluation.metric_format import Evidence
 from maexp.envs.metrics import episode_metrics, label_copies, resample_weights, summarise
 from maexp.envs.recorder import CoverageRecorder
@@ -124,7 +124,7 @@ def evaluate(
     seed: int = 0,
     advance: Callable[[int], None] = lambda count: None,
     recorder: CoverageRecorder | None = None,
-    kept: Kept | None = None,
+    kept: EpisodeCache | None = None,
 ) -> EvaluationResult:
     """Play episodes 0 .. `episodes` - 1, each to its end, `env.num_envs` at once.
 
@@ -155,7 +155,7 @@ def evaluate(
 
 
 def _play_or_read(
-    policy: Callable, env, numbers: torch.Tensor, recorder: CoverageRecorder | None, kept: Kept | None
+    policy: Callable, env, numbers: torch.Tensor, recorder: CoverageRecorder | None, kept: EpisodeCache | None
 ) -> tuple[TensorDict, list[int]]:
     """The last step's info of a batch of episodes and the numbers of their maps, from `kept` where it is there."""
     first = int(numbers[0])

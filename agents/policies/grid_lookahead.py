@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from maexp.agents.deploy.planner.arena_policy import go_beyond
-from maexp.agents.deploy.planner.assignment import Shares
+from maexp.agents.deploy.planner.assignment import DistinctTargets
 from maexp.agents.deploy.planner.features import Motion
 from maexp.agents.deploy.planner.grid import KnownGrid
 from maexp.agents.deploy.planner.grid_search import coarsen
@@ -80,7 +80,7 @@ class Foresight:
             notes: why there is no search is added, in a sentence.
         """
         start = time.monotonic()
-        shares = Shares(preference, scene.travel, scene.points, team.radius[scene.robots], self.distinct)
+        shares = DistinctTargets(preference, scene.travel, scene.points, team.radius[scene.robots], self.distinct)
         own = shares.settle()
         if self.config.candidates < 2 or np.isfinite(scene.travel).sum(-1).max(initial=0) < 2:
             return preference

@@ -22,7 +22,7 @@ from maexp.agents.policies.rollouts import (
 )
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.targets.heuristics import Array, Scene, value_targets
-from maexp.envs.targets.observation import TargetView, pick_places
+from maexp.envs.targets.observation import TargetView, gather_points
 from maexp.envs.targets.tracker import TargetTracker, TensorScene
 
 HIDDEN = -1e3  # what targets are worth that the policy is not shown [radar discs]: less than any
@@ -43,7 +43,7 @@ class TrainedRank:
 
     def __init__(self, word: str, env: ExplorationEnv, tracker: TargetTracker, setting: str):
         chooser, count = load_chooser(word, setting)
-        if chooser.radio and not env.settings.tells_of_radios:
+        if chooser.radio and not env.settings.observes_radios:
             raise UserError(
                 f"{setting}={word} was trained with observation.radio=true, and the env shows nothing of radios: add "
                 "observation.radio=true."
@@ -126,7 +126,7 @@ class LookaheadPlanner(FrontierPlanner):
         there = (index >= 0) & scene.alive.unsqueeze(-1)
         place = index.clamp_min(0)
         cell, block = scene.cells().gather(2, place), scene.block.gather(2, place)
-        toward, point = (pick_places(points, place) for points in (scene.middle, scene.points))
+        toward, point = (gather_points(points, place) for points in (scene.middle, scene.points))
         block = torch.where(index >= 0, block, -1)
         value = (preference if self.trained else value_in_turn(scene)).gather(2, place)
         value = torch.where(there & there[..., :1], value - value[..., :1], 0.0)

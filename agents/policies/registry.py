@@ -20,7 +20,7 @@ from maexp.agents.files import warn_of_changed_maps
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
 from maexp.agents.policies.names import describe_unknown, plug_ins
 from maexp.agents.policies.pretrained import is_exported, load_policy_folder, open_policy, read_model
-from maexp.agents.policies.remote.user_policy import find_own, is_foreign, is_reference, make_own, source_of
+from maexp.agents.policies.remote.user_policy import find_own, is_numpy_policy, is_reference, make_own, source_of
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.model import ModelConfig
@@ -107,7 +107,7 @@ class NamedPolicy:
             warn_of_changed_maps(self.saved, maps)
 
 
-def find_player(word: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
+def find_named_policy(word: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
     """The policy that a word names.
 
     Args:
@@ -161,7 +161,7 @@ def _from_checkpoint(word: str, name: str) -> NamedPolicy:
 
 def _own(word: str, setting: str, name: str) -> NamedPolicy:
     found = find_own(word, setting)
-    foreign = is_foreign(found)
+    foreign = is_numpy_policy(found)
     return NamedPolicy(
         name,
         lambda env: make_own(found, env, name),
@@ -173,16 +173,16 @@ def _own(word: str, setting: str, name: str) -> NamedPolicy:
     )
 
 
-def find_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
+def find_named_policies(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
     """The policies of several words, with names of their own.
 
     Raises:
-        UserError: as `find_player`; or a policy is named twice.
+        UserError: as `find_named_policy`; or a policy is named twice.
     """
-    return [find_player(word, setting, name) for word, name in name_players(words, setting, taken).items()]
+    return [find_named_policy(word, setting, name) for word, name in name_policies(words, setting, taken).items()]
 
 
-def name_players(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> dict[str, str]:
+def name_policies(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> dict[str, str]:
     """word -> its name in tables: the short one, with the folders above it where that is another's.
 
     Raises:
@@ -218,15 +218,15 @@ def short_name(word: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name)
 
 
-def check_planner(planner: str, players: Sequence[NamedPolicy]) -> None:
+def check_planner(planner: str, policies: Sequence[NamedPolicy]) -> None:
     """Raise UserError where policies that pick goals meet a planner that takes controls, or the other way round."""
-    goals = [player.name for player in players if player.direct is False]
+    goals = [policy.name for policy in policies if policy.direct is False]
     if goals and planner == "direct":
         raise UserError(
             f"planner=direct takes controls, and {', '.join(goals)} pick{'s' if len(goals) == 1 else ''} goals: "
             "use planner=dwa or wavefront."
         )
-    controls = [player.name for player in players if player.direct]
+    controls = [policy.name for policy in policies if policy.direct]
     if controls and planner != "direct":
         raise UserError(
             f"{', '.join(controls)} {'was' if len(controls) == 1 else 'were'} trained with planner=direct, and "
@@ -234,25 +234,25 @@ def check_planner(planner: str, players: Sequence[NamedPolicy]) -> None:
         )
 
 
-def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> None:
+def suit_observation(cfg: CommonSettings, policies: Sequence[NamedPolicy]) -> None:
     """Let the env of the settings show what the policies look at, and nothing that nobody does.
 
     Raises:
         UserError: they look at different things, or the settings show another number of targets.
     """
-    counts = {player.name: player.targets for player in players if player.targets is not None}
+    counts = {policy.name: policy.targets for policy in policies if policy.targets is not None}
     if counts:
         counts |= {"observation.targets": cfg.observation.targets} if cfg.observation.targets else {}
         if len(set(counts.values())) > 1:
             told = ", ".join(f"{word} {count}" for word, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
         cfg.observation.targets = next(iter(counts.values()))
-    cfg.observation.radio = cfg.observation.radio or any(player.radio for player in players)
-    shown = {player.name: player.map for player in players if player.map is not None}
+    cfg.observation.radio = cfg.observation.radio or any(policy.radio for policy in policies)
+    shown = {policy.name: policy.map for policy in policies if policy.map is not None}
     if len(set(shown.values())) > 1:
         told = ", ".join(f"{word} {what}" for word, what in shown.items())
         raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
     if shown:
         cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True
-    elif not any(player.pictures for player in players):
+    elif not any(policy.pictures for policy in policies):
         cfg.observation.pictures = False

@@ -17,7 +17,7 @@ from maexp.agents.policies.pretrained import is_exported
 from maexp.envs import ExplorationEnv, LookaheadConfig
 from maexp.envs.imagined.branches import Branches
 from maexp.envs.imagined.maps import Beliefs, Guess, guess_nearest
-from maexp.envs.targets.observation import pick_places
+from maexp.envs.targets.observation import gather_points
 from maexp.envs.targets.tracker import TargetTracker
 
 ROLLOUT_POLICY = "lookahead.rollout_policy"
@@ -204,7 +204,7 @@ def search_in_turn(
 
 def _taken(robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor) -> torch.Tensor:
     """Which of a robot's candidates leave no room beside what those before it have chosen, bool [T, K]."""
-    where = pick_places(mine["point"], chosen.unsqueeze(-1)).squeeze(2)[:, :robot]  # [T, robot, 2]
+    where = gather_points(mine["point"], chosen.unsqueeze(-1)).squeeze(2)[:, :robot]  # [T, robot, 2]
     gap = (mine["point"][:, robot].unsqueeze(2) - where.unsqueeze(1)).norm(dim=-1)  # [T, K, robot]
     apart = (mine["body"][:, robot : robot + 1] + mine["body"][:, :robot]).unsqueeze(1)
     goes = mine["block"].gather(2, chosen.unsqueeze(-1)).squeeze(-1)[:, :robot] >= 0

@@ -49,7 +49,7 @@ def check_distinct(name: str, values: Sequence) -> None:
         raise UserError(f"{name}={','.join(map(str, values))} names {twice} twice: give each once.")
 
 
-def words_of(value: Any) -> list[str]:
+def choices_of(value: Any) -> list[str]:
     """The words of a setting that names one policy or several."""
     if value is None:
         return []

@@ -35,7 +35,7 @@ from maexp.envs.comm.strategy import Strategy
 from maexp.envs.config_fields import check_settings, setting
 from maexp.envs.imagined.branches import Branches
 from maexp.envs.scenarios import GENERATED, cut_last_fifth, find_scenario, split
-from maexp.envs.targets.observation import pick_places
+from maexp.envs.targets.observation import gather_points
 from maexp.envs.targets.tracker import TargetTracker
 
 SHOWN = 24  # candidates that a policy sees
@@ -62,7 +62,7 @@ class BranchingConfig:
     seed: int = setting(0, "of starts, departures and what is tried", low=0)
 
 
-class BranchPlayer:
+class BranchRollouts:
     """Teams that see targets, and what their candidates are worth.
 
     Args:
@@ -128,7 +128,7 @@ class BranchPlayer:
         s, count = self.view.state, self.view.count
         place, frontier = index.clamp(0, count - 1), (index >= 0) & (index < count)
         block = torch.where(frontier, s["block"].gather(2, place), -1)
-        toward = pick_places(s["toward"], place)
+        toward = gather_points(s["toward"], place)
         goal = self.rollouts.goals(block, s["cell"].gather(2, place), toward, waits)
         tells = index == count
         if self.view.contacts is not None:
@@ -172,7 +172,7 @@ class BranchingActor(TensorDictModuleBase):
         super().__init__()
         self.policy, self.share = policy, settings.branch_share
         horizon, learn_from = settings.branch_horizon, settings.learn_from
-        self.player = BranchPlayer(env, settings.candidates, horizon, learn_from=learn_from)
+        self.policy = BranchRollouts(env, settings.candidates, horizon, learn_from=learn_from)
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]
 
     @torch.no_grad()
@@ -180,13 +180,13 @@ class BranchingActor(TensorDictModuleBase):
         tensordict = self.policy(tensordict)
         features = tensordict[TARGETS]
         among = torch.rand(len(features), device=features.device) < self.share
-        tried, worth = self.player.try_candidates(features, tensordict[PREFERENCE], among)
+        tried, worth = self.policy.try_candidates(features, tensordict[PREFERENCE], among)
         tensordict[TRIED], tensordict[ADVANTAGE] = tried.to(torch.int8), worth
         return tensordict
 
 
 @torch.no_grad()
-def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfig) -> dict[str, np.ndarray]:
+def play_round(env: ExplorationEnv, policy: BranchRollouts, config: BranchingConfig) -> dict[str, np.ndarray]:
     """An episode of every team; what was seen and found at the decisions that were branched at.
 
     Returns:
@@ -196,7 +196,7 @@ def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfi
     Raises:
         UserError: no decision was branched at.
     """
-    found, td, draw = [], env.reset(), player.draw
+    found, td, draw = [], env.reset(), policy.draw
     running = torch.ones(env.num_envs, dtype=torch.bool)
     phase = int(torch.randint(config.every, (1,), generator=draw))
     share = 2.0 * config.departures * torch.rand(env.num_envs, 1, generator=draw)
@@ -204,9 +204,9 @@ def play_round(env: ExplorationEnv, player: BranchPlayer, config: BranchingConfi
         features, mask = td[TARGETS], td[TARGETS_MASK]
         preference = torch.where(mask, features[..., SCORE], NEVER)
         if step % config.every == phase:
-            found += [describe(env, step, features, mask, *player.try_candidates(features, preference))]
+            found += [describe(env, step, features, mask, *policy.try_candidates(features, preference))]
         leaves = torch.rand(mask.shape[:2], generator=draw) < share
-        other = player.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
+        other = policy.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
         preference = torch.where(leaves.unsqueeze(-1), other, preference).clamp_min(NEVER)
         td[(*ACTION, "preference")], td[(*ACTION, "target")] = preference, preference.argmax(-1)
         td = env.step(td)
@@ -271,7 +271,7 @@ def _write_round(config: BranchingConfig, scenario: str, turn: int, place: Path)
         planner=PlannerConfig(name="wavefront"),
         observation=ObservationConfig(pictures=False, targets=SHOWN),
     )
-    found = play_round(env, BranchPlayer(env, config.candidates, config.horizon, seed), config)
+    found = play_round(env, BranchRollouts(env, config.candidates, config.horizon, seed), config)
     write_file(place, lambda file: np.savez_compressed(file, names=np.array([world.name for world in maps]), **found))
     tried, seconds = int(np.isfinite(found["advantage"]).sum()), time.perf_counter() - begin
     log = place.parent / "costs.csv"

@@ -21,7 +21,7 @@ from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.models.actor import ALIVE, load_matching
 from maexp.agents.models.distributions import ACTION
-from maexp.agents.policies.registry import NamedPolicy, check_planner, find_player, suit_observation
+from maexp.agents.policies.registry import NamedPolicy, check_planner, find_named_policy, suit_observation
 from maexp.agents.progress import Progress
 from maexp.agents.settings.resolved import model_settings
 from maexp.agents.settings.verbs import TrainSettings
@@ -38,7 +38,7 @@ def check_warm_start(cfg: TrainSettings) -> None:
     """Raise UserError for a teacher that cannot be used."""
     if cfg.warm_start is None:
         return
-    teacher = find_player(cfg.warm_start, "warm_start")
+    teacher = find_named_policy(cfg.warm_start, "warm_start")
     check_planner(cfg.planner.name, [teacher])
     suit_observation(copy.deepcopy(cfg), [teacher])
     _check_kind(cfg, taught_by(teacher))
@@ -48,7 +48,7 @@ def starts_as(word: str | None) -> list[str]:
     """Overrides by which a policy starts from the planner that its teacher starts from, to take its weights; none
     where the teacher has no such network, or is none (`check_warm_start` says so)."""
     try:
-        model = None if word is None else find_player(word, "warm_start").model
+        model = None if word is None else find_named_policy(word, "warm_start").model
     except UserError:
         return []
     return [] if model is None else [f"model.starts_from={model.starts_from}"]
@@ -104,7 +104,7 @@ def warm_start(run: TrainingRun) -> None:
 def take_weights(run: TrainingRun) -> bool:
     """Give the policy of `run` its teacher's weights, where both have the same network; else False."""
     cfg = run.cfg
-    teacher = find_player(cfg.warm_start, "warm_start")
+    teacher = find_named_policy(cfg.warm_start, "warm_start")
     if teacher.model is None or teacher.model.policy != model_settings(cfg).policy:
         return False
     with blame_input():
@@ -134,7 +134,7 @@ def demonstrate(run: TrainingRun, rounds: int) -> Iterator[list[TensorDictBase]]
             make_env(cfg, run.suite.train, team.num_robots, team.num_envs, device=device)
             for team in divide_teams(cfg.num_envs, run.sizes)
         ]
-        teacher = find_player(cfg.warm_start, "warm_start")
+        teacher = find_named_policy(cfg.warm_start, "warm_start")
         teachers = [teacher.make(env) for env in envs]
     for _ in range(rounds):
         with torch.no_grad():

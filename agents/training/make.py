@@ -9,7 +9,7 @@ from typing import overload
 from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.models import actor
-from maexp.agents.policies.registry import find_player
+from maexp.agents.policies.registry import find_named_policy
 from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
@@ -51,4 +51,4 @@ def load_policy(name: str | PathLike, env: ExplorationEnv) -> Callable:
     Raises:
         UserError: no policy of that name, a damaged one, or one that does not fit the env.
     """
-    return find_player(fspath(name)).make(env)
+    return find_named_policy(fspath(name)).make(env)

@@ -16,7 +16,7 @@ from maexp.agents.build import MapSuite, choose_device, make_env
 from maexp.agents.evaluation.comparison import DECIDES, play_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, join
 from maexp.agents.policies.classical import CLASSICAL
-from maexp.agents.settings.checks import team_sizes, words_of
+from maexp.agents.settings.checks import choices_of, team_sizes
 from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
@@ -47,7 +47,7 @@ class Validation:
         self.cfg, self.suite = cfg, suite
         self.sizes = team_sizes(cfg.num_robots)
         self.episodes = math.ceil(cfg.evaluate_episodes / len(self.sizes))
-        words = [] if cfg.planner.name == "direct" else words_of(cfg.classical)  # controls: no planner gives these
+        words = [] if cfg.planner.name == "direct" else choices_of(cfg.classical)  # controls: no planner gives these
         self.planners = [word for word in words if word in CLASSICAL]
         self._rivals: dict[int, EvaluationResult] = {}
 

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from maexp.envs.simulation import radio_struct
-from maexp.envs.targets.features import DETOUR, Contacts, Moment, add_telling, predict_margin
+from maexp.envs.targets.features import DETOUR, Contacts, FeatureInputs, add_telling, predict_margin
 from maexp.envs.targets.heuristics import WAY_AHEAD
 from maexp.envs.targets.navigation import Navigation
 from maexp.kernels.constants import FREE, STRAIGHT, UNREACHED
@@ -40,15 +40,15 @@ class ContactView:
         """Bring the memory of the robots up to date."""
         self.env.strategy.look()
 
-    def add_to(self, moment: Moment, nav: Navigation) -> Moment:
+    def add_to(self, inputs: FeatureInputs, nav: Navigation) -> FeatureInputs:
         """The moment with one candidate more, [E, N, M + 1], to go and tell the base station, and with `Contacts`."""
         memory = self.env.strategy
         can = nav.pick(memory.can_tell()).unsqueeze(-1)
         base = nav.state["base"][:, None, :2]
-        to = (base - moment.at).unsqueeze(2)
+        to = (base - inputs.at).unsqueeze(2)
         way, begin = self._way_to_base(nav, base, to)
-        moment = add_telling(moment, can, way, begin, to)
-        return replace(moment, radio=self._contacts(moment, nav))
+        inputs = add_telling(inputs, can, way, begin, to)
+        return replace(inputs, radio=self._contacts(inputs, nav))
 
     def goals(self) -> torch.Tensor:
         """Where robots go that tell the base station, float32 [E, N, 2] [m]."""
@@ -71,7 +71,7 @@ class ContactView:
         ahead = nav.points_on_way(torch.where(reached, cell, -1), WAY_AHEAD) - nav.centers().unsqueeze(2)
         return way, torch.where(reached.unsqueeze(-1), ahead, to)
 
-    def _contacts(self, moment: Moment, nav: Navigation) -> Contacts:
+    def _contacts(self, inputs: FeatureInputs, nav: Navigation) -> Contacts:
         memory, steps = self.env.strategy, self.env.macro_steps
         n = self.env.num_robots
         disc, met, told, place = (
@@ -80,16 +80,16 @@ class ContactView:
         known, linked, step = (nav.pick(tensor) for tensor in (memory.known, memory.linked, memory.step))
         since = (step.unsqueeze(-1) - met) / steps
         untold = (known.unsqueeze(-1) - told) / disc.unsqueeze(-1)
-        point = moment.to + moment.at.unsqueeze(2)
+        point = inputs.to + inputs.at.unsqueeze(2)
         others = ~torch.eye(n, dtype=torch.bool, device=point.device).expand(len(point), -1, -1)
         mates_far = (point.unsqueeze(3) - place[:, :, None, :n]).norm(dim=-1)
         mates_far = torch.where((others & (met[..., :n] >= 0)).unsqueeze(2), mates_far, torch.inf).amin(-1)
         mates_untold = torch.where(others, untold[..., :n], 0.0).amax(-1, keepdim=True)
         mates_since = torch.where(others, since[..., :n], 0.0).sum(-1, keepdim=True) / max(n - 1, 1)
-        tells = torch.zeros_like(moment.mask)
-        tells[..., -1] = moment.mask[..., -1]
-        blank, flat = torch.zeros_like(moment.travel), torch.zeros_like(mates_since)
-        shared = {"mates_untold": mates_untold, "mates_since": mates_since, "mates_far": mates_far / moment.reach}
+        tells = torch.zeros_like(inputs.mask)
+        tells[..., -1] = inputs.mask[..., -1]
+        blank, flat = torch.zeros_like(inputs.travel), torch.zeros_like(mates_since)
+        shared = {"mates_untold": mates_untold, "mates_since": mates_since, "mates_far": mates_far / inputs.reach}
         if not self.comm.has_base:
             none = dict.fromkeys(("untold", "since", "linked", "way", "spare"), flat)
             return Contacts(tells=tells, **none, far=blank, signal=blank, **shared)
@@ -102,9 +102,9 @@ class ContactView:
             untold=untold[..., n:],
             since=since[..., n:],
             linked=linked[..., n:],
-            way=way / moment.reach,
+            way=way / inputs.reach,
             spare=((nav.pick(memory.rest) - (way / drive).squeeze(-1)) / steps).unsqueeze(-1),
-            far=gap / moment.reach,
+            far=gap / inputs.reach,
             signal=self._signal(nav, base, point, gap),
             **shared,
         )

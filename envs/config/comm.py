@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from maexp.envs.config.group import Group
-from maexp.envs.config_fields import is_finite, plain_numbers, setting, shown, words_of
+from maexp.envs.config_fields import choices_of, is_finite, plain_numbers, setting, shown
 from maexp.kernels.constants import DT, LOSS
 
 CELL_BYTES = 4  # of a message that tell of a cell: its number and what it is
@@ -106,4 +106,4 @@ def _check_base(base: Any) -> bool | tuple[float, float]:
     return float(place[0]), float(place[1])
 
 
-STRATEGIES = words_of(CommConfig, "strategy")
+STRATEGIES = choices_of(CommConfig, "strategy")

@@ -25,7 +25,7 @@ class FaultsConfig(Group):
     duration: float = setting(math.inf, "how long a failure lasts; inf: for good", unit="s", low=0.1, infinite=True)
 
     @property
-    def some(self) -> bool:
+    def enabled(self) -> bool:
         """Whether any robot may fail."""
         return self.probability > 0.0 or bool(self.at)
 
@@ -74,7 +74,7 @@ class OdometryConfig(Group):
     map_errors: bool = setting(False, "robots draw what they see where they believe it to be; else where it is")
 
     @property
-    def some(self) -> bool:
+    def enabled(self) -> bool:
         """Whether robots may be elsewhere than they believe."""
         return self.drift > 0.0 or self.turn > 0.0 or self.jump > 0.0
 
@@ -86,7 +86,7 @@ class OdometryConfig(Group):
                 f"odometry.jump={self.jump:g} m and odometry.jump_rate={self.jump_rate:g} 1/s: jumps need both, "
                 "or neither"
             )
-        if self.map_errors and not self.some:
+        if self.map_errors and not self.enabled:
             raise ValueError(
                 "odometry.map_errors=true and robots know where they are, so their maps are true: add odometry.drift, "
                 "odometry.turn or odometry.jump"

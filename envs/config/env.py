@@ -14,7 +14,7 @@ from maexp.envs.config.radar import RadarConfig
 from maexp.envs.config.reward import RewardConfig
 from maexp.envs.config.robot import RobotConfig
 from maexp.envs.config.targets import TargetsConfig
-from maexp.envs.config_fields import setting, words_of
+from maexp.envs.config_fields import choices_of, setting
 from maexp.envs.scenarios import Scenario, default_macro_steps
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class EnvSettings:
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
     @property
-    def tells_of_radios(self) -> bool:
+    def observes_radios(self) -> bool:
         """Whether robots are told of radios, and may choose to go and tell the base station."""
         return self.observation.radio and self.limited
 
@@ -108,7 +108,7 @@ GROUPS: dict[str, type[Group]] = {
     field.name: type(field.default) for field in fields(EnvSettings) if isinstance(field.default, Group)
 }
 """The groups of settings by their names."""
-DONE = words_of(EnvSettings, "done")
+DONE = choices_of(EnvSettings, "done")
 """Whose coverage ends an episode, numbered as in kernels/radio.py."""
 
 

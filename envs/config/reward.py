@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from maexp.envs.config.group import Group
-from maexp.envs.config_fields import setting, words_of
+from maexp.envs.config_fields import choices_of, setting
 
 
 @dataclass(frozen=True)
@@ -48,4 +48,4 @@ class RewardConfig(Group):
         return self
 
 
-TIME_ON = words_of(RewardConfig, "time_on")  # numbered as in kernels/reward.py
+TIME_ON = choices_of(RewardConfig, "time_on")  # numbered as in kernels/reward.py

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from maexp.envs.config.group import Group
-from maexp.envs.config_fields import check_value, kinds, setting, words_of
+from maexp.envs.config_fields import check_value, choices_of, kinds, setting
 from maexp.envs.scenarios import Scenario
 
 RobotKind = Literal["ackermann", "differential", "omnidirectional"]
@@ -63,4 +63,4 @@ class RobotConfig(Group):
                 )
 
 
-ROBOT_KINDS = words_of(RobotConfig, "kind")
+ROBOT_KINDS = choices_of(RobotConfig, "kind")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from maexp.envs.config.group import Group
-from maexp.envs.config_fields import setting, words_of
+from maexp.envs.config_fields import choices_of, setting
 
 Spare = Literal["wait", "home"]
 """Where robots go for which no target is left."""
@@ -24,4 +24,4 @@ class TargetsConfig(Group):
     )
 
 
-SPARE = words_of(TargetsConfig, "spare")
+SPARE = choices_of(TargetsConfig, "spare")

@@ -233,20 +233,20 @@ def repair_map(
         steps.append("found the boundary points anew")
     both = np.isin(_as_rows(world.free), _as_rows(world.obstacles))
     if both.any():
-        world = _replace(world, free_kept=~both)
+        world = _replace(world, free_mask=~both)
         steps.append(f"dropped {both.sum():,} free points that are obstacles too")
     if close_gaps:
         behind = _find_cut_off(world, threshold, start_clearance)
         if behind.any():
-            world = _replace(world, free_kept=~behind)
+            world = _replace(world, free_mask=~behind)
             steps.append(f"dropped {behind.sum():,} free points behind gaps too narrow for a robot")
     piece = label_components(world.free, world.free_spacing)
     if piece.any():
-        world = _replace(world, free_kept=piece == 0)
+        world = _replace(world, free_mask=piece == 0)
         steps.append(f"kept the largest of {piece.max() + 1} pieces: dropped {(piece > 0).sum():,} free points")
     unseen = _find_unseen(world, threshold, start_clearance)
     if unseen.any():
-        world = _replace(world, free_kept=~unseen)
+        world = _replace(world, free_mask=~unseen)
         steps.append(f"dropped {unseen.sum():,} free points that no robot can see from where it can go")
     for _ in range(SEAL_ROUNDS):  # a winding leak may need a second look
         wall = find_seal(world)
@@ -311,24 +311,24 @@ def _find_unseen(world: PointCloudMap, threshold: float, start_clearance: float)
     return unseen if unseen.mean() > 1 - VISIBLE_SHARE else np.zeros_like(unseen)
 
 
-def _replace(world: PointCloudMap, free_kept=None, wall=None) -> PointCloudMap:
+def _replace(world: PointCloudMap, free_mask=None, wall=None) -> PointCloudMap:
     """The map with some of its free points, and `wall` [m] as further obstacle points."""
-    if free_kept is None:
-        free_kept = np.ones(len(world.free), dtype=bool)
-    elif not free_kept.any():
+    if free_mask is None:
+        free_mask = np.ones(len(world.free), dtype=bool)
+    elif not free_mask.any():
         raise MapError(f"{world.name}: the repair would drop every free point; the map has no room for a robot")
     wall = np.zeros((0, 2)) if wall is None else wall
     spacing = np.full(len(wall), world.resolution, dtype=np.float32)
     floor = 0.0 if world.free_height is None else float(world.free_height.mean())
     return PointCloudMap(
-        world.free[free_kept],
+        world.free[free_mask],
         np.concatenate([world.obstacles, np.pad(wall, ((0, 0), (0, 1)))]),
         world.resolution,
         name=world.name,
         scenario=world.scenario,
-        free_spacing=world.free_spacing[free_kept],
+        free_spacing=world.free_spacing[free_mask],
         obstacle_spacing=np.concatenate([world.obstacle_spacing, spacing]),
-        free_height=None if world.free_height is None else world.free_height[free_kept],
+        free_height=None if world.free_height is None else world.free_height[free_mask],
         obstacle_height=None
         if world.obstacle_height is None
         else np.concatenate([world.obstacle_height, np.full(len(wall), floor)]),

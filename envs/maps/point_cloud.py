@@ -77,12 +77,12 @@ class PointCloudMap:
         obstacle_height=None,
     ):
         resolution = _check_resolution(resolution)
-        free, free_kept = _check_cloud("free", free, resolution)
-        obstacles, obstacles_kept = _check_cloud("obstacles", obstacles, resolution)
+        free, free_mask = _check_cloud("free", free, resolution)
+        obstacles, obstacle_mask = _check_cloud("obstacles", obstacles, resolution)
         if not len(free):
             raise MapError("free has 0 points; a map needs at least one free point to explore")
-        free_spacing = _check_spacing("free_spacing", free_spacing, free_kept, resolution)
-        obstacle_spacing = _check_spacing("obstacle_spacing", obstacle_spacing, obstacles_kept, resolution)
+        free_spacing = _check_spacing("free_spacing", free_spacing, free_mask, resolution)
+        obstacle_spacing = _check_spacing("obstacle_spacing", obstacle_spacing, obstacle_mask, resolution)
         _check_distances(free, resolution)
         if boundary is None:
             touching = find_boundary(free, obstacles, np.maximum(obstacle_spacing, resolution))
@@ -100,11 +100,9 @@ class PointCloudMap:
             "free_spacing": free_spacing,
             "obstacle_spacing": obstacle_spacing,
             "boundary_spacing": boundary_spacing,
-            "free_height": None if free_height is None else _check_per_point("free_height", free_height, free_kept),
+            "free_height": None if free_height is None else _check_per_point("free_height", free_height, free_mask),
             "obstacle_height": (
-                None
-                if obstacle_height is None
-                else _check_per_point("obstacle_height", obstacle_height, obstacles_kept)
+                None if obstacle_height is None else _check_per_point("obstacle_height", obstacle_height, obstacle_mask)
             ),
         }
         for field, value in values.items():

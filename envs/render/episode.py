@@ -181,9 +181,9 @@ class EpisodeRecorder:
             first = self._seen.setdefault(name, np.full(seen.shape, -1, dtype=np.int32))
             first[seen & (first < 0)] = record
         self._last = {name: snapshot[name] for name in ("map", "body", "radar_range")}
-        moment = {name: snapshot[name] for name in ("pose", "center", "goal", "waypoint", "collided")}
-        moment |= {"step": np.int32(snapshot["local_step"]), "coverage": np.float32(snapshot["coverage"])}
-        self._moments.append(moment | {"visible": np.packbits(snapshot["visible"], axis=-1)})
+        inputs = {name: snapshot[name] for name in ("pose", "center", "goal", "waypoint", "collided")}
+        inputs |= {"step": np.int32(snapshot["local_step"]), "coverage": np.float32(snapshot["coverage"])}
+        self._moments.append(inputs | {"visible": np.packbits(snapshot["visible"], axis=-1)})
 
     def episode(self) -> Episode:
         """The episode so far.
@@ -193,6 +193,6 @@ class EpisodeRecorder:
         """
         if not self._moments:
             raise ValueError("nothing was recorded; add at least one snapshot")
-        stacked = {name: np.stack([moment[name] for moment in self._moments]) for name in self._moments[0]}
+        stacked = {name: np.stack([inputs[name] for inputs in self._moments]) for name in self._moments[0]}
         seen = {f"{name}_seen_at": first.copy() for name, first in self._seen.items()}
         return Episode(policy=self.policy, **self._last, **stacked, **seen)

@@ -141,7 +141,7 @@ def record_episode(env, policy, env_index=0, every: int | None = 2, size: int = 
     The other teams of the batch play along, undrawn. The first picture is the start, the last one the end.
     """
     frames = []
-    watch_episode(env, policy, lambda moment: frames.append(draw_teams(moment, size)), env_index, every)
+    watch_episode(env, policy, lambda inputs: frames.append(draw_teams(inputs, size)), env_index, every)
     return frames
 
 

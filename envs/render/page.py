@@ -263,7 +263,7 @@ class Page:
                 return
             self.server.scene.reset()
             prepare_scene(self.server, stage)
-            self.actors = Actors(self.server, stage.moment(self.episode.snapshot(0)))
+            self.actors = Actors(self.server, stage.inputs(self.episode.snapshot(0)))
             self.time.max = max(float(self.episode.seconds[-1]), 0.1)
             self.seek(0.0)
 
@@ -298,7 +298,7 @@ class Page:
         with self._lock, self.server.atomic():
             snapshot = self.episode.snapshot(self.record)
             chosen = None if self.robot.value == TEAM else int(self.robot.value.split()[1])
-            scene = self.stages[self.number].moment(snapshot, chosen)
+            scene = self.stages[self.number].inputs(snapshot, chosen)
             self.actors.show(scene, self.radar.value)
             self._follow(scene, chosen)
             self.status.content = describe(snapshot, chosen)
@@ -380,12 +380,12 @@ def write_page(stage: Stage, episode: Episode | None, path: Path, seen_by: int |
     server = start_server(import_viser(), 0)
     try:
         prepare_scene(server, stage)
-        scene = stage.empty() if episode is None else stage.moment(episode.snapshot(0), seen_by)
+        scene = stage.empty() if episode is None else stage.inputs(episode.snapshot(0), seen_by)
         actors = Actors(server, scene)
         recording = server.get_scene_serializer()
         for record in range(1, 0 if episode is None else len(episode)):
             recording.insert_sleep(float(episode.seconds[record] - episode.seconds[record - 1]))
-            actors.show(stage.moment(episode.snapshot(record), seen_by))
+            actors.show(stage.inputs(episode.snapshot(record), seen_by))
         recording.insert_sleep(1.0 if episode is not None else 0.0)
         html = recording.as_html()
     finally:

@@ -99,7 +99,7 @@ class Stage:
         ground = np.tile(np.array(GROUND, dtype=np.uint8), (len(self.ground), 1))
         return self._scene(ground, np.rint(colours).astype(np.uint8), {})
 
-    def moment(self, snapshot: dict, robot: int | None = None) -> DrawnScene:
+    def inputs(self, snapshot: dict, robot: int | None = None) -> DrawnScene:
         """A moment of an episode; `robot`: only what this robot has seen counts as explored.
 
         Args:

@@ -4,7 +4,8 @@ Lengths count in radar ranges and areas in radar discs, so that one policy fits 
 features of a candidate contain what the classical planner `cost_utility` would think of it, and what others weigh: a
 policy starts from there.
 
-A feature is a row of `TABLE`: a name, what a function makes of the `Moment`, a unit and a line of meaning. Simulator
+A feature is a row of `TABLE`: a name, what a function makes of the `FeatureInputs`, a unit and a line of meaning.
+    Simulator
 (`maexp.envs.targets.observation`) and robots (`maexp.agents.deploy.planner.features`) fill in the moment. Imports
 neither torch nor Warp.
 """
@@ -67,7 +68,7 @@ class Contacts:
 
 
 @dataclass(frozen=True)
-class Moment:
+class FeatureInputs:
     """What is known when N robots of a team choose among M candidates each; `...` are the teams, where there are
     several. What stands for candidates that are absent is left to whoever fills it in.
 
@@ -174,7 +175,7 @@ class Moment:
 class Feature(NamedTuple):
     """What it is made of, [..., N, M] or to be broadcast to that; its unit; its meaning."""
 
-    of: Callable[[Moment], Array]
+    of: Callable[[FeatureInputs], Array]
     unit: str
     meaning: str
 
@@ -229,7 +230,7 @@ FEATURES = tuple(TABLE)
 """Names of the last axis of the features."""
 
 
-def _log_discs(name: str) -> Callable[[Moment], Array]:
+def _log_discs(name: str) -> Callable[[FeatureInputs], Array]:
     return lambda now: now.xp.log1p(now.xp.clip(getattr(now.radio, name), 0.0, None))
 
 
@@ -262,7 +263,7 @@ def drive_until_next(xp: Any, speed: Array, max_accel: Array, max_speed: Array, 
     return xp.clip(speed * seconds + 0.5 * max_accel * seconds**2, None, max_speed * seconds)
 
 
-def add_telling(moment: Moment, can: Array, way: Array, begin: Array, to: Array) -> Moment:
+def add_telling(inputs: FeatureInputs, can: Array, way: Array, begin: Array, to: Array) -> FeatureInputs:
     """The moment with one candidate more, [..., N, M + 1]: to go and tell the base station.
 
     Args:
@@ -270,15 +271,15 @@ def add_telling(moment: Moment, can: Array, way: Array, begin: Array, to: Array)
         way: [..., N, 1], how far it is [m].
         begin, to: [..., N, 1, 2], from the robot to a point near the beginning of the way, and to the base station [m].
     """
-    xp = moment.xp
-    way = xp.where(can, way / moment.reach, 0.0)
+    xp = inputs.xp
+    way = xp.where(can, way / inputs.reach, 0.0)
     blank = xp.zeros_like(way)
     more = dict.fromkeys(ZERO, blank) | {name: xp.full_like(blank, xp.inf) for name in FAR_AWAY}
     more |= {"mask": can, "travel": way, "to": to, "way": begin, "toward": xp.zeros_like(to)}
     more |= {"value": -BETA * way, "score": -BETA * way}
     axis = can.ndim - 1
-    wider = {name: xp.concatenate([getattr(moment, name), columns], axis) for name, columns in more.items()}
-    return replace(moment, **wider)
+    wider = {name: xp.concatenate([getattr(inputs, name), columns], axis) for name, columns in more.items()}
+    return replace(inputs, **wider)
 
 
 def predict_margin(xp: Any, comm: CommConfig, cell: float, gap: Array, blocked: Array, edge: Array) -> Array:

@@ -33,7 +33,7 @@ OPEN_GROUND = 1.2  # places with so many clearances of room around are open: DWA
 OPEN_SAMPLES = 7  # places on a way that are looked at
 
 
-class Rows:
+class RowView:
     """Tensors [E, ...] by name, of which only some rows are given out."""
 
     def __init__(self, tensors: dict[str, torch.Tensor], rows: torch.Tensor):
@@ -171,9 +171,9 @@ class Navigation:
         self.blocks.place(launch)
 
     @property
-    def state(self) -> dict[str, torch.Tensor] | Rows:
+    def state(self) -> dict[str, torch.Tensor] | RowView:
         """The simulation's tensors, with the poses that robots believe to have."""
-        return self._state if self.envs is None else Rows(self._state, self.envs)
+        return self._state if self.envs is None else RowView(self._state, self.envs)
 
     @property
     def known(self) -> torch.Tensor:

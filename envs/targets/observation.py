@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDictBase
 
 from maexp.envs.comm.radio_features import ContactView
-from maexp.envs.targets.features import AROUND, EDGE, NEAR, Moment, feature_names
+from maexp.envs.targets.features import AROUND, EDGE, NEAR, FeatureInputs, feature_names
 from maexp.envs.targets.heuristics import WAY_AHEAD, value_targets
 from maexp.envs.targets.tracker import TargetTracker, TensorScene, plan_in_turn
-from maexp.kernels.greedy_assignment import compare_with_others, gather_gain
+from maexp.kernels.greedy_assignment import compare_with_mates, gather_gain
 
 if TYPE_CHECKING:
     from maexp.envs.environment import ExplorationEnv
@@ -41,7 +41,7 @@ class TargetView:
     def __init__(self, env: ExplorationEnv, count: int, tracker: TargetTracker | None = None):
         self.env, self.count, self.tracker = env, count, tracker or TargetTracker(env)
         shape, device = (env.num_envs, env.num_robots), env.device
-        self.contacts = ContactView(env) if env.settings.tells_of_radios else None
+        self.contacts = ContactView(env) if env.settings.observes_radios else None
         self.shown = count + (self.contacts is not None)
         self.features = len(feature_names(self.contacts is not None))
         self.tells = torch.zeros(shape, dtype=torch.bool, device=device)
@@ -90,13 +90,13 @@ class TargetView:
         s["block"], s["mask"] = scene.block.gather(2, best), some
         s["cell"] = scene.cells().gather(2, best)
         s["way"] = torch.where(some, scene.travel.gather(2, best), 0.0)
-        s["point"], s["toward"] = pick_places(scene.points, best), pick_places(scene.middle, best)
+        s["point"], s["toward"] = gather_points(scene.points, best), gather_points(scene.middle, best)
         self.state.update({name: nav.put(value, s[name]) for name, value in self.state.items()})
-        moment = self._moment(s, scene, best, some, value.gather(2, best))
+        inputs = self._moment(s, scene, best, some, value.gather(2, best))
         if self.contacts is not None:
             self.contacts.look()
-            moment = self.contacts.add_to(moment, nav)
-        return {"features": moment.features(), "mask": first_if_none(moment.mask)}, best
+            inputs = self.contacts.add_to(inputs, nav)
+        return {"features": inputs.features(), "mask": first_if_none(inputs.mask)}, best
 
     def _moment(
         self,
@@ -105,7 +105,7 @@ class TargetView:
         best: torch.Tensor,
         some: torch.Tensor,
         value: torch.Tensor,
-    ) -> Moment:
+    ) -> FeatureInputs:
         """What features are made of; each robot hears only those it hears.
 
         Args:
@@ -117,17 +117,17 @@ class TargetView:
         reach, point, gain, hears = nav.radar_range, state["point"], scene.gain.gather(2, best), nav.state["comm"]
         open_value = torch.where(some, value, -torch.inf)
         score, taken, claimed = plan_in_turn(gain, open_value, point / reach, hears)
-        where = pick_places(point, taken.unsqueeze(-1)).squeeze(2)
+        where = gather_points(point, taken.unsqueeze(-1)).squeeze(2)
         ways = torch.where(scene.alive.unsqueeze(-1), nav.way / reach, torch.inf)
         plans, last = (where, some.any(-1)), (state["last"], state["has_last"])
-        rival, *gaps = compare_with_others(point, best, ways, hears, plans, last)
+        rival, *gaps = compare_with_mates(point, best, ways, hears, plans, last)
         plan_gap, own_last, mates_last = (gap / reach for gap in gaps)
         near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR + EDGE, AROUND + EDGE)
         speed, at = tracker.speed(nav), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
         left = 1.0 - nav.state["macro_step"].float() / env.macro_steps
         cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
-        return Moment(
+        return FeatureInputs(
             xp=torch,
             reach=reach,
             mask=some,
@@ -189,10 +189,10 @@ class TargetView:
         chosen, waits = self.tracker.share(preference, s["way"], s["point"])
         self.tells = index == self.count
         index = chosen.clamp_min(0).unsqueeze(-1)
-        self.note(chosen, pick_places(s["point"], index).squeeze(2))
+        self.note(chosen, gather_points(s["point"], index).squeeze(2))
         block = torch.where(chosen >= 0, s["block"].gather(2, index).squeeze(-1), -1)
         cell = s["cell"].gather(2, index).squeeze(-1)
-        return self.tracker.take(block, cell, pick_places(s["toward"], index).squeeze(2), waits)
+        return self.tracker.take(block, cell, gather_points(s["toward"], index).squeeze(2), waits)
 
     def forget(self) -> None:
         """Another policy acts: nobody knows which targets its robots go to."""
@@ -239,6 +239,6 @@ def _best(value: torch.Tensor, count: int) -> torch.Tensor:
     return torch.nn.functional.pad(place, (0, count - place.shape[-1]))
 
 
-def pick_places(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+def gather_points(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
     """Entries [E, N, M, 2] of [E, N, K, 2]; ``index`` int64 [E, N, M]."""
     return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))

@@ -126,6 +126,6 @@ def test_a_radar_without_end_is_drawn_at_once():
     begin = time.process_time()
     picture = draw_teams([far], 512)
     assert np.array_equal(picture, draw_teams([snapshot], 512)), "a circle of 30 m is outside, too"
-    scene = Stage(FLOOR).moment(snapshot)
+    scene = Stage(FLOOR).inputs(snapshot)
     wide, none = (make_quads(replace(scene, radar_range=np.full(2, reach))) for reach in (1e6, 100.0))
     assert len(wide.corners) == len(none.corners) and time.process_time() - begin < 20.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import team
-from worlds import moment, room
+from worlds import inputs, room
 
 from maexp.envs import ExplorationEnv, PlannerConfig, RadarConfig, RewardConfig, RobotConfig, make_map
 from maexp.envs.specs import REWARD_TERMS
@@ -41,10 +41,10 @@ def test_the_rest_is_charged_once_when_the_last_robot_has_collided(charge, unfin
     )
     control = torch.tensor([1.0, 0.0]).expand(4, 2, 2)
     td = env.reset()
-    before, half, ends = [moment(env, e) for e in range(4)], 0, 0
+    before, half, ends = [inputs(env, e) for e in range(4)], 0, 0
     for _ in range(80):
         td = drive(env, td, control.clone())
-        after = [moment(env, e) for e in range(4)]
+        after = [inputs(env, e) for e in range(4)]
         for old, now in zip(before, after, strict=True):
             if not old.active:
                 assert not now.terms.any(), "a team that has ended pays nothing more"
@@ -106,7 +106,7 @@ def test_gains_pay_at_once_what_time_would_have_cost(unfinished):
         time = REWARD_TERMS.index("time")
         env.set_seed(3)
         td, total = env.reset(), torch.zeros(8, 2)
-        starts[kind] = torch.tensor([[moment(env, e).coverage] for e in range(8)])
+        starts[kind] = torch.tensor([[inputs(env, e).coverage] for e in range(8)])
         generator = torch.Generator().manual_seed(4)
         for _ in range(9):
             control = torch.rand(8, 2, 2, generator=generator) * torch.tensor([1.0, 0.6]) - torch.tensor([0.0, 0.3])
@@ -136,10 +136,10 @@ def test_gains_by_the_oracle():
         success_coverage=0.9,
     )
     td, time, paid = env.reset(), REWARD_TERMS.index("time"), 0
-    before = [moment(env, e) for e in range(4)]
+    before = [inputs(env, e) for e in range(4)]
     for _ in range(50):
         td = drive(env, td, torch.tensor([0.5, 0.1]).expand(4, 2, 2).clone())
-        after = [moment(env, e) for e in range(4)]
+        after = [inputs(env, e) for e in range(4)]
         for old, now in zip(before, after, strict=True):
             if old.active:
                 done = old.coverage < 0.9 <= now.coverage

@@ -17,7 +17,7 @@ MAPS = {
 
 
 @dataclass
-class Moment:
+class FeatureInputs:
     """An env and its navigation, up to date; and the same as arguments of `TeamPlanner` and of its `plan`."""
 
     env: ExplorationEnv
@@ -41,13 +41,13 @@ def moments(kind: str, policy: str = "cost_utility", num_robots: int = 3, steps:
     td = env.reset()
     for _ in range(steps):
         nav.update()
-        yield moment(env, nav)
+        yield inputs(env, nav)
         td = env.step(play(td))["next"]
         if td["done"].any():
             break
 
 
-def moment(env: ExplorationEnv, nav: Navigation) -> Moment:
+def inputs(env: ExplorationEnv, nav: Navigation) -> FeatureInputs:
     """What the env holds now."""
     width, height = (int(v[0]) for v in (nav.width, nav.height))
     known = nav.known[0, 0, : width * height].cpu().numpy().reshape(height, width)
@@ -55,7 +55,7 @@ def moment(env: ExplorationEnv, nav: Navigation) -> Moment:
     radius = robots["collision_threshold"][0].tolist()
     pose = np.concatenate([nav.centers()[0].numpy(), nav.state["pose"][0, :, 3:].numpy()], axis=1)
     poses = [row if alive else None for row, alive in zip(pose.tolist(), nav.alive()[0].tolist(), strict=True)]
-    return Moment(
+    return FeatureInputs(
         env,
         nav,
         settings={

@@ -47,7 +47,7 @@ def turned(points, angle: float, shift=(0.0, 0.0)) -> np.ndarray:
     return result
 
 
-def moment(env: ExplorationEnv, index: int) -> SimpleNamespace:
+def inputs(env: ExplorationEnv, index: int) -> SimpleNamespace:
     """Everything env `index` holds now, copied; flags in the order of its map."""
     state = env.simulation.tensors
     fields = {

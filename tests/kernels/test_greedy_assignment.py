@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from maexp.kernels.greedy_assignment import choose_in_turn, compare_with_others, gather_gain
+from maexp.kernels.greedy_assignment import choose_in_turn, compare_with_mates, gather_gain
 
 pytestmark = pytest.mark.kernels
 
@@ -72,7 +72,7 @@ def test_ways_plans_and_last_targets_of_those_that_are_heard(team):
     point, best, ways, hears, plan, has_plan, last, has_last = tensors(
         team, "point", "best", "ways", "hears", "plan", "has_plan", "last", "has_last"
     )
-    found = compare_with_others(point, best, ways, hears, (plan, has_plan), (last, has_last))
+    found = compare_with_mates(point, best, ways, hears, (plan, has_plan), (last, has_last))
     for e, i, k in np.ndindex(ENVS, ROBOTS, COUNT):
         mates = [j for j in range(ROBOTS) if j != i and team["hears"][e, i, j]]
 

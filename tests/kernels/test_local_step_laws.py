@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import motion, radar
-from worlds import act, moment, room, turned
+from worlds import act, inputs, room, turned
 
 from maexp.envs import CommConfig, ExplorationEnv, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
 from maexp.kernels import unpack_flags
@@ -100,7 +100,7 @@ def test_permuting_robots_permutes_results(robots, limited):
         first.simulation.step(0, 1)
         second.simulation.step(0, 1)
     for e in range(2):
-        a, b = moment(first, e), moment(second, e)
+        a, b = inputs(first, e), inputs(second, e)
         for name in PER_ROBOT:
             np.testing.assert_array_equal(getattr(b, name), getattr(a, name)[order], err_msg=name)
         assert a.covered == b.covered > 0 and a.shared == b.shared
@@ -131,7 +131,7 @@ def test_moving_the_world_changes_nothing_but_the_pose(angle, shift, collision):
         here.simulation.step(0, 1)
         there.simulation.step(0, 1)
     for e in range(5):
-        a, b = moment(here, e), moment(there, e)
+        a, b = inputs(here, e), inputs(there, e)
         np.testing.assert_allclose(turned(a.center, angle, shift), b.center, atol=2e-4)
         np.testing.assert_allclose(a.control, b.control, atol=1e-6)
         np.testing.assert_allclose(a.pose[:, 2], b.pose[:, 2], atol=1e-5)
@@ -163,7 +163,7 @@ def test_masked_reset_leaves_other_envs_alone(limited):
         for e in (1, 3):
             assert not torch.equal(before[name][e], after[name][e]), name
     assert (after["local_step"][~kept] == 0).all() and (after["path_length"][~kept] == 0).all()
-    scanned = [moment(env, e) for e in (1, 3)]
+    scanned = [inputs(env, e) for e in (1, 3)]
     for now in scanned:  # of the old episode nothing is left but what the first scan saw
         np.testing.assert_array_equal(now.seen_free, now.visible)
 
@@ -220,7 +220,7 @@ def test_starts(robots):
     for _ in range(5):
         env.reset()
         for e in range(3):
-            now = moment(env, e)
+            now = inputs(env, e)
             need = 3.0 * BODY["collision_threshold"]
             maps.add(now.map.name)
             headings += now.pose[:, 3].tolist()
@@ -304,7 +304,7 @@ def test_collisions_of_robots_close_together(mode):
     thresholds = [r.collision_threshold if mode == "centre" else 0.0 for r in env.robot_configs]
     close, hits = 0, 0
     for e in range(150):
-        now = moment(env, e)
+        now = inputs(env, e)
         kinds = [r.kind for r in env.robot_configs]
         states = [motion.rear_state(p, n, k) for p, n, k in zip(now.pose, lengths, kinds, strict=True)]
         near = world.boundary[np.linalg.norm(world.boundary[:, :2] - now.center[0], axis=1) < 5.0]

@@ -84,8 +84,8 @@ def test_it_stands_in_the_way():
 def test_nobody_foresees_a_failure(name):
     """Up to the moment, choices are those of a team in which it comes later; after it, others."""
     found = []
-    for moment in (2.0, 5.0):
-        env = make(FaultsConfig(at=[(0, moment)]), envs=1, local_steps=10)
+    for inputs in (2.0, 5.0):
+        env = make(FaultsConfig(at=[(0, inputs)]), envs=1, local_steps=10)
         policy, td, played = POLICIES[name](env), env.reset(), []
         for _ in range(4):
             td = policy(td)

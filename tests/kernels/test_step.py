@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from oracle import dwa, motion, picture, radar, team
-from worlds import act, moment, room
+from worlds import act, inputs, room
 
 from maexp.envs import (
     CommConfig,
@@ -74,14 +74,14 @@ def episode(request):
     )
     generator = torch.Generator().manual_seed(3)
     env.reset()
-    moments = [[moment(env, e)] for e in range(3)]
+    moments = [[inputs(env, e)] for e in range(3)]
     action = act(env, generator)
     for step in range(14):
         if step % 5 == 4:
             action = act(env, generator)
         env.step(action.clone())
         for e in range(3):
-            moments[e].append(moment(env, e))
+            moments[e].append(inputs(env, e))
     return env, moments
 
 
@@ -318,7 +318,7 @@ def test_milestones():
     for step in range(160):
         env.step(actions[step // 8].clone())
         for e, line in enumerate(lines):
-            line.append(moment(env, e))
+            line.append(inputs(env, e))
     counts = [0, 0, 0]
     for line in lines:
         weights = team.area_weights(line[0].map.free_spacing)
@@ -380,7 +380,7 @@ def test_pictures_of_what_robots_know_beside_a_base_station(count):
     for _ in range(4):
         td = env.step(act(env, generator))["next"]
     for e in range(3):
-        now = moment(env, e)
+        now = inputs(env, e)
         want = draw_points(now.map, now.known_free, now.known_boundary)
         np.testing.assert_array_equal(td["agents", "observation", "map"][e, :, :2].numpy(), want[:, :2])
         assert env.simulation.tensors["known_weight"][e, count] > 0 and want[:, 0].any()
@@ -400,13 +400,13 @@ def test_pictures():
         macro_steps=100,
     )
     td, generator = env.reset(), torch.Generator().manual_seed(3)
-    past = [[moment(env, e).center for e in range(2)]]
+    past = [[inputs(env, e).center for e in range(2)]]
     for _ in range(25):
         td = env.step(act(env, generator))["next"]
-        past.append([moment(env, e).center for e in range(2)])
+        past.append([inputs(env, e).center for e in range(2)])
     pictures, teams = td["agents", "observation", "map"].numpy(), td["team", "map"].numpy()
     for e in range(2):
-        now = moment(env, e)
+        now = inputs(env, e)
         m = now.map
         corner, size = picture.frame(m.extent)
         want = draw_points(m, now.seen_free, now.seen_boundary)

@@ -42,8 +42,8 @@ def play(env: ExplorationEnv) -> list[dict]:
 
 def choose(seen: list[dict]) -> list[tuple[str, dict]]:
     """The moments shown: parted, the last decision before they meet, and the one after."""
-    parted = [k for k, moment in enumerate(seen) if not moment["hears"]]
-    apart = [np.count_nonzero(moment["known"][0] != moment["known"][1]) for moment in seen]
+    parted = [k for k, inputs in enumerate(seen) if not inputs["hears"]]
+    apart = [np.count_nonzero(inputs["known"][0] != inputs["known"][1]) for inputs in seen]
     meets = [k for k in parted if k + 1 < len(seen) and seen[k + 1]["hears"]]
     last = max(meets, key=lambda k: apart[k])
     begin = max((k for k in range(last) if seen[k]["hears"]), default=0)
@@ -61,9 +61,9 @@ def draw(path: Path) -> None:
     free = tensors["free"][tensors["free_begin"][m] : tensors["free_begin"][m + 1], :2].numpy()  # in the kernels' order
     if path.suffix == ".gif":
         titles = [
-            f"{moment['seconds']:.0f} s: {'they hear each other' if moment['hears'] else 'apart'}" for moment in seen
+            f"{inputs['seconds']:.0f} s: {'they hear each other' if inputs['hears'] else 'apart'}" for inputs in seen
         ]
-        figures = [draw_moments([moment], maps[m], free) for moment in zip(titles, seen, strict=True)]
+        figures = [draw_moments([inputs], maps[m], free) for inputs in zip(titles, seen, strict=True)]
         write_gif([pixels(figure) for figure in figures], path, fps=2.0)
         return
     with whole_file(path) as file:
@@ -73,10 +73,10 @@ def draw(path: Path) -> None:
 def draw_moments(moments: list[tuple[str, dict]], world: PointCloudMap, free: np.ndarray) -> Figure:
     """Moments side by side: who knows which of the free points, [count, 2]."""
     figure, axes = panels(len(moments), height=3.2)
-    for ax, (title, moment) in zip(axes, moments, strict=False):
+    for ax, (title, inputs) in zip(axes, moments, strict=False):
         ax.set_title(title, loc="left")
         ax.plot(*world.boundary[:, :2].T, ".", color="black", markersize=1)
-        known = moment["known"][:, : len(free)]
+        known = inputs["known"][:, : len(free)]
         parts = (
             (~known[0] & ~known[1], GREY, None),
             (known[0] & ~known[1], COLOURS[0], "first alone"),
@@ -85,7 +85,7 @@ def draw_moments(moments: list[tuple[str, dict]], world: PointCloudMap, free: np
         )
         for which, colour, label in parts:
             ax.plot(*free[which].T, "s", color=colour, markersize=2.2, label=label)
-        for (x, y), colour in zip(moment["at"], COLOURS[:2], strict=True):
+        for (x, y), colour in zip(inputs["at"], COLOURS[:2], strict=True):
             ax.plot(x, y, "o", color=colour, markeredgecolor="black", markersize=9)
         ax.set_aspect("equal")
         ax.set_axis_off()

@@ -17,9 +17,9 @@ from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.names import plug_ins
 from maexp.agents.policies.pretrained import is_exported
-from maexp.agents.policies.registry import NamedPolicy, find_player
+from maexp.agents.policies.registry import NamedPolicy, find_named_policy
 from maexp.agents.policies.registry import short_name as name_of
-from maexp.agents.policies.remote.process import APART, EXEC, Guest, command_of
+from maexp.agents.policies.remote.process import APART, EXEC, PolicyProcess, command_of
 from maexp.agents.policies.remote.server import SOCKET
 from maexp.agents.policies.remote.subprocess_policy import HostedPolicy, greet, guest_of
 from maexp.envs import (
@@ -35,7 +35,7 @@ from maexp.envs import (
 from maexp.envs.metrics import RADIO, episode_metrics
 
 
-class Player:
+class SuitePolicy:
     """A policy by the word that names it.
 
     Args:
@@ -52,22 +52,22 @@ class Player:
 
     def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0, name: str | None = None):
         self.word, self.limit, self.patience = word, limit, patience
-        self.make_guest = self._find_guest()
+        self.start_process = self._find_guest()
         self.name = name or short_name(word)
-        self.found: NamedPolicy | None = None if self.hosted else find_player(word, name=self.name)
+        self.found: NamedPolicy | None = None if self.hosted else find_named_policy(word, name=self.name)
         if self.found is not None and self.found.direct:
             raise UserError(f"policy={word} gives controls (planner=direct), and the robots of a suite drive to goals.")
 
-    def _find_guest(self) -> Callable[[], Guest] | None:
+    def _find_guest(self) -> Callable[[], PolicyProcess] | None:
         """What plays a team in a process of its own or elsewhere; None: it plays in this one."""
         if not self.word.startswith((EXEC, APART, SOCKET)) and not is_own(self.word):
             return None
         try:
-            make_guest = guest_of(self.word)
+            start_process = guest_of(self.word)
         except ValueError as error:
             raise UserError(f"policy={self.word} cannot be played: {error}.") from error
-        if greet(make_guest, self.word):
-            return make_guest
+        if greet(start_process, self.word):
+            return start_process
         if self.word.startswith(APART):
             raise UserError(f"policy={self.word} is no class with act(observation): see docs/arena.md.")
         return None
@@ -75,7 +75,7 @@ class Player:
     @property
     def hosted(self) -> bool:
         """Whether each team has a process or connection of its own."""
-        return self.make_guest is not None
+        return self.start_process is not None
 
     @property
     def most_teams(self) -> int:
@@ -93,7 +93,7 @@ class Player:
     def open(self, env: ExplorationEnv) -> AbstractContextManager[Callable]:
         """The policy for an env; at the end of the context it has done with its guests."""
         if self.found is None:
-            return HostedPolicy(env, self.make_guest, self.name, self.limit, self.patience)
+            return HostedPolicy(env, self.start_process, self.name, self.limit, self.patience)
         return nullcontext(self.found.make(env))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from maexp.agents.benchmarks.suites import run_files
 from maexp.agents.benchmarks.suites.frozen import check_maps, play_rivals, read_frozen, sums
-from maexp.agents.benchmarks.suites.play import Batch, Player, build_env, build_maps, play_batch
+from maexp.agents.benchmarks.suites.play import Batch, SuitePolicy, build_env, build_maps, play_batch
 from maexp.agents.benchmarks.suites.score import summarise_suite
 from maexp.agents.benchmarks.suites.suite import Suite
 from maexp.agents.errors import UserError, blame_input
@@ -28,7 +28,7 @@ class SuiteRun:
     """
 
     suite: Suite
-    player: Player
+    policy: SuitePolicy
     where: Path
     seed: int | None
     num_envs: int
@@ -45,19 +45,19 @@ class SuiteRun:
             batches[name], points[name] = self._play_part(name)
         with blame_input():
             rivals = read_frozen(self.suite) if self.seed is None else play_rivals(self.suite, self.seed)["results"]
-        summary = summarise_suite(self.suite, run_files.to_results(self.player.name, self.suite, batches), rivals)
+        summary = summarise_suite(self.suite, run_files.to_results(self.policy.name, self.suite, batches), rivals)
         code = run_files.describe_code()
         content = {
             "format": run_files.FORMAT,
             "suite": run_files.describe_suite(self.suite, self.seed),
-            "policy": self.player.name,
+            "policy": self.policy.name,
             **summary,
             "decisions": run_files.describe_decisions(batches),
             "episodes": run_files.describe_episodes(self.suite, batches),
             "maps": points,
             "files": run_files.list_files(self.where),
             "run": {
-                "policy": self.player.word,
+                "policy": self.policy.word,
                 **code,
                 "machine": run_files.describe_machine(),
                 "device": str(self.device),
@@ -84,9 +84,9 @@ class SuiteRun:
                     if env is None:
                         with blame_input():
                             env = build_env(
-                                part, maps, size, suite.key(self.seed), self.player.observation(), device=self.device
+                                part, maps, size, suite.key(self.seed), self.policy.observation(), device=self.device
                             )
-                            policy = stack.enter_context(self.player.open(env))
+                            policy = stack.enter_context(self.policy.open(env))
                     played.append(play_batch(suite, env, policy, first))
                     run_files.write_batch(self.where, suite, name, played[-1])
                     self._tell_lost(name, played[-1])

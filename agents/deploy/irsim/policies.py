@@ -20,8 +20,8 @@ from maexp.agents.deploy.planner.team import read_team
 from maexp.agents.errors import UserError
 from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.registry import NamedPolicy
-from maexp.agents.policies.remote.numpy_policy import ForeignCalls
-from maexp.agents.policies.remote.user_policy import is_foreign
+from maexp.agents.policies.remote.numpy_policy import PolicyCalls
+from maexp.agents.policies.remote.user_policy import is_numpy_policy
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, PointCloudMap, RadarConfig, RobotConfig
 from maexp.kernels.constants import DT, FREE, OBSTACLE, UNREACHED
 
@@ -73,32 +73,32 @@ def _begin(env: ExplorationEnv, episode: int):
     return env.reset()
 
 
-def check_player(word: str, player: NamedPolicy) -> None:
+def check_player(word: str, policy: NamedPolicy) -> None:
     """Raise UserError for a policy that plays in our simulator alone."""
-    if player.kind == "classical" and word not in (names := (*CHOICES, LOOKAHEAD)):
+    if policy.kind == "classical" and word not in (names := (*CHOICES, LOOKAHEAD)):
         known = ", ".join(names)
         raise UserError(f"policy={word} looks into our simulator and plays there alone: choose of {known}.")
-    if player.kind == "checkpoint" and player.targets is None:
+    if policy.kind == "checkpoint" and policy.targets is None:
         raise UserError(f"policy={word} chooses regions of a whole map: maexp irsim plays those trained on targets.")
-    if player.kind == "own" and not is_foreign(player.found):
+    if policy.kind == "own" and not is_numpy_policy(policy.found):
         raise UserError(
             f"policy={word} plays on tensordicts of our simulator's env: maexp irsim takes a class with act "
             "(NumPy arrays in, goals in metres out)."
         )
 
 
-def make_planner(word: str, player: NamedPolicy, config: TrialConfig, env: ExplorationEnv, where: Path):
+def make_planner(word: str, policy: NamedPolicy, config: TrialConfig, env: ExplorationEnv, where: Path):
     """What `run_trial` asks for plans.
 
     Args:
         env: the same team in our simulator.
         where: folder of the trial; a run's policy is exported to it.
     """
-    if player.kind == "own":
-        return ForeignTeam(player, config, env.num_robots)
-    if player.kind == "checkpoint":
-        trained = {"iteration": player.saved["iteration"]}
-        export_policy(player.make(env), env, where / "policy", player.name, f"# {player.name}\n", trained)
+    if policy.kind == "own":
+        return NumpyTeam(policy, config, env.num_robots)
+    if policy.kind == "checkpoint":
+        trained = {"iteration": policy.saved["iteration"]}
+        export_policy(policy.make(env), env, where / "policy", policy.name, f"# {policy.name}\n", trained)
         word = str(where / "policy")
     return team_planner(word, config)
 
@@ -116,12 +116,12 @@ def team_planner(word: str, config: TrialConfig) -> TeamPlanner:
     )
 
 
-class ForeignTeam:
+class NumpyTeam:
     """A foreign policy in the place of a `TeamPlanner`: all robots hear each other, ways are found as there."""
 
-    def __init__(self, player: NamedPolicy, config: TrialConfig, num_robots: int):
-        self.config, self.calls = config, ForeignCalls(player.name)
-        self.agent = self.calls.make(player.found)
+    def __init__(self, policy: NamedPolicy, config: TrialConfig, num_robots: int):
+        self.config, self.calls = config, PolicyCalls(policy.name)
+        self.agent = self.calls.make(policy.found)
         self.poses = np.full((num_robots, 3), np.nan)
         self.calls.reset(
             self.agent,

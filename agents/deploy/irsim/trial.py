@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from maexp.agents.deploy.irsim.config import TrialConfig
-from maexp.agents.deploy.irsim.policies import ForeignTeam
+from maexp.agents.deploy.irsim.policies import NumpyTeam
 from maexp.agents.deploy.irsim.robot import Follower, Odometry, TeamGrid
 from maexp.agents.deploy.irsim.simulator import Scan, Simulator, make_floor
 from maexp.agents.deploy.planner import TeamPlanner
@@ -98,7 +98,7 @@ class FilmFrame:
 
 def run_trial(
     world: PointCloudMap,
-    planner: TeamPlanner | ForeignTeam,
+    planner: TeamPlanner | NumpyTeam,
     starts: np.ndarray,
     config: TrialConfig,
     watch: Callable[[FilmFrame], None] | None = None,

@@ -18,9 +18,9 @@ UNKNOWN, CLEAR, WALL, PERSON = (205, 205, 210), (255, 255, 255), (40, 40, 46), (
 HEAD = 26  # pixels above the picture, for what is going on
 
 
-def draw_moment(moment: FilmFrame, radius: float, width: int = 640) -> np.ndarray:
+def draw_moment(inputs: FilmFrame, radius: float, width: int = 640) -> np.ndarray:
     """The team's grid with robots where they believe to be (discs) and are (rings); uint8 [height, width, 3]."""
-    values = moment.grid.values()
+    values = inputs.grid.values()
     colours = np.array([UNKNOWN, CLEAR, WALL], np.uint8)[np.where(values < 0, 0, np.where(values < 50, 1, 2))]
     rows, columns = values.shape
     scale = width / max(rows, columns)
@@ -30,20 +30,20 @@ def draw_moment(moment: FilmFrame, radius: float, width: int = 640) -> np.ndarra
     draw = ImageDraw.Draw(picture)
 
     def disc(place, reach, **look):
-        x, y = (np.asarray(place) - moment.grid.low) / moment.grid.cell * scale
-        r = max(reach / moment.grid.cell * scale, 3.0)
+        x, y = (np.asarray(place) - inputs.grid.low) / inputs.grid.cell * scale
+        r = max(reach / inputs.grid.cell * scale, 3.0)
         draw.ellipse((x - r, HEAD + size[1] - y - r, x + r, HEAD + size[1] - y + r), **look)
 
-    for person in moment.people:
+    for person in inputs.people:
         disc(person, PERSON_RADIUS, fill=PERSON)
-    for i, (believed, pose, goal) in enumerate(zip(moment.believed, moment.poses, moment.goals, strict=True)):
+    for i, (believed, pose, goal) in enumerate(zip(inputs.believed, inputs.poses, inputs.goals, strict=True)):
         colour = ROBOT_COLOURS[i % len(ROBOT_COLOURS)]
         disc(believed[:2], radius, fill=colour)
         disc(pose[:2], 2 * radius, outline=colour, width=2)
         if np.isfinite(goal).all():
             disc(goal, 0.05, outline=colour, width=2)
-    people = f", {len(moment.people)} people" if len(moment.people) else ""
-    draw.text((6, 6), f"ir-sim {moment.time:5.1f} s   seen {moment.coverage:.1%}{people}", fill=(20, 20, 20))
+    people = f", {len(inputs.people)} people" if len(inputs.people) else ""
+    draw.text((6, 6), f"ir-sim {inputs.time:5.1f} s   seen {inputs.coverage:.1%}{people}", fill=(20, 20, 20))
     return np.asarray(picture)
 
 

@@ -48,10 +48,10 @@ def share_targets(preference: np.ndarray, way: np.ndarray, points: np.ndarray, b
     Returns:
         int64 [n], -1 = none.
     """
-    return Shares(preference, way, points, body).settle()
+    return DistinctTargets(preference, way, points, body).settle()
 
 
-class Shares:
+class DistinctTargets:
     """Who has which target, and what that leaves the others.
 
     Args:

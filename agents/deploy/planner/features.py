@@ -10,7 +10,7 @@ import numpy as np
 
 from maexp.agents.deploy.planner.assignment import plan_in_turn
 from maexp.agents.deploy.planner.scene import ArrayScene
-from maexp.envs.targets.features import AROUND, EDGE, NEAR, Moment, drive_until_next
+from maexp.envs.targets.features import AROUND, EDGE, NEAR, FeatureInputs, drive_until_next
 from maexp.envs.targets.heuristics import WAY_AHEAD, value_targets
 from maexp.kernels.constants import UNKNOWN
 
@@ -58,7 +58,7 @@ def list_candidates(
     last,
     time_left: float,
     motion: Motion,
-    telling: Callable[[Moment], Moment] | None = None,
+    telling: Callable[[FeatureInputs], FeatureInputs] | None = None,
 ) -> Candidates:
     """The candidates of every robot of a scene with at least one target.
 
@@ -76,12 +76,14 @@ def list_candidates(
     target = np.pad(best, ((0, 0), (0, count - best.shape[1])))
     mask = np.isfinite(np.take_along_axis(scene.travel, target, 1))
     mask[:, best.shape[1] :] = False
-    moment = _moment(scene, target, mask, np.take_along_axis(value, target, 1), heading, speed, last, time_left, motion)
-    moment = moment if telling is None else telling(moment)
-    return Candidates(moment.features().astype(np.float32), moment.mask, target)
+    inputs = _moment(scene, target, mask, np.take_along_axis(value, target, 1), heading, speed, last, time_left, motion)
+    inputs = inputs if telling is None else telling(inputs)
+    return Candidates(inputs.features().astype(np.float32), inputs.mask, target)
 
 
-def _moment(scene: ArrayScene, target, mask, value, heading, speed, last, time_left: float, motion: Motion) -> Moment:
+def _moment(
+    scene: ArrayScene, target, mask, value, heading, speed, last, time_left: float, motion: Motion
+) -> FeatureInputs:
     """What features are made of; everyone hears everyone."""
     reach, point, gain, robots = scene.radar_range, scene.points[target], scene.gain[target], np.arange(len(target))
     own = np.eye(len(target), dtype=bool)
@@ -98,7 +100,7 @@ def _moment(scene: ArrayScene, target, mask, value, heading, speed, last, time_l
     def of_robots(values) -> np.ndarray:
         return np.reshape(values, (len(target), 1))
 
-    return Moment(
+    return FeatureInputs(
         xp=np,
         reach=reach,
         mask=mask,

@@ -18,7 +18,7 @@ from maexp.agents.deploy.planner.stall_monitor import STEP, Watch
 from maexp.agents.deploy.planner.team import Team
 from maexp.envs.config.comm import CELLS_OF_RADAR, CommConfig
 from maexp.envs.config_fields import check_settings
-from maexp.envs.targets.features import DETOUR, PACE, Contacts, Moment, add_telling, predict_margin
+from maexp.envs.targets.features import DETOUR, PACE, Contacts, FeatureInputs, add_telling, predict_margin
 from maexp.envs.targets.heuristics import WAY_AHEAD
 from maexp.kernels.constants import FREE, NUDGE, STRAIGHT, UNREACHED
 
@@ -201,7 +201,7 @@ class ContactBook:
         memories = [self.memories.get(team.names[robot]) for robot in robots]
         return np.array([memory is not None and memory.tells for memory in memories], bool)
 
-    def add_to(self, moment: Moment, scene: ArrayScene, names: list[Hashable], can: np.ndarray) -> Moment:
+    def add_to(self, inputs: FeatureInputs, scene: ArrayScene, names: list[Hashable], can: np.ndarray) -> FeatureInputs:
         """The moment with one candidate more, [n, M + 1], to go and tell the base station, and with `Contacts`.
 
         Args:
@@ -211,8 +211,8 @@ class ContactBook:
         base = scene.at if self.base is None else np.broadcast_to(scene.grid.from_map(self.base), scene.at.shape)
         to = (base - scene.at)[:, None]
         way, begin = self._way_to_base(scene, base, to)
-        moment = add_telling(moment, can[:, None], way, begin, to)
-        return replace(moment, radio=self._contacts(moment, scene, names))
+        inputs = add_telling(inputs, can[:, None], way, begin, to)
+        return replace(inputs, radio=self._contacts(inputs, scene, names))
 
     def _way_to_base(self, scene: ArrayScene, base: np.ndarray, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far it is to the base station [m], [n, 1], and a point near the beginning of the way, from the robot,
@@ -225,10 +225,10 @@ class ContactBook:
         way = np.where(reached, steps * (grid.cell / STRAIGHT), DETOUR * np.linalg.norm(to, axis=-1))
         return way, np.where(reached[..., None], scene.ways_to(cell, WAY_AHEAD), to)
 
-    def _contacts(self, moment: Moment, scene: ArrayScene, names: list[Hashable]) -> Contacts:
+    def _contacts(self, inputs: FeatureInputs, scene: ArrayScene, names: list[Hashable]) -> Contacts:
         memories = [self.memories.get(name, Memory((0.0, 0.0))) for name in names]
         others = [sorted(self.crew - {name}, key=str) for name in names]
-        disc, point = math.pi * scene.radar_range**2, moment.to + moment.at[:, None]
+        disc, point = math.pi * scene.radar_range**2, inputs.to + inputs.at[:, None]
         decision = self.motion.seconds / self.time_limit
 
         def each(values: list[float]) -> np.ndarray:
@@ -236,8 +236,8 @@ class ContactBook:
 
         pairs = list(zip(memories, others, strict=True))
         since = [[memory.since(mate, self.used, decision) for mate in mates] for memory, mates in pairs]
-        tells = np.zeros_like(moment.mask)
-        tells[:, -1] = moment.mask[:, -1]
+        tells = np.zeros_like(inputs.mask)
+        tells[:, -1] = inputs.mask[:, -1]
         shared = {
             "mates_untold": each([max([0.0, *map(memory.untold, mates)]) for memory, mates in pairs]) / disc,
             "mates_since": each([sum(row) / max(len(row), 1) for row in since]),
@@ -247,7 +247,7 @@ class ContactBook:
         }
         if self.base is None:
             none = dict.fromkeys(("untold", "since", "linked", "way", "spare"), each([0.0] * len(names)))
-            blank = np.zeros_like(moment.travel)
+            blank = np.zeros_like(inputs.travel)
             return Contacts(tells=tells, **none, far=blank, signal=blank, **shared)
         way = each([self._way_back(memory) for memory in memories])
         gap = np.linalg.norm(point - scene.grid.from_map(self.base), axis=-1)

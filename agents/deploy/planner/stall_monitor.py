@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from maexp.agents.deploy.planner.assignment import Shares
+from maexp.agents.deploy.planner.assignment import DistinctTargets
 from maexp.agents.deploy.planner.frontiers import Targets
 from maexp.agents.deploy.planner.team import Team
 
@@ -171,7 +171,7 @@ class Watch:
         return np.array([number.get(self.tracks[team.names[robot]].hold, -1) for robot in robots], np.int64)
 
     def settle(
-        self, team: Team, robots: np.ndarray, targets: Targets, travel: np.ndarray, shares: Shares, room: float
+        self, team: Team, robots: np.ndarray, targets: Targets, travel: np.ndarray, shares: DistinctTargets, room: float
     ) -> list[str]:
         """Write down the targets that robots get, and change those of robots that go back and forth; returns what was
         changed, in sentences.

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.deploy.planner.assignment import Shares
+from maexp.agents.deploy.planner.assignment import DistinctTargets
 from maexp.agents.deploy.planner.bundle import Contract, LearnedChoice, find_policy
 from maexp.agents.deploy.planner.features import Motion, list_candidates
 from maexp.agents.deploy.planner.grid import KnownGrid, is_planned_on, read_grid
@@ -243,7 +243,7 @@ class TeamPlanner:
         x, y = -np.rint(grid.from_map(old.corner) / grid.cell)
         return int(x), int(y)
 
-    def _choose(self, team: Team, scene: ArrayScene, time_left: float, ends) -> tuple[Shares, list[str]]:
+    def _choose(self, team: Team, scene: ArrayScene, time_left: float, ends) -> tuple[DistinctTargets, list[str]]:
         """The target of each robot of the scene, and what happened; who goes to tell the base station has none.
 
         Args:
@@ -271,7 +271,7 @@ class TeamPlanner:
             tells = (tell > preference.max(-1, initial=-np.inf)) | self.book.on_duty(team, scene.robots)
             self.book.send(team, scene.robots, tells & (ends >= 0))
             preference[tells & (ends >= 0)] = -np.inf
-        shares = Shares(preference, travel, scene.points, team.radius[scene.robots], self.distinct)
+        shares = DistinctTargets(preference, travel, scene.points, team.radius[scene.robots], self.distinct)
         some = shares.reached.any(-1)
         shares.settle_for(np.flatnonzero(some & ~parked))
         for row in np.flatnonzero(some & parked).tolist():  # who stands still takes nothing away from the others
@@ -311,7 +311,7 @@ class TeamPlanner:
             plan.active[robot] = plan.tells[robot] = True
         return replace(plan, done=plan.done and not plan.tells.any())
 
-    def _send_away(self, plan: Plan, team: Team, scene: ArrayScene, shares: Shares) -> Plan:
+    def _send_away(self, plan: Plan, team: Team, scene: ArrayScene, shares: DistinctTargets) -> Plan:
         """The plan with what robots do for which no target is left."""
         for robot in np.flatnonzero(np.isfinite(team.at).all(-1)):
             self.home.setdefault(team.names[robot], team.at[robot].copy())

@@ -48,7 +48,7 @@ VALUES = np.array([-1, 0, 100], np.int8)
 """What a grid holds where a cell is UNKNOWN, FREE or OBSTACLE."""
 
 
-class ForeignAgent(Protocol):
+class NumpyTeamPolicy(Protocol):
     """What plays one team."""
 
     def reset(self, episode: dict[str, Any]) -> None: ...
@@ -176,7 +176,7 @@ def _told(answer: Any) -> str:
     return "nothing" if answer is None else f"a {type(answer).__name__}"
 
 
-class ForeignCalls:
+class PolicyCalls:
     """Calls of a foreign policy; whatever it raises is told in a sentence that names it and the line.
 
     Args:
@@ -186,16 +186,16 @@ class ForeignCalls:
     def __init__(self, name: str):
         self.name = name
 
-    def make(self, make: Callable[[], ForeignAgent]) -> ForeignAgent:
+    def make(self, make: Callable[[], NumpyTeamPolicy]) -> NumpyTeamPolicy:
         """One object, for one team."""
         return self._call("its constructor", make)
 
-    def reset(self, agent: ForeignAgent, episode: dict[str, Any]) -> None:
+    def reset(self, agent: NumpyTeamPolicy, episode: dict[str, Any]) -> None:
         """Tell it that an episode begins, if it likes to know."""
         if hasattr(agent, "reset"):
             self._call("reset()", agent.reset, episode)
 
-    def act(self, agent: ForeignAgent, observation: dict[str, Any], num_robots: int) -> np.ndarray:
+    def act(self, agent: NumpyTeamPolicy, observation: dict[str, Any], num_robots: int) -> np.ndarray:
         """Its goals, float64 [N, 2] [m], NaN: stay."""
         answer = self._call("act()", agent.act, observation)
         try:
@@ -210,7 +210,7 @@ class ForeignCalls:
             raise UserError(f"policy {self.name}: {what} raised {describe_error(error)}.") from error
 
 
-class ForeignPolicy:
+class NumpyPolicy:
     """A foreign policy for all teams of an env; calling it asks those that play.
 
     Args:
@@ -222,8 +222,8 @@ class ForeignPolicy:
         UserError: here or when called, where a call of `make`, `reset` or `act` raises, or `act` returns no goals.
     """
 
-    def __init__(self, env: ExplorationEnv, make: Callable[[], ForeignAgent], name: str = "the policy"):
-        self.env, self.sight, self.calls = env, TeamSight(env), ForeignCalls(name)
+    def __init__(self, env: ExplorationEnv, make: Callable[[], NumpyTeamPolicy], name: str = "the policy"):
+        self.env, self.sight, self.calls = env, TeamSight(env), PolicyCalls(name)
         self.agents = [self.calls.make(make) for _ in range(env.num_envs)]
 
     @torch.no_grad()
@@ -242,13 +242,13 @@ class ForeignPolicy:
         return self.calls.act(agent, self.sight.observation(team), self.env.num_robots)
 
 
-def as_policy(env: ExplorationEnv, make: Callable[[], ForeignAgent], name: str = "the policy") -> TensorDictModule:
-    """A `ForeignPolicy` on tensordicts, as the classical planners are.
+def as_policy(env: ExplorationEnv, make: Callable[[], NumpyTeamPolicy], name: str = "the policy") -> TensorDictModule:
+    """A `NumpyPolicy` on tensordicts, as the classical planners are.
 
     Raises:
-        ValueError: the env takes controls; UserError: as `ForeignPolicy`.
+        ValueError: the env takes controls; UserError: as `NumpyPolicy`.
     """
-    return as_module(lambda env: ForeignPolicy(env, make, name), env)
+    return as_module(lambda env: NumpyPolicy(env, make, name), env)
 
 
 def describe_error(error: BaseException) -> str:

@@ -70,7 +70,7 @@ class Session(subprocess.Popen):
         reaper.end_marked(self.mark)
 
 
-class Guest:
+class PolicyProcess:
     """A policy that plays one team, beyond two files that do not block: one takes questions, one gives answers.
 
     Attributes:
@@ -110,7 +110,7 @@ class Guest:
         except BlockingIOError:
             pass
         except OSError:
-            raise Lost(self.last_words()) from None
+            raise Lost(self.last_output()) from None
 
     def receive_part(self) -> None:
         """What it has said since."""
@@ -121,7 +121,7 @@ class Guest:
         except OSError:
             part = b""
         if not part:
-            raise Lost(self.last_words())
+            raise Lost(self.last_output())
         self.inbox += part
 
     def receive(self) -> dict[str, Any] | None:
@@ -155,7 +155,7 @@ class Guest:
         if self.spent_seconds() - self.clock > limit:
             raise Lost(f"it thought for more than {limit:g} s")
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """Why there will be no more answers."""
         return "it closed the connection"
 
@@ -165,7 +165,7 @@ class Guest:
             file.close()
 
 
-class Process(Guest):
+class Process(PolicyProcess):
     """One in a process of this machine, which ends with it.
 
     Args:
@@ -205,11 +205,11 @@ class Process(Guest):
     def check_clocks(self, limit: float, patience: float) -> None:
         """A process that has ended gives no answer, even where others that it started hold its pipes open."""
         if self.ended:  # at the last look: what it left in the pipe has been read since
-            raise Lost(self.last_words())
+            raise Lost(self.last_output())
         self.ended = self.process.poll() is not None
         super().check_clocks(limit, patience)
 
-    def last_words(self) -> str:
+    def last_output(self) -> str:
         """How a process that has closed its pipes ended, and the last line that it said."""
         try:
             status = self.process.wait(GRACE)
@@ -227,7 +227,7 @@ class Process(Guest):
 
 
 def ask_all(
-    questions: list[tuple[Guest, dict[str, Any]]], limit: float, patience: float
+    questions: list[tuple[PolicyProcess, dict[str, Any]]], limit: float, patience: float
 ) -> list[dict[str, Any] | Lost]:
     """Ask several at once; the answer of each, or why there is none.
 
@@ -244,43 +244,43 @@ def ask_all(
                 if file.fileno() in selector.get_map():
                     selector.unregister(file)
 
-        for k, (guest, message) in enumerate(questions):
+        for k, (worker, message) in enumerate(questions):
             try:
-                guest.begin(message)
+                worker.begin(message)
             except Lost as lost:
                 answers[k] = lost
                 continue
-            selector.register(guest.asked, selectors.EVENT_WRITE, (k, "send"))
-            selector.register(guest.answers, selectors.EVENT_READ, (k, "receive"))
-            if guest.spoken is not None:
-                selector.register(guest.spoken, selectors.EVENT_READ, (k, "listen"))
+            selector.register(worker.asked, selectors.EVENT_WRITE, (k, "send"))
+            selector.register(worker.answers, selectors.EVENT_READ, (k, "receive"))
+            if worker.spoken is not None:
+                selector.register(worker.spoken, selectors.EVENT_READ, (k, "listen"))
         while any(answer is None for answer in answers):
             events = selector.select(POLL)
             for key, _ in events:
                 _serve(selector, key, questions[key.data[0]][0], answers, settle)
-            for k, (guest, _) in enumerate(questions):
+            for k, (worker, _) in enumerate(questions):
                 if answers[k] is None:
                     try:
-                        guest.check_clocks(limit, patience)
+                        worker.check_clocks(limit, patience)
                     except Lost as lost:
                         settle(k, lost)
     return answers
 
 
-def _serve(selector, key, guest: Guest, answers: list, settle) -> None:
+def _serve(selector, key, worker: PolicyProcess, answers: list, settle) -> None:
     """One file that is ready."""
     k, what = key.data
     if answers[k] is not None:
         return
     try:
         if what == "send":
-            guest.send()
-            if not guest.outbox:
+            worker.send()
+            if not worker.outbox:
                 selector.unregister(key.fileobj)
         elif what == "listen":
-            if not guest.listen():
+            if not worker.listen():
                 selector.unregister(key.fileobj)
-        elif (answer := guest.receive()) is not None:
+        elif (answer := worker.receive()) is not None:
             settle(k, answer)
     except Lost as lost:
         settle(k, lost)

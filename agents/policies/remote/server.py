@@ -14,7 +14,7 @@ import sys
 from threading import Thread
 
 from maexp.agents.errors import ended_by_signals
-from maexp.agents.policies.remote.process import Guest, Lost, Session, command_of
+from maexp.agents.policies.remote.process import Lost, PolicyProcess, Session, command_of
 
 SOCKET = "socket:"
 REACH = 10.0  # seconds that connecting may take
@@ -34,7 +34,7 @@ def address_of(word: str) -> tuple[str, int]:
     return host.removeprefix("[").removesuffix("]"), int(port)
 
 
-class Connection(Guest):
+class Connection(PolicyProcess):
     """One that somebody at an address plays; what an answer took is the time waited, for no more is known.
 
     Raises:

@@ -14,14 +14,14 @@ from tensordict import TensorDictBase
 from maexp.agents.errors import UserError
 from maexp.agents.policies.remote import protocol
 from maexp.agents.policies.remote.numpy_policy import TeamSight, read_goals
-from maexp.agents.policies.remote.process import Guest, Lost, Process, ask_all, command_of
+from maexp.agents.policies.remote.process import Lost, PolicyProcess, Process, ask_all, command_of
 from maexp.agents.policies.remote.server import SOCKET, Connection, address_of
 from maexp.envs import ExplorationEnv
 
 START = 120.0  # seconds that a process may take to say hello: some import a lot
 
 
-def guest_of(word: str) -> Callable[[], Guest]:
+def guest_of(word: str) -> Callable[[], PolicyProcess]:
     """What makes a guest for one team: of `socket:HOST:PORT` a connection, of any other word a process.
 
     Raises:
@@ -41,7 +41,7 @@ class HostedPolicy:
 
     Args:
         env: with a planner that drives to goals.
-        make_guest: called for each team (`guest_of`).
+        start_process: called for each team (`guest_of`).
         name: of the policy, for messages.
         limit: processor time of a decision [s].
         patience: how long an answer may take otherwise [s].
@@ -50,12 +50,14 @@ class HostedPolicy:
         reasons: why each team is lost, "" for those that are not.
     """
 
-    def __init__(self, env: ExplorationEnv, make_guest: Callable[[], Guest], name: str, limit: float, patience: float):
+    def __init__(
+        self, env: ExplorationEnv, start_process: Callable[[], PolicyProcess], name: str, limit: float, patience: float
+    ):
         if env.planner_config.name == "direct":
             raise UserError(f"planner=direct takes controls, and {name} picks goals: use planner=dwa or wavefront.")
-        self.env, self.make_guest, self.name = env, make_guest, name
+        self.env, self.start_process, self.name = env, start_process, name
         self.limit, self.patience = limit, patience
-        self.sight, self.guests = TeamSight(env), [None] * env.num_envs
+        self.sight, self.workers = TeamSight(env), [None] * env.num_envs
         self.reasons = [""] * env.num_envs
 
     def __enter__(self) -> HostedPolicy:
@@ -66,10 +68,10 @@ class HostedPolicy:
 
     def close(self) -> None:
         """Have done with all guests."""
-        for team, guest in enumerate(self.guests):
-            if guest is not None:
-                guest.kill()
-            self.guests[team] = None
+        for team, worker in enumerate(self.workers):
+            if worker is not None:
+                worker.kill()
+            self.workers[team] = None
 
     @torch.no_grad()
     def __call__(self, state: TensorDictBase) -> TensorDictBase:
@@ -80,12 +82,12 @@ class HostedPolicy:
         begins = [team for team in playing if self.sight.begins[team]]
         for team in begins:
             self.reasons[team] = ""
-        self._start([team for team in begins if self.guests[team] is None])
+        self._start([team for team in begins if self.workers[team] is None])
         self._ask({team: {"type": "reset", "episode": self.sight.episode(team)} for team in begins}, "ready")
         left = [team for team in playing if not self.reasons[team]]
         questions = {team: {"type": "act", "observation": self.sight.observation(team)} for team in left}
         for team, answer in self._ask(questions, "goals").items():
-            seconds[team] = self.guests[team].seconds
+            seconds[team] = self.workers[team].seconds
             try:
                 goals[team] = read_goals(answer.get("goals"), self.env.num_robots)
             except ValueError as error:
@@ -99,11 +101,11 @@ class HostedPolicy:
     def _start(self, teams: list[int]) -> None:
         for team in teams:
             try:
-                self.guests[team] = self.make_guest()
+                self.workers[team] = self.start_process()
             except Lost as lost:
                 self._lose(team, lost)
         hello = {"type": "hello", "version": protocol.VERSION}
-        there = {team: hello for team in teams if self.guests[team] is not None}
+        there = {team: hello for team in teams if self.workers[team] is not None}
         for team, answer in self._ask(there, "hello", START, START).items():
             if answer.get("version") != protocol.VERSION:
                 version = repr(answer.get("version"))[:40]
@@ -113,8 +115,8 @@ class HostedPolicy:
         self, questions: dict[int, dict], wanted: str, limit: float | None = None, patience: float | None = None
     ) -> dict[int, dict]:
         """Answers of the wanted type by team; the teams of all others are lost."""
-        asked = {team: question for team, question in questions.items() if self.guests[team] is not None}
-        pairs = [(self.guests[team], question) for team, question in asked.items()]
+        asked = {team: question for team, question in questions.items() if self.workers[team] is not None}
+        pairs = [(self.workers[team], question) for team, question in asked.items()]
         answers = ask_all(pairs, limit or self.limit, patience or self.patience)
         good = {}
         for team, answer in zip(asked, answers, strict=True):
@@ -128,25 +130,25 @@ class HostedPolicy:
 
     def _lose(self, team: int, why: Lost) -> None:
         self.reasons[team] = str(why)
-        if self.guests[team] is not None:
-            self.guests[team].kill()
-        self.guests[team] = None
+        if self.workers[team] is not None:
+            self.workers[team].kill()
+        self.workers[team] = None
 
 
-def greet(make_guest: Callable[[], Guest], name: str) -> bool:
+def greet(start_process: Callable[[], PolicyProcess], name: str) -> bool:
     """Start a policy once, before anything is played; whether it is a foreign one.
 
     Raises:
         UserError: it does not start, or does not say hello.
     """
     try:
-        guest = make_guest()
+        worker = start_process()
     except Lost as lost:
         raise UserError(f"policy={name}: {lost}.") from lost
     try:
-        (answer,) = ask_all([(guest, {"type": "hello", "version": protocol.VERSION})], START, START)
+        (answer,) = ask_all([(worker, {"type": "hello", "version": protocol.VERSION})], START, START)
     finally:
-        guest.kill()
+        worker.kill()
     if isinstance(answer, Lost):
         raise UserError(f"policy={name}: {str(answer).rstrip('.')}.") from answer
     if answer["type"] != "hello" or answer.get("version") != protocol.VERSION:

@@ -88,7 +88,7 @@ def _import(module: str, given: str) -> Any:
             sys.path.append(here)  # what the module imports later may lie beside it
 
 
-def is_foreign(found: Callable) -> bool:
+def is_numpy_policy(found: Callable) -> bool:
     """Whether this is a class of NumPy policies."""
     return inspect.isclass(found) and callable(getattr(found, "act", None))
 
@@ -108,7 +108,7 @@ def make_own(found: Callable, env: ExplorationEnv, name: str) -> Callable[[Tenso
     Raises:
         UserError: making it raises, or gives nothing that can be called.
     """
-    if is_foreign(found):
+    if is_numpy_policy(found):
         return as_policy(env, found, name)
     try:
         policy = found(env)

@@ -9,7 +9,7 @@ import pytest
 
 from maexp.agents.benchmarks.suites import score
 from maexp.agents.benchmarks.suites.frozen import check_maps, read_frozen, sums
-from maexp.agents.benchmarks.suites.play import Player, build_env, build_maps, play_batch
+from maexp.agents.benchmarks.suites.play import SuitePolicy, build_env, build_maps, play_batch
 from maexp.agents.benchmarks.suites.suite import load_suite, suite_names
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
@@ -46,7 +46,7 @@ def test_the_simulator_still_plays_the_frozen_episodes():
     frozen = read_frozen(suite)["random"]["indoor_small"]
     part = suite.parts["indoor_small"]
     env = build_env(part, build_maps(part), 4, suite.seed, ObservationConfig(pictures=False), device="cpu")
-    with Player("random").open(env) as policy:
+    with SuitePolicy("random").open(env) as policy:
         again = play_batch(suite, env, policy, 0)
     assert again.maps.tolist() == frozen.maps[:4].tolist()
     assert np.abs(again.metrics["coverage_auc"] - frozen.episodes["coverage_auc"][:4]).max() < 0.02

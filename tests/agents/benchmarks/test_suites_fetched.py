@@ -14,7 +14,7 @@ from worlds import room
 
 from maexp.agents import map_sets
 from maexp.agents.benchmarks.suites.frozen import check_maps, freeze, read_frozen
-from maexp.agents.benchmarks.suites.play import Player, build_env, build_maps, play_batch
+from maexp.agents.benchmarks.suites.play import SuitePolicy, build_env, build_maps, play_batch
 from maexp.agents.benchmarks.suites.suite import FOLDER, load_suite
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
@@ -166,7 +166,7 @@ def test_real_1_is_as_it_was_frozen(fetched):
     assert [world.name for world in maps] == part.map_names()
     frozen = read_frozen(suite)["random"]["floors"]
     env = build_env(part, maps, 4, suite.seed, ObservationConfig(pictures=False), device="cpu")
-    with Player("random").open(env) as policy:
+    with SuitePolicy("random").open(env) as policy:
         again = play_batch(suite, env, policy, 0)
     assert sorted(again.maps) == sorted(part.map_names()) and again.maps.tolist() == frozen.maps[:4].tolist()
     assert np.abs(again.metrics["coverage_auc"] - frozen.episodes["coverage_auc"][:4]).max() < 0.02

@@ -131,7 +131,7 @@ def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, sm
     )
     try:
         end = time.monotonic() + 120
-        while len(guests := find_guests(run.pid)) < 2:
+        while len(workers := find_guests(run.pid)) < 2:
             assert time.monotonic() < end and run.poll() is None
             time.sleep(0.05)
         run.send_signal(number)
@@ -141,7 +141,9 @@ def test_a_run_that_is_told_to_end_leaves_nobody_behind_and_can_go_on(number, sm
         run.wait()
     assert run.returncode == 130 and "Go on with: maexp suite run resume=" in told
     end = time.monotonic() + 30
-    while left := [guest for guest in guests if Path(f"/proc/{guest}").exists()]:  # killed, and perhaps not yet gone
+    while left := [
+        worker for worker in workers if Path(f"/proc/{worker}").exists()
+    ]:  # killed, and perhaps not yet gone
         assert time.monotonic() < end, left
         time.sleep(0.05)
 

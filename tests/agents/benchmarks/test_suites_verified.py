@@ -13,7 +13,7 @@ from mazes import OFFSET, REGION
 from maexp.agents.benchmarks.suites import run_files
 from maexp.agents.benchmarks.suites.play import (
     Batch,
-    Player,
+    SuitePolicy,
     build_env,
     build_maps,
     build_replay,
@@ -50,7 +50,7 @@ def test_a_run_is_believed(suite_run, small_suite, capsys):
 def test_actions_give_the_same_bits_played_in_other_batches(suite_run, small_suite):
     """Also those of a policy that chooses among targets."""
     suite = load_suite(str(small_suite))
-    part, player = suite.parts["maze_small"], Player("small_mazes")
+    part, player = suite.parts["maze_small"], SuitePolicy("small_mazes")
     env = build_env(part, build_maps(part), 2, suite.seed, player.observation(), device="cpu")
     with player.open(env) as policy:
         noted = [play_batch(suite, env, policy, first) for first in (0, 2)]

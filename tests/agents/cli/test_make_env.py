@@ -7,7 +7,7 @@ from maexp.agents import make_env, make_policy
 from maexp.agents.cli import main
 from maexp.agents.commands.evaluate import evaluate_all
 from maexp.agents.errors import UserError
-from maexp.agents.policies.registry import find_player
+from maexp.agents.policies.registry import find_named_policy
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training import train
@@ -32,7 +32,8 @@ def same(first, second) -> None:
     for env in (first, second):
         env.simulation.tensors["episode"].fill_(-1)  # a collector has begun an episode already
     batches = [
-        env.rollout(4, find_player("nearest_frontier").make(env), break_when_any_done=False) for env in (first, second)
+        env.rollout(4, find_named_policy("nearest_frontier").make(env), break_when_any_done=False)
+        for env in (first, second)
     ]
     keys = [{*batch.keys(True, True)} for batch in batches]
     assert keys[0] == keys[1] and len(keys[0]) > 20
@@ -67,7 +68,7 @@ def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
     assert held_out.settings.reward == again.settings.reward and held_out.num_envs == 2
     cfg = compose_config("evaluate", [*words, "policy=voronoi", "episodes=2"])
     first, second = (
-        evaluate_all(cfg, env, [find_player("voronoi")], tmp_path / f"kept_{place}")[0].episodes["coverage_auc"]
+        evaluate_all(cfg, env, [find_named_policy("voronoi")], tmp_path / f"kept_{place}")[0].episodes["coverage_auc"]
         for place, env in enumerate((make_env(*words, verb="evaluate"), make_env(*words, split="held_out")))
     )
     assert (first == second).all(), "episode k comes from the seed and k alone"

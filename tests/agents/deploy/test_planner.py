@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runtime_cases import Moment, moments
+from runtime_cases import FeatureInputs, moments
 from worlds import ways_to_blocks
 
 from maexp.agents.deploy.planner import grid_search
@@ -34,7 +34,7 @@ def cases(name: str):
     return moments(name.partition(",")[0], **CASES[name])
 
 
-def survey(now: Moment):
+def survey(now: FeatureInputs):
     """The scene that the runtime makes of a moment."""
     planner, notes = TeamPlanner("nearest_frontier", **now.settings), []
     grid = read_grid(now.call["grid"], now.call["resolution"], now.call["origin"], planner.occupied, notes)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from radio_policy import export_told, make_told_policy
-from runtime_cases import moment
+from runtime_cases import inputs
 from test_radio_features import ACTION, BASE, COUNT, HERE, PLACE, TELL, make
 from test_stall_monitor import CELL, SETTINGS, World
 from torchrl.envs.utils import step_mdp
@@ -60,7 +60,7 @@ class Robots:
 
     def __init__(self, env: ExplorationEnv, folder):
         self.env, self.count = env, env.num_robots
-        settings = moment(env, env.target_view.tracker.nav).settings
+        settings = inputs(env, env.target_view.tracker.nav).settings
         robots, base = env.simulation.robot_tensors, env.simulation.tensors["base"][0, :2].tolist()
         comm = replace(env.comm_config, base_station=tuple(base))
         settings |= {name: float(robots[name].max()) for name in ("max_speed", "max_accel")}
@@ -84,7 +84,7 @@ class Robots:
     def plan(self) -> list:
         """What each robot plans now."""
         nav, step = self.env.target_view.tracker.nav, int(self.env.simulation.tensors["macro_step"])
-        call, now = moment(self.env, nav).call, DT * self.env.local_steps * step
+        call, now = inputs(self.env, nav).call, DT * self.env.local_steps * step
         poses, speeds = call.pop("poses"), self.env.target_view.tracker.speed(nav)[0].tolist()
         linked = self.env.strategy.linked[0]
         plans, self.seen = [], [None] * self.count
@@ -334,8 +334,8 @@ def test_a_base_station_beyond_the_grid_is_not_at_its_edge(folder, monkeypatch):
     team, seen = alone(folder, comm={"range": 3.0, "base_station": (90.0, 3.0)}), []
     add = team.book.add_to
 
-    def note(moment, **more):
-        seen.append(add(moment, **more))
+    def note(inputs, **more):
+        seen.append(add(inputs, **more))
         return seen[-1]
 
     monkeypatch.setattr(team.book, "add_to", note)

@@ -7,7 +7,7 @@ from oracle.sharing import share
 from test_stall_monitor import SETTINGS, World, explore
 
 from maexp.agents.deploy.planner import team_planner as planner_module
-from maexp.agents.deploy.planner.assignment import Shares, share_targets
+from maexp.agents.deploy.planner.assignment import DistinctTargets, share_targets
 from maexp.agents.deploy.planner.stall_monitor import Track, Watch
 from maexp.agents.deploy.planner.team import Team
 from maexp.agents.runtime import CHOICES, TeamPlanner
@@ -143,7 +143,7 @@ def test_who_goes_back_and_forth_gets_the_nearest_that_nobody_has():
         past = [((k, 0), at) for k in (1, 2, 1)]
         watch.tracks = {0: Track(at, 0.0, 0.0, block=(1, 0), past=past), 1: Track(at, 0.0, 0.0)}
         way = np.array([[1.0, 2.0, 3.0]] * 2)
-        shares = Shares(-way, way, np.array([[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]]), team.radius)
+        shares = DistinctTargets(-way, way, np.array([[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]]), team.radius)
         shares.taken = np.array([2, other])
         notes = watch.settle(team, np.array([0, 1]), Blocks(), way, shares, 5.0)
         assert len(notes) == 1 and shares.taken.tolist() == [wanted, other]

@@ -155,7 +155,7 @@ def test_goals_and_markers_are_real_messages(conversion):
     assert (line.ns, ball.ns, ball.id) == ("ways", "goals", 1) and ball.color.a > 0 and ball.scale.x == 0.3
 
 
-class Moment:
+class FeatureInputs:
     """rclpy.time.Time [s]."""
 
     def __init__(self, seconds: float = 0.0):
@@ -203,7 +203,7 @@ class StandIn:
                 ros.timer = (period, call)
 
             def get_clock(self):
-                return SimpleNamespace(now=lambda: Moment(ros.now))
+                return SimpleNamespace(now=lambda: FeatureInputs(ros.now))
 
             def get_logger(self):
                 def log(text, **_):
@@ -249,7 +249,7 @@ class StandIn:
             "rclpy.action": module(ActionClient=self.action_class()),
             "rclpy.node": module(Node=self.node_class()),
             "rclpy.publisher": module(Publisher=object),
-            "rclpy.time": module(Time=lambda nanoseconds: Moment(nanoseconds / 1e9)),
+            "rclpy.time": module(Time=lambda nanoseconds: FeatureInputs(nanoseconds / 1e9)),
             "rclpy.qos": module(QoSProfile=lambda **_: None, DurabilityPolicy=words, ReliabilityPolicy=words),
             "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),

@@ -146,7 +146,7 @@ def test_speeds_and_time_left_reach_the_policy(monkeypatch):
     place(driver, 75.0)
     driver.decide(75.0)
     assert told[0]["velocities"] == [0.0, 0.5]
-    assert [moment["time_left"] for moment in told] == [1.0, 0.75] and [moment["now"] for moment in told] == [0.0, 25.0]
+    assert [inputs["time_left"] for inputs in told] == [1.0, 0.75] and [inputs["now"] for inputs in told] == [0.0, 25.0]
 
 
 def test_settings_reach_the_planner():

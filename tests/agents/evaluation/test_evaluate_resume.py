@@ -12,7 +12,7 @@ from small_run import SMALL
 
 from maexp.agents.build import model_settings
 from maexp.agents.cli import main
-from maexp.agents.evaluation.cache import FOLDER, Kept, digest_weights, identify
+from maexp.agents.evaluation.cache import FOLDER, EpisodeCache, digest_weights, identify
 from maexp.agents.evaluation.evaluate import evaluate_recorded
 from maexp.agents.models.actor import make_policy
 from maexp.agents.policies import POLICIES
@@ -150,7 +150,7 @@ def test_damaged_batches_are_played_again(tmp_path):
     env = build()
     play = {"name": "random", "seed": 3}
     whole = evaluate_recorded(POLICIES["random"](env), env, 6, **play)
-    kept = Kept(tmp_path, {})
+    kept = EpisodeCache(tmp_path, {})
     evaluate_recorded(POLICIES["random"](env), env, 6, kept=kept, **play)
     files = sorted(tmp_path.rglob("*.npz"))
     assert [file.name for file in files] == ["000000.npz", "000002.npz", "000004.npz"]
@@ -181,10 +181,13 @@ def test_batches_are_of_what_their_bits_follow_from(tmp_path):
         identify(settings("radar.range=5"), env, 6, policy, "random"),
     ]
     assert all(other != base for other in others)
-    Kept(tmp_path / "random", base).write(0, {"a": np.zeros(1)})
-    assert Kept(tmp_path / "random", base).read(0) is not None and Kept(tmp_path / "random", base).read(6) is None
+    EpisodeCache(tmp_path / "random", base).write(0, {"a": np.zeros(1)})
+    assert (
+        EpisodeCache(tmp_path / "random", base).read(0) is not None
+        and EpisodeCache(tmp_path / "random", base).read(6) is None
+    )
     with pytest.warns(UserWarning, match="what random was played with has changed since"):
-        assert Kept(tmp_path / "random", others[0]).read(0) is None
+        assert EpisodeCache(tmp_path / "random", others[0]).read(0) is None
     shutil.rmtree(tmp_path / "random")
 
 

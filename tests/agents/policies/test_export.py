@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from runtime_cases import moment
+from runtime_cases import inputs
 from test_planner import survey
 
 from maexp.agents import ModelConfig, make_policy
@@ -46,7 +46,7 @@ def play(env: ExplorationEnv, steps: int = 5):
     last, draw = np.full((env.num_robots, 2), np.nan), np.random.default_rng(0)
     for step in range(steps):
         nav.update()
-        now = moment(env, nav)
+        now = inputs(env, nav)
         heading, speed = nav.state["pose"][0, :, 3].numpy(), env.target_view.tracker.speed(nav)[0].numpy()
         here, left = last - np.array(now.call["origin"]), 1.0 - step / env.macro_steps
         ours = list_candidates(survey(now), 24, heading, speed, here, left, motion_of(env))

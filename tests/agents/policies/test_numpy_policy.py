@@ -7,7 +7,7 @@ from mazes import OFFSET, REGION, make_env
 
 from maexp.agents.errors import UserError
 from maexp.agents.policies import POLICIES
-from maexp.agents.policies.remote.numpy_policy import ForeignPolicy, TeamSight, as_policy, read_goals
+from maexp.agents.policies.remote.numpy_policy import NumpyPolicy, TeamSight, as_policy, read_goals
 from maexp.envs import CommConfig, RobotConfig, make_map
 from maexp.envs.targets.navigation import Navigation
 
@@ -186,7 +186,7 @@ class Bad:
 )
 def test_what_is_no_goal_is_told_in_a_sentence(answer, told):
     env = make_env(1)
-    policy = ForeignPolicy(env, lambda: Bad(answer), "mine")
+    policy = NumpyPolicy(env, lambda: Bad(answer), "mine")
     env.reset()
     with pytest.raises(UserError, match=told) as error:
         policy(None)
@@ -197,6 +197,6 @@ def test_goals_are_read_as_numbers_of_any_kind():
     assert np.array_equal(read_goals([[1, 2], [3, 4]], 2), [[1.0, 2.0], [3.0, 4.0]])
     assert np.isnan(read_goals([[np.nan, 1.0]], 1)[0, 0])
     with pytest.raises(UserError, match=r"mine: its constructor raised TypeError"):
-        ForeignPolicy(make_env(1), lambda: Bad(), "mine")
+        NumpyPolicy(make_env(1), lambda: Bad(), "mine")
     with pytest.raises(ValueError, match="planner=direct"):
         as_policy(make_env(1, planner="direct"), Greedy)

@@ -14,7 +14,7 @@ import torch
 from mazes import OFFSET, REGION, make_env
 from subprocess_episodes import ENVS, EXAMPLES, STEPS, TESTS, alive, play_hosted, wait_for
 
-from maexp.agents.benchmarks.suites.play import Player
+from maexp.agents.benchmarks.suites.play import SuitePolicy
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies.remote import protocol, subprocess_policy
@@ -145,11 +145,11 @@ def test_what_plays_elsewhere_ends_with_its_connection(tmp_path):
     script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/number\nwhile :; do :; done\n")
     script.chmod(0o755)
     with listening(f"exec:{script}") as (word, _):
-        guest = guest_of(word)()
+        worker = guest_of(word)()
         wait_for(lambda: (tmp_path / "number").exists() and (tmp_path / "number").read_text().strip())
         number = int((tmp_path / "number").read_text())
         assert alive(number)
-        guest.kill()
+        worker.kill()
         wait_for(lambda: not alive(number))
 
 
@@ -187,7 +187,7 @@ def free_port() -> int:
 
 def test_a_listener_that_takes_one_after_another_is_enough():
     with answering(stays) as word:
-        player = Player(word)
+        player = SuitePolicy(word)
         assert player.hosted and player.most_teams == 1 and player.name == word
         env = make_env(1, macro_steps=2)
         with player.open(env) as policy:
@@ -224,7 +224,7 @@ def replies(message: bytes):
 def test_who_is_no_policy_is_told_before_anything_is_played(reply, told, monkeypatch):
     monkeypatch.setattr(subprocess_policy, "START", 1.0 if reply is silent else 30.0)
     with answering(reply) as word, pytest.raises(UserError, match=told) as error:
-        Player(word)
+        SuitePolicy(word)
     assert str(error.value).startswith(f"policy={word}") and "\n" not in str(error.value)
 
 
@@ -232,9 +232,9 @@ def test_nobody_there_is_told_before_anything_is_played():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(UserError, match=f"nobody can be reached at 127.0.0.1, port {port} .*refused"):
-        Player(f"socket:127.0.0.1:{port}")
+        SuitePolicy(f"socket:127.0.0.1:{port}")
     with pytest.raises(UserError, match="nobody can be reached at no.such.host.invalid, port 5000"):
-        Player("socket:no.such.host.invalid:5000")
+        SuitePolicy("socket:no.such.host.invalid:5000")
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_nobody_there_is_told_before_anything_is_played():
 )
 def test_what_is_no_address_is_told(word):
     with pytest.raises(UserError, match="is no HOST:PORT, as localhost:5000") as error:
-        Player(word)
+        SuitePolicy(word)
     assert str(error.value).startswith(f"policy={word} ")
 
 

@@ -9,7 +9,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from runtime_cases import moment
+from runtime_cases import inputs
 
 from maexp.agents.deploy.planner.bundle import SHIPPED
 from maexp.agents.policies.export import find_chooser
@@ -106,7 +106,7 @@ def play_runtime(planner: TeamPlanner, env: ExplorationEnv) -> tuple[float, np.n
         left = 1 - len(goals) / env.macro_steps
         speeds = view.tracker.speed(view.tracker.nav)[0].numpy()
         seconds = 0.1 * env.local_steps * len(goals)
-        plan = planner.plan(**moment(env, nav).call, velocities=speeds, time_left=left, now=seconds)
+        plan = planner.plan(**inputs(env, nav).call, velocities=speeds, time_left=left, now=seconds)
         goals.append(plan.goals.copy())
         gap = np.linalg.norm(view.state["point"][0].numpy() - plan.goals[:, None], axis=-1)
         index = np.where(view.state["mask"][0].numpy(), gap, np.inf).argmin(-1)
@@ -134,7 +134,7 @@ def test_the_runtime_plays_the_episode_that_torch_plays(scenario, num_robots, in
     envs = [make_env(scenario, num_robots, index=index, targets=alone) for _ in range(2)]
     robots = envs[0].simulation.robot_tensors
     limits = {name: float(robots[name].max()) for name in ("max_speed", "max_accel")}
-    settings = moment(envs[0], Navigation(envs[0])).settings | limits | {"seconds": 0.1 * envs[0].local_steps}
+    settings = inputs(envs[0], Navigation(envs[0])).settings | limits | {"seconds": 0.1 * envs[0].local_steps}
     coverage, goals = play_runtime(TeamPlanner("universal", distinct=False, **settings), envs[0])
     wanted, there = play_torch(load_policy_folder("universal", envs[1]), envs[1])
     assert len(there) >= 4 and wanted > 0.5

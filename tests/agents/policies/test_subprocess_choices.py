@@ -89,17 +89,17 @@ def test_our_planners_through_a_process_take_the_targets_that_they_take_inside(p
     apart, sent = 0.0, note_goals(monkeypatch)
     env = make_env(1, maps=[make_map("maze_small", 1)])
     inside, sight, state = POLICIES[policy](env), TeamSight(env), env.reset()
-    guest = Process(command_of(f"process:{policy}"))
+    worker = Process(command_of(f"process:{policy}"))
     try:
-        ask_all([(guest, {"type": "hello", "version": 1})], 60.0, 60.0)
+        ask_all([(worker, {"type": "hello", "version": 1})], 60.0, 60.0)
         for _ in range(5):
             sight.look()
-            ask_all([(guest, {"type": "reset", "episode": sight.episode(0)})], 60.0, 60.0)
-            (answer,) = ask_all([(guest, {"type": "act", "observation": sight.observation(0)})], 60.0, 60.0)
+            ask_all([(worker, {"type": "reset", "episode": sight.episode(0)})], 60.0, 60.0)
+            (answer,) = ask_all([(worker, {"type": "act", "observation": sight.observation(0)})], 60.0, 60.0)
             state = env.step(inside(state))["next"]
             apart = max(apart, np.abs(answer["goals"] - sent[-1][0].numpy()).max())
     finally:
-        guest.kill()
+        worker.kill()
     print(f"{policy}: goals differ by at most {apart:.1e} m")
     assert apart < 1e-4
 
@@ -110,20 +110,20 @@ def test_a_trained_policy_through_a_process_takes_the_targets_that_it_takes_insi
     shown, apart, sent = ObservationConfig(pictures=False, targets=24), [], note_goals(monkeypatch)
     env = make_env(1, observation=shown)
     inside, sight, state = load_policy_folder("universal", env), TeamSight(env), env.reset()
-    guest = Process(command_of("process:universal"))
+    worker = Process(command_of("process:universal"))
     try:
-        ask_all([(guest, {"type": "hello", "version": 1})], 60.0, 60.0)
+        ask_all([(worker, {"type": "hello", "version": 1})], 60.0, 60.0)
         for step in range(6):
             sight.look()
             if step == 0:
-                ask_all([(guest, {"type": "reset", "episode": sight.episode(0)})], 60.0, 60.0)
-            (answer,) = ask_all([(guest, {"type": "act", "observation": sight.observation(0)})], 60.0, 60.0)
+                ask_all([(worker, {"type": "reset", "episode": sight.episode(0)})], 60.0, 60.0)
+            (answer,) = ask_all([(worker, {"type": "act", "observation": sight.observation(0)})], 60.0, 60.0)
             with torch.no_grad():
                 state = inside(state)
             state = env.step(state)["next"]
             apart.append(np.abs(answer["goals"] - sent[-1][0].numpy()).max())
     finally:
-        guest.kill()
+        worker.kill()
     print(f"universal: goals differ by at most {max(apart):.1e} m")
     assert max(apart) < 1e-4
 

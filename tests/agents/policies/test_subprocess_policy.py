@@ -13,7 +13,7 @@ import torch
 from mazes import make_env
 from subprocess_episodes import ENVS, STEPS, TESTS, alive, play_hosted, wait_for
 
-from maexp.agents.benchmarks.suites.play import Player
+from maexp.agents.benchmarks.suites.play import SuitePolicy
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies.remote import subprocess_policy
@@ -99,7 +99,7 @@ def test_the_next_episode_has_a_new_process():
         for number in range(6):
             play(policy, env, torch.tensor([number]))
             ends.append((policy.sight.episode(0)["seed"] // 2 % 2 == 1, policy.reasons[0] != ""))
-        processes = [guest.process for guest in policy.guests if guest is not None]
+        processes = [worker.process for worker in policy.workers if worker is not None]
     assert all(bad == lost for bad, lost in ends) and {bad for bad, _ in ends} == {True, False}
     assert all(process.returncode is not None for process in processes)
 
@@ -124,7 +124,7 @@ def test_the_next_episode_has_a_new_process():
 def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):
     monkeypatch.setattr(subprocess_policy, "START", 2.0 if "sleep" in word else 60.0)
     with pytest.raises(UserError, match=f"(?s){told}") as error:
-        Player(word)
+        SuitePolicy(word)
     assert "\n" not in str(error.value)
 
 
@@ -143,15 +143,15 @@ def test_the_processor_time_is_that_of_the_process():
         "    while time.process_time() - begin < m['spin']: pass\n"
         "    time.sleep(m['sleep']); wire.write(sys.stdout.buffer, {'type': 'ready'})\n"
     )
-    guest = Process([sys.executable, "-c", program])
+    worker = Process([sys.executable, "-c", program])
     try:
-        ask_all([(guest, {"type": "x", "spin": 0.0, "sleep": 0.0})], 60.0, 60.0)
-        ask_all([(guest, {"type": "x", "spin": 0.3, "sleep": 0.6})], 60.0, 60.0)
-        assert 0.29 < guest.seconds < 0.5
-        (answer,) = ask_all([(guest, {"type": "x", "spin": 30.0, "sleep": 0.0})], 0.2, 60.0)
+        ask_all([(worker, {"type": "x", "spin": 0.0, "sleep": 0.0})], 60.0, 60.0)
+        ask_all([(worker, {"type": "x", "spin": 0.3, "sleep": 0.6})], 60.0, 60.0)
+        assert 0.29 < worker.seconds < 0.5
+        (answer,) = ask_all([(worker, {"type": "x", "spin": 30.0, "sleep": 0.0})], 0.2, 60.0)
         assert isinstance(answer, Lost) and "thought for more than 0.2 s" in str(answer)
     finally:
-        guest.kill()
+        worker.kill()
 
 
 RUN = """
@@ -210,12 +210,12 @@ def having(variable: str, but: int) -> list[int]:
 
 
 def test_where_memory_runs_out_the_policy_is_ended_and_not_the_run():
-    guest = Process(["sleep", "60"])
+    worker = Process(["sleep", "60"])
     try:
-        assert Path(f"/proc/{guest.process.pid}/oom_score_adj").read_text() == "1000\n"
+        assert Path(f"/proc/{worker.process.pid}/oom_score_adj").read_text() == "1000\n"
         assert int(Path("/proc/self/oom_score_adj").read_text()) < 1000
     finally:
-        guest.kill()
+        worker.kill()
 
 
 def test_the_guest_needs_no_torch():

@@ -13,7 +13,7 @@ from mazes import OFFSET, REGION, make_env
 from maexp.agents import make_policy
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.policies.registry import NamedPolicy, find_player, name_players, short_name, suit_observation
+from maexp.agents.policies.registry import NamedPolicy, find_named_policy, name_policies, short_name, suit_observation
 from maexp.agents.policies.remote import user_policy
 from maexp.agents.settings.overrides import make_overrides
 from maexp.envs import ObservationConfig
@@ -171,7 +171,7 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
 def test_every_mistake_is_a_sentence_that_names_the_policy(word, told):
     env = make_env(1)
     with pytest.raises(UserError, match=told) as error:
-        find_player(word).make(env)(env.reset())
+        find_named_policy(word).make(env)(env.reset())
     assert "\n" not in str(error.value) and len(str(error.value)) < 600
 
 
@@ -183,12 +183,12 @@ def test_a_plug_in_is_found_by_its_name(monkeypatch, capsys):
     monkeypatch.setattr(
         user_policy.metadata, "entry_points", lambda group: [point for point in points if point.group == group]
     )
-    found = find_player("swarm")
+    found = find_named_policy("swarm")
     assert (found.name, found.kind, found.pictures) == ("swarm", "own", False)
-    assert find_player("voronoi").kind == "classical", "names of ours come first"
+    assert find_named_policy("voronoi").kind == "classical", "names of ours come first"
     with pytest.raises(UserError, match="policy=bent .*an entry point of maexp.policies is written module:function"):
-        find_player("bent")
-    assert "swarm" in str(pytest.raises(UserError, find_player, "swarn").value)
+        find_named_policy("bent")
+    assert "swarm" in str(pytest.raises(UserError, find_named_policy, "swarn").value)
 
 
 def test_names_in_tables_are_unique_and_readable(tmp_path):
@@ -197,35 +197,35 @@ def test_names_in_tables_are_unique_and_readable(tmp_path):
     assert short_name("my_robots:Corner") == "my_robots.Corner"
     words = ["outputs/mappo_3/checkpoints/iteration_000040.pt", "outputs/mappo_3/checkpoints/best.pt"]
     assert [short_name(word) for word in words] == ["mappo_3_iteration_40", "mappo_3_best"]
-    named = name_players(["a/best", "b/best", "run", "voronoi"], taken=["mappo"])
+    named = name_policies(["a/best", "b/best", "run", "voronoi"], taken=["mappo"])
     assert list(named.values()) == ["best", "b-best", f"{tmp_path.name}-run", "voronoi"]
     for words in (["voronoi", "voronoi"], ["a/best", "./a/best"]):
         with pytest.raises(UserError, match="twice"):
-            name_players(words)
+            name_policies(words)
 
 
-def player(name: str, **shown) -> NamedPolicy:
+def policy(name: str, **shown) -> NamedPolicy:
     return NamedPolicy(name, lambda env: None, "own", **shown)
 
 
 def test_an_env_shows_what_its_policies_look_at_and_no_more():
     from maexp.agents.settings.compose import compose_config
 
-    def suited(*players, words=()):
+    def suited(*policies, words=()):
         cfg = compose_config("evaluate", ["policy=random", *words])
-        suit_observation(cfg, players)
+        suit_observation(cfg, policies)
         return cfg.observation.targets, cfg.observation.pictures, cfg.observation.map
 
-    assert suited(player("a")) == (0, False, "seen"), "pictures that nobody looks at"
-    assert suited(player("a", targets=24), player("b", pictures=True)) == (24, True, "seen")
-    assert suited(player("a", pictures=True, map="known")) == (0, True, "known")
-    for players, words in (
-        ([player("a", targets=24), player("b", targets=8)], []),
-        ([player("a", targets=24)], ["observation.targets=8"]),
-        ([player("a", pictures=True, map="known"), player("b", pictures=True, map="seen")], []),
+    assert suited(policy("a")) == (0, False, "seen"), "pictures that nobody looks at"
+    assert suited(policy("a", targets=24), policy("b", pictures=True)) == (24, True, "seen")
+    assert suited(policy("a", pictures=True, map="known")) == (0, True, "known")
+    for policies, words in (
+        ([policy("a", targets=24), policy("b", targets=8)], []),
+        ([policy("a", targets=24)], ["observation.targets=8"]),
+        ([policy("a", pictures=True, map="known"), policy("b", pictures=True, map="seen")], []),
     ):
         with pytest.raises(UserError, match="cannot play together"):
-            suited(*players, words=words)
+            suited(*policies, words=words)
 
 
 def test_folders_of_any_name_stand_in_lists(tmp_path):
@@ -241,7 +241,7 @@ def test_folders_of_any_name_stand_in_lists(tmp_path):
 
 def test_a_foreign_policy_cannot_steer():
     with pytest.raises(UserError, match=r"planner=direct takes controls, and my_robots.Stay picks goals"):
-        find_player("my_robots:Stay").make(make_env(1, planner="direct"))
+        find_named_policy("my_robots:Stay").make(make_env(1, planner="direct"))
     state = make_env(1)
     policy = make_policy("my_robots:Corner", state)
     td = policy(state.reset())

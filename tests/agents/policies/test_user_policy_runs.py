@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from small_suite import make_small_suite
 
-from maexp.agents.benchmarks.suites.play import Player
+from maexp.agents.benchmarks.suites.play import SuitePolicy
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.policies.registry import find_player
+from maexp.agents.policies.registry import find_named_policy
 from maexp.agents.training.checkpoint import load_checkpoint
 
 pytestmark = pytest.mark.slow  # trainings
@@ -69,13 +69,15 @@ def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
     assert main(["evaluate", *alone, "scenario.local_steps=20", "hydra.run.dir=alone"]) == 0
     trained = json.loads(Path("alone/results.json").read_text())["trained"]
     assert trained["coverage_auc"] == found["aims"]["coverage_auc"]
-    saved = find_player("aims").saved
+    saved = find_named_policy("aims").saved
     assert load_checkpoint(Path("aims/checkpoints/iteration_000001.pt"))["maps"] == saved["maps"]
     saved["maps"] = dict.fromkeys(saved["maps"], "0" * 16)
     from maexp.envs import make_map
 
     with pytest.warns(UserWarning, match="maze_small_70 has changed"):
-        find_player("aims").__class__("aims", None, "checkpoint", saved=saved).check_maps([make_map("maze_small", 70)])
+        find_named_policy("aims").__class__("aims", None, "checkpoint", saved=saved).check_maps(
+            [make_map("maze_small", 70)]
+        )
 
 
 def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
@@ -188,11 +190,13 @@ def test_a_suite_takes_what_policy_takes_elsewhere(tmp_path, monkeypatch, capsys
     assert found["teachers:regions"]["episodes"] == found["swarm_voronoi"]["episodes"] == found["voronoi"]["episodes"]
     means = {word: results["score"]["mean"] for word, results in found.items()}
     assert means["swarm_stay"] == min(means.values()) and len(set(means.values())) == 4
-    assert Player("swarm_stay").hosted and not Player("swarm_voronoi").hosted
+    assert SuitePolicy("swarm_stay").hosted and not SuitePolicy("swarm_voronoi").hosted
 
 
 def test_a_suite_refuses_controls(monkeypatch):
-    found = find_player("aims")
-    monkeypatch.setattr("maexp.agents.benchmarks.suites.play.find_player", lambda *a, **k: replace(found, direct=True))
+    found = find_named_policy("aims")
+    monkeypatch.setattr(
+        "maexp.agents.benchmarks.suites.play.find_named_policy", lambda *a, **k: replace(found, direct=True)
+    )
     with pytest.raises(UserError, match="policy=aims gives controls"):
-        Player("aims")
+        SuitePolicy("aims")

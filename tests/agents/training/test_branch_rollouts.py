@@ -12,7 +12,7 @@ from maexp.agents.models.target_chooser import NEVER, SCORE
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.training import branch_rollouts
-from maexp.agents.training.branch_rollouts import BranchPlayer, main, training_maps
+from maexp.agents.training.branch_rollouts import BranchRollouts, main, training_maps
 from maexp.envs import ExplorationEnv, ObservationConfig, make_map
 
 
@@ -45,7 +45,7 @@ def test_a_candidate_is_worth_what_comes_of_it():
     td, compared = env.reset(), 0
     for _ in range(2):
         preference = torch.where(td[TARGETS_MASK], td[TARGETS][..., SCORE], NEVER)
-        index, advantage = BranchPlayer(env, candidates=3, horizon=1).try_candidates(td[TARGETS], preference)
+        index, advantage = BranchRollouts(env, candidates=3, horizon=1).try_candidates(td[TARGETS], preference)
         own, saved, ended = index[..., 0].clamp_min(0), env.state_dict(), {}
         points = env.target_view.state["point"].clone()
         state = env.simulation.tensors

@@ -11,7 +11,7 @@ from maexp.agents.models.actor import TARGETS, TARGETS_MASK
 from maexp.agents.models.distributions import ACTION
 from maexp.agents.models.target_chooser import NEVER, SCORE
 from maexp.agents.policies.classical import FrontierPlanner
-from maexp.agents.training.branch_rollouts import BranchPlayer
+from maexp.agents.training.branch_rollouts import BranchRollouts
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, make_map
 from maexp.envs.targets.heuristics import rank_by_criteria
 
@@ -89,8 +89,8 @@ def test_a_branch_is_worth_what_comes_of_it(learner, strategy):
         likes = prefer(td)
         td = begin(env, td, likes, likes.argmax(-1))
     likes, saved = prefer(td), env.state_dict()
-    player = BranchPlayer(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
-    index, advantage = player.try_candidates(td[TARGETS], likes)
+    policy = BranchRollouts(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
+    index, advantage = policy.try_candidates(td[TARGETS], likes)
     after = env.state_dict()
     assert all(torch.equal(tensor, after[name]) for name, tensor in saved.items()), "the episode was touched"
     own, worth, compared, telling = index[..., 0].clamp_min(0), {}, 0, 0
@@ -113,10 +113,10 @@ def test_who_is_on_its_way_to_tell_tries_nothing():
     for _ in range(BEFORE):
         likes = prefer(td)
         td = begin(env, td, likes, likes.argmax(-1))
-    player, likes = BranchPlayer(env, candidates=3, horizon=1, seed=0, learn_from="base"), prefer(td)
-    tried = player.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    policy, likes = BranchRollouts(env, candidates=3, horizon=1, seed=0, learn_from="base"), prefer(td)
+    tried = policy.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
     env.strategy.state["duty"][:] = True
-    fewer = player.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    fewer = policy.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
     can = env.strategy.can_tell()
     assert can.any() and tried[can].any()
     assert not fewer[can].any() and torch.equal(fewer[~can], tried[~can])
@@ -132,4 +132,4 @@ def test_who_is_on_its_way_to_tell_tries_nothing():
 )
 def test_what_nobody_could_learn_is_told(comm, learner, sentence):
     with pytest.raises(ValueError, match=f"algorithm.learn_from={learner}.*{sentence}"):
-        BranchPlayer(make_env(radio=False, comm=comm), candidates=2, horizon=1, learn_from=learner)
+        BranchRollouts(make_env(radio=False, comm=comm), candidates=2, horizon=1, learn_from=learner)

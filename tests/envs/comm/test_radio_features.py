@@ -17,7 +17,7 @@ from maexp.agents.models.actor import TARGETS, TARGETS_MASK
 from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.lookahead import LookaheadPlanner
-from maexp.agents.policies.registry import find_player, suit_observation
+from maexp.agents.policies.registry import find_named_policy, suit_observation
 from maexp.agents.runtime import TeamPlanner
 from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.model import ModelConfig
@@ -245,7 +245,7 @@ def test_exported_it_plays_on_here_and_planners_on_robots_ask_for_the_radios(tmp
     with pytest.raises(UserError, match=r"add observation\.radio=true"):
         make_policy(str(folder), plain)
     cfg = compose_config("evaluate", ["policy=cost_utility"])
-    suit_observation(cfg, [find_player("universal"), find_player(str(folder))])
+    suit_observation(cfg, [find_named_policy("universal"), find_named_policy(str(folder))])
     assert cfg.observation.radio and cfg.observation.targets == COUNT
     config = LookaheadConfig(rollout_policy=str(folder), horizon=2, candidates=3)
     LookaheadPlanner(env, config)(None)

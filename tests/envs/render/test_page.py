@@ -58,7 +58,7 @@ def test_scrubbing_shows_that_moment(page, episodes):
     for seconds in (1.0, 0.0, 1.5):
         page.seek(seconds)
         snapshot = episodes[0].snapshot(round(10 * seconds))
-        scene = Stage(episodes[0].map).moment(snapshot)
+        scene = Stage(episodes[0].map).inputs(snapshot)
         assert np.array_equal(ground(page), _paint(scene.ground_colour))
         np.testing.assert_allclose(page.actors.moving["robots"].batched_positions, scene.robots, atol=1e-4)
         assert f"after **{seconds:.1f} s**" in page.status.content
@@ -82,7 +82,7 @@ def test_another_episode(page, episodes):
     page.open_episode(1)
     assert page.record == 0 and page.episode is episodes[1]
     page.seek(1.5)
-    scene = Stage(episodes[1].map).moment(episodes[1].snapshot(-1))
+    scene = Stage(episodes[1].map).inputs(episodes[1].snapshot(-1))
     np.testing.assert_allclose(page.actors.moving["robots"].batched_positions, scene.robots, atol=1e-4)
 
 

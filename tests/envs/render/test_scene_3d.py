@@ -85,7 +85,7 @@ def test_columns_are_as_high_as_the_scan_says():
 def test_robots_stand_on_the_hill():
     slope = room().free[:, 0] * 0.5 + 7.0
     stage = Stage(room(free_height=slope, obstacle_height=np.full(len(room().obstacles), 30.0)))
-    scene = stage.moment(team(stage.map))
+    scene = stage.inputs(team(stage.map))
     assert scene.robots[:, 2] == pytest.approx([0.5 * (3 - 1), 0.5 * (16 - 1)])
 
 
@@ -94,7 +94,7 @@ def test_every_class_has_its_colour_in_its_place():
     seen, walls = np.zeros((2, len(place.free)), bool), np.zeros((2, len(place.boundary)), bool)
     seen[0, index_of(place.free, (6, 3))] = seen[:, index_of(place.free, (14, 3))] = True
     walls[1, index_of(place.boundary, (19, 8))] = True
-    picture, at = painted(Stage(place).moment(team(place, seen_free=seen, seen_boundary=walls)))
+    picture, at = painted(Stage(place).inputs(team(place, seen_free=seen, seen_boundary=walls)))
     top = WALL_SHARE * 19
     assert picture.shape == (SIZE[1], SIZE[0], 3) and picture.dtype == np.uint8
     assert at(6, 3, 0) == EXPLORED and at(14, 3, 0) == OVERLAP and at(8, 12, 0) == UNEXPLORED
@@ -106,7 +106,7 @@ def test_seen_by_one_robot_alone():
     place = room()
     seen = np.zeros((2, len(place.free)), bool)
     seen[0, index_of(place.free, (6, 3))] = seen[1, index_of(place.free, (14, 3))] = True
-    _, at = painted(Stage(place).moment(team(place, seen_free=seen), robot=1))
+    _, at = painted(Stage(place).inputs(team(place, seen_free=seen), robot=1))
     assert at(6, 3, 0) == UNEXPLORED and at(14, 3, 0) == EXPLORED
 
 
@@ -170,7 +170,7 @@ def test_where_open3d_fails_the_painter_draws_and_says_so(outcome, wanted, monke
 
 @pytest.mark.slow
 def test_open3d_draws_what_the_painter_draws(episode):
-    scene = Stage(episode.map).moment(episode.snapshot(-1))
+    scene = Stage(episode.map).inputs(episode.snapshot(-1))
     try:
         drawn, how = show.draw_scene(scene, 480, "open3d")
     except ValueError as error:

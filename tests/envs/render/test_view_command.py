@@ -30,9 +30,9 @@ def played() -> tuple[Episode, list[dict]]:
     torch.manual_seed(0)
     recorder, snapshots = EpisodeRecorder("random"), []
 
-    def look(moment: list[dict]) -> None:
-        snapshots.append(moment[0])
-        recorder.add(moment[0])
+    def look(inputs: list[dict]) -> None:
+        snapshots.append(inputs[0])
+        recorder.add(inputs[0])
 
     watch_episode(env, env.rand_action, look, 1, every=2)
     return recorder.episode(), snapshots

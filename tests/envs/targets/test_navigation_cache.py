@@ -49,7 +49,7 @@ def test_what_is_kept_is_what_is_there(reach):
             td = env.reset(td.set("_reset", reset))
         nav.some(torch.tensor([0, 3])).update()  # leaves the others, and what has changed of them counts later
         nav.update()
-        kept += int((wp_array(nav, "looked_from") >= 0).sum()) if changed.any() else 0
+        kept += int((wp_array(nav, "cached_from") >= 0).sum()) if changed.any() else 0
         assert_up_to_date(nav, env)
     assert kept > 20, "nothing was ever kept"
 
@@ -68,12 +68,12 @@ def test_nothing_is_kept_of_another_map():
     fresh = Navigation(env)
     fresh.update()
     width = torch.from_numpy(nav.grids.width.numpy())[env.simulation.tensors["map_id"].long()]
-    wp_array(nav, "looked_from").copy_(fresh._target.flatten(0, 1))
-    wp_array(nav, "looked_at")[..., 0] = width.view(-1, 1) - 1  # corners that enclose nothing on this map
-    wp_array(nav, "looked_at")[..., 1] = width.view(-1, 1)
-    assert (wp_array(nav, "looked_from") >= 0).sum() > 10
+    wp_array(nav, "cached_from").copy_(fresh._target.flatten(0, 1))
+    wp_array(nav, "cached_window")[..., 0] = width.view(-1, 1) - 1  # corners that enclose nothing on this map
+    wp_array(nav, "cached_window")[..., 1] = width.view(-1, 1)
+    assert (wp_array(nav, "cached_from") >= 0).sum() > 10
     nav.update()
-    assert (wp_array(nav, "looked_from") < 0).all()
+    assert (wp_array(nav, "cached_from") < 0).all()
     assert_up_to_date(nav, env)
 
 
