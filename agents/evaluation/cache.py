@@ -118,7 +118,7 @@ def begin(where: Path, cfg: EvaluateSettings, overrides: list[str]) -> None:
     settings = {name: value for name, value in flatten(plain(cfg)).items() if name != "resume"}
     settings |= {name: str(Path(settings[name]).absolute()) for name in PATHS if settings[name] is not None}
     words = settings["policy"]
-    settings["policy"] = [from_root(word) for word in words] if isinstance(words, list) else words and from_root(words)
+    settings["policy"] = [from_root(spec) for spec in words] if isinstance(words, list) else words and from_root(words)
     content = {"format": FORMAT, "overrides": overrides, "settings": settings}
     write_text(where / FOLDER / ASKED, json.dumps(content, indent=2) + "\n")  # inf stays inf
 
@@ -145,7 +145,7 @@ def continue_evaluation(place: str, overrides: list[str]) -> Recipe:
         content = json.loads(path.read_text())
         if content["format"] != FORMAT:
             raise ValueError(content["format"])
-        words, values = [str(word) for word in content["overrides"]], dict(content["settings"])
+        words, values = [str(spec) for spec in content["overrides"]], dict(content["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{short(path)} is damaged, or not of the kind {FORMAT}: evaluate anew.") from error
     return Recipe([*words, *overrides], values=values, source=str(path))

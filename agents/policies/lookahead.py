@@ -32,20 +32,20 @@ class TrainedRank:
     """Calling it with a `TensorScene` gives what each robot thinks of each target [radar discs], float32 [E, N, K].
 
     Args:
-        word: a policy that ships, or a folder that `maexp export` wrote.
+        spec: a policy that ships, or a folder that `maexp export` wrote.
         env: of the teams; only read.
         tracker: with which the planner looks.
-        setting: what messages call the word.
+        setting: the setting that messages name.
 
     Raises:
         UserError: there is no such policy, it is damaged, or it looks at radios and the env shows nothing of these.
     """
 
-    def __init__(self, word: str, env: ExplorationEnv, tracker: TargetTracker, setting: str):
-        chooser, count = load_chooser(word, setting)
+    def __init__(self, spec: str, env: ExplorationEnv, tracker: TargetTracker, setting: str):
+        chooser, count = load_chooser(spec, setting)
         if chooser.radio and not env.settings.observes_radios:
             raise UserError(
-                f"{setting}={word} was trained with observation.radio=true, and the env shows nothing of radios: add "
+                f"{setting}={spec} was trained with observation.radio=true, and the env shows nothing of radios: add "
                 "observation.radio=true."
             )
         self.chooser = chooser.to(env.device)

@@ -10,35 +10,35 @@ from maexp.agents.policies.remote.worker import GROUP
 from maexp.agents.settings.verbs.evaluate import NAMES
 
 
-def plug_ins() -> dict[str, metadata.EntryPoint]:
+def policy_plugins() -> dict[str, metadata.EntryPoint]:
     """The policies that installed packages offer, by their names."""
     return {entry_point.name: entry_point for entry_point in metadata.entry_points(group=GROUP)}
 
 
-def check_name(word: str, setting: str) -> None:
+def check_name(spec: str, setting: str) -> None:
     """Raise UserError for a plain name that is none of a policy; files and module:function are read later."""
-    known = word in NAMES or word in shipped_names() or word in plug_ins()
-    if not known and re.fullmatch(r"[\w-]*", word) and not os.path.exists(word[:250]):
-        raise UserError(describe_unknown(word, setting))
+    known = spec in NAMES or spec in shipped_names() or spec in policy_plugins()
+    if not known and re.fullmatch(r"[\w-]*", spec) and not os.path.exists(spec[:250]):
+        raise UserError(describe_unknown_policy(spec, setting))
 
 
-def describe_unknown(word: str, setting: str) -> str:
+def describe_unknown_policy(spec: str, setting: str) -> str:
     """What is wrong with a word that names no policy."""
-    if os.path.isdir(word):
+    if os.path.isdir(spec):
         return (
-            f"{setting}={word} is a folder without a policy: it holds neither the {CONTRACT} of maexp export nor the "
+            f"{setting}={spec} is a folder without a policy: it holds neither the {CONTRACT} of maexp export nor the "
             "checkpoints of maexp train."
         )
-    if module := _module_of(word):
-        return f"{setting}={word} is a module: name its class or function, as {setting}={module}:NAME."
-    if os.path.exists(word):
-        return f"{setting}={word} is a file and no checkpoint: give a run's folder, or that of an exported policy."
-    advice = advise(word[:100], [*NAMES, *plug_ins(), *shipped_names()])
+    if module := _module_of(spec):
+        return f"{setting}={spec} is a module: name its class or function, as {setting}={module}:NAME."
+    if os.path.exists(spec):
+        return f"{setting}={spec} is a file and no checkpoint: give a run's folder, or that of an exported policy."
+    advice = advise(spec[:100], [*NAMES, *policy_plugins(), *shipped_names()])
     more = "" if advice.endswith("?") else ", a run, or module:function of your own."
-    return f"{setting}={word[:100]} is unknown: {advice}{more}"
+    return f"{setting}={spec[:100]} is unknown: {advice}{more}"
 
 
-def _module_of(word: str) -> str:
+def _module_of(spec: str) -> str:
     """The module in this folder that a word without a class means; "" for none."""
-    name = word.removesuffix(".py")
+    name = spec.removesuffix(".py")
     return name if name.isidentifier() and os.path.isfile(f"{name}.py") else ""

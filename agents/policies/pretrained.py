@@ -26,14 +26,14 @@ from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
 
-def open_policy(word: str, setting: str = "policy", others: Iterable[str] = tuple(POLICIES)) -> tuple[Path, Contract]:
+def open_policy(spec: str, setting: str = "policy", others: Iterable[str] = tuple(POLICIES)) -> tuple[Path, Contract]:
     """Folder and contract of a trained policy, its files checked.
 
     Raises:
         UserError: there is none of that name, or it is damaged.
     """
     try:
-        folder = find_policy(word, others, setting)
+        folder = find_policy(spec, others, setting)
         contract = read_contract(folder)
         read_checked(folder, contract.content, WEIGHTS)
     except ValueError as error:
@@ -41,45 +41,45 @@ def open_policy(word: str, setting: str = "policy", others: Iterable[str] = tupl
     return folder, contract
 
 
-def is_exported(word: str) -> bool:
+def is_exported(spec: str) -> bool:
     """Whether this is the name of a policy that ships, or a folder that `maexp export` wrote."""
-    return word in shipped_names() or os.path.isfile(Path(word) / CONTRACT)
+    return spec in shipped_names() or os.path.isfile(Path(spec) / CONTRACT)
 
 
-def load_policy_folder(word: str, env: ExplorationEnv, setting: str = "policy") -> ProbabilisticActor:
+def load_policy_folder(spec: str, env: ExplorationEnv, setting: str = "policy") -> ProbabilisticActor:
     """The trained policy in torch, on the device of `env`, for teams of any size; it takes the likeliest target, as on
     a robot.
 
     Raises:
         UserError: it is unknown, damaged, or of another kind.
     """
-    folder, contract = open_policy(word, setting)
+    folder, contract = open_policy(spec, setting)
     config, weights = _read_network(folder, contract)
     policy = make_policy(env, config, contract.radio)
     find_chooser(policy).load_state_dict(weights)
     return policy.to(env.device)
 
 
-def load_chooser(word: str, setting: str = "policy") -> tuple[TargetChooser, int]:
+def load_chooser(spec: str, setting: str = "policy") -> tuple[TargetChooser, int]:
     """The network of a trained policy, on the CPU, and how many candidates it is shown.
 
     Raises:
         UserError: it is unknown, damaged, or of another kind.
     """
-    folder, contract = open_policy(word, setting)
+    folder, contract = open_policy(spec, setting)
     config, weights = _read_network(folder, contract)
     chooser = TargetChooser(config, contract.radio).eval()
     chooser.load_state_dict(weights)
     return chooser, contract.candidates
 
 
-def read_model(word: str, setting: str = "policy") -> ModelConfig:
+def read_model(spec: str, setting: str = "policy") -> ModelConfig:
     """Sizes of a trained policy's network.
 
     Raises:
         UserError: it is unknown, damaged, or of another kind.
     """
-    return _read_network(*open_policy(word, setting))[0]
+    return _read_network(*open_policy(spec, setting))[0]
 
 
 def _read_network(folder: Path, contract: Contract) -> tuple[ModelConfig, dict[str, Tensor]]:

@@ -1,7 +1,7 @@
-"""Any policy by the word that names it, with one meaning wherever a policy is named.
+"""Any policy by its spec, with one meaning wherever a policy is named.
 
 A classical name, a policy that ships, a folder of `maexp export`, a run of `maexp train` or one of its checkpoints,
-module:function, or a plug-in by the name of its entry point: in this order, where a word could be several.
+module:function, or a plug-in by the name of its entry point: in this order, where a spec could be several.
 """
 
 from __future__ import annotations
@@ -18,9 +18,15 @@ from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import STARTS
 from maexp.agents.files import warn_of_changed_maps
 from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
-from maexp.agents.policies.names import describe_unknown, plug_ins
+from maexp.agents.policies.names import describe_unknown_policy, policy_plugins
 from maexp.agents.policies.pretrained import is_exported, load_policy_folder, open_policy, read_model
-from maexp.agents.policies.remote.user_policy import find_own, is_numpy_policy, is_reference, make_own, source_of
+from maexp.agents.policies.remote.user_policy import (
+    find_user_policy,
+    is_module_reference,
+    is_numpy_policy,
+    make_user_policy,
+    read_source,
+)
 from maexp.agents.settings.checks import check_distinct
 from maexp.agents.settings.groups import CommonSettings
 from maexp.agents.settings.model import ModelConfig
@@ -37,7 +43,7 @@ from maexp.agents.training.checkpoint import (
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 Kind = Literal["classical", "exported", "checkpoint", "start", "own"]
-TAKEN = ("run", "difference", "headroom_share", "trained", *STARTS, "best_classical")
+RESERVED_NAMES = ("run", "difference", "headroom_share", "trained", *STARTS, "best_classical")
 """What results call something else."""
 
 
@@ -48,7 +54,7 @@ class NamedPolicy:
     Attributes:
         name: in tables and file names.
         build: env -> policy on tensordicts.
-        kind: what its word named.
+        kind: what its spec named.
         targets: frontier targets that it is shown; None: it takes what there is.
         radio: it looks at what these tell of radios.
         pictures: whether it looks, or may look, at pictures; `map` is what these show, None: as set.
@@ -56,7 +62,7 @@ class NamedPolicy:
         source: text that changes with the policy itself, "" for what comes with the package.
         saved: the checkpoint that it comes from.
         model: sizes of its network, of a trained one.
-        found: what one's own word stands for.
+        found: the user's class or function.
     """
 
     name: str
@@ -90,7 +96,7 @@ class NamedPolicy:
         if self.targets not in (None, shown.targets):
             raise UserError(
                 f"policy {self.name} looks at {self.targets} targets, and the env shows {shown.targets}: "
-                f"make it with observation=ObservationConfig(targets={self.targets}), as a word "
+                f"make it with observation=ObservationConfig(targets={self.targets}), on the command line as "
                 f"observation.targets={self.targets}."
             )
         if self.radio and not shown.radio:
@@ -107,41 +113,41 @@ class NamedPolicy:
             warn_of_changed_maps(self.saved, maps)
 
 
-def find_named_policy(word: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
-    """The policy that a word names.
+def find_named_policy(spec: str, setting: str = "policy", name: str | None = None) -> NamedPolicy:
+    """The policy of a spec.
 
     Args:
-        setting: what messages call the word.
-        name: in tables; None: from the word.
+        setting: the setting that messages name.
+        name: in tables; None: from the spec.
 
     Raises:
         UserError: there is none, or it is damaged.
     """
-    name = name or short_name(word)
-    if word in POLICIES:
-        return NamedPolicy(name, POLICIES[word], "classical")
-    if not is_exported(word) and word in plug_ins():
-        return _own(word, setting, name)
-    if not is_exported(word) and is_run(Path(word)):
-        return _from_checkpoint(word, name)
-    if is_reference(word) and not os.path.exists(word):
-        return _own(word, setting, name)
-    if not is_exported(word):
-        raise UserError(describe_unknown(word, setting))
-    _, contract = open_policy(word, setting)
+    name = name or policy_label(spec)
+    if spec in POLICIES:
+        return NamedPolicy(name, POLICIES[spec], "classical")
+    if not is_exported(spec) and spec in policy_plugins():
+        return _own(spec, setting, name)
+    if not is_exported(spec) and is_run(Path(spec)):
+        return _from_checkpoint(spec, name)
+    if is_module_reference(spec) and not os.path.exists(spec):
+        return _own(spec, setting, name)
+    if not is_exported(spec):
+        raise UserError(describe_unknown_policy(spec, setting))
+    _, contract = open_policy(spec, setting)
     return NamedPolicy(
         name,
-        lambda env: load_policy_folder(word, env, setting),
+        lambda env: load_policy_folder(spec, env, setting),
         "exported",
         targets=contract.candidates,
         radio=contract.radio,
         source=str(contract.content["sha256"]),
-        model=read_model(word, setting),
+        model=read_model(spec, setting),
     )
 
 
-def _from_checkpoint(word: str, name: str) -> NamedPolicy:
-    path, saved = find_checkpoint(word)
+def _from_checkpoint(spec: str, name: str) -> NamedPolicy:
+    path, saved = find_checkpoint(spec)
     settings, model = flatten(saved["settings"]), model_of(saved)
     regions, direct = model.action == "regions", settings["planner.name"] == "direct"
     return NamedPolicy(
@@ -159,54 +165,54 @@ def _from_checkpoint(word: str, name: str) -> NamedPolicy:
     )
 
 
-def _own(word: str, setting: str, name: str) -> NamedPolicy:
-    found = find_own(word, setting)
+def _own(spec: str, setting: str, name: str) -> NamedPolicy:
+    found = find_user_policy(spec, setting)
     foreign = is_numpy_policy(found)
     return NamedPolicy(
         name,
-        lambda env: make_own(found, env, name),
+        lambda env: make_user_policy(found, env, name),
         "own",
         pictures=not foreign,
         direct=False if foreign else None,
-        source=f"{word} {source_of(found)}",
+        source=f"{spec} {read_source(found)}",
         found=found,
     )
 
 
-def find_named_policies(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
-    """The policies of several words, with names of their own.
+def find_named_policies(specs: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> list[NamedPolicy]:
+    """The policies of several specs, with names of their own.
 
     Raises:
         UserError: as `find_named_policy`; or a policy is named twice.
     """
-    return [find_named_policy(word, setting, name) for word, name in name_policies(words, setting, taken).items()]
+    return [find_named_policy(spec, setting, name) for spec, name in name_policies(specs, setting, taken).items()]
 
 
-def name_policies(words: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> dict[str, str]:
+def name_policies(specs: Sequence[str], setting: str = "policy", taken: Iterable[str] = ()) -> dict[str, str]:
     """word -> its name in tables: the short one, with the folders above it where that is another's.
 
     Raises:
         UserError: a policy is named twice.
     """
-    check_distinct(setting, [str(Path(word).absolute()) if os.path.exists(word) else word for word in words])
-    names, used = {}, {*TAKEN, *taken, *(word for word in words if word in POLICIES)}
-    for word in words:
-        name, above = short_name(word), list(Path(word).absolute().parents)
-        while name in used and word not in POLICIES:
+    check_distinct(setting, [str(Path(spec).absolute()) if os.path.exists(spec) else spec for spec in specs])
+    names, used = {}, {*RESERVED_NAMES, *taken, *(spec for spec in specs if spec in POLICIES)}
+    for spec in specs:
+        name, above = policy_label(spec), list(Path(spec).absolute().parents)
+        while name in used and spec not in POLICIES:
             if not above or not above[0].name:
-                raise UserError(f"{setting}={word} cannot be told from {name}: rename its folder.")
+                raise UserError(f"{setting}={spec} cannot be told from {name}: rename its folder.")
             name = f"{above.pop(0).name}-{name}"
-        names[word] = name
+        names[spec] = name
         used.add(name)
     return names
 
 
-def short_name(word: str) -> str:
+def policy_label(spec: str) -> str:
     """What tables and files call a policy: its own name, that of its folder, or module.function."""
-    path = Path(word)
-    is_path = os.sep in word or path.suffix == ".pt" or os.path.exists(word)
-    if word in POLICIES or word in plug_ins() or not is_path:
-        name = word.replace(":", ".") if is_reference(word) else word
+    path = Path(spec)
+    is_path = os.sep in spec or path.suffix == ".pt" or os.path.exists(spec)
+    if spec in POLICIES or spec in policy_plugins() or not is_path:
+        name = spec.replace(":", ".") if is_module_reference(spec) else spec
     elif path.suffix == ".pt":
         run = path.absolute().parent
         run = run.parent if run.name == "checkpoints" else run
@@ -244,13 +250,13 @@ def suit_observation(cfg: CommonSettings, policies: Sequence[NamedPolicy]) -> No
     if counts:
         counts |= {"observation.targets": cfg.observation.targets} if cfg.observation.targets else {}
         if len(set(counts.values())) > 1:
-            told = ", ".join(f"{word} {count}" for word, count in counts.items())
+            told = ", ".join(f"{spec} {count}" for spec, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
         cfg.observation.targets = next(iter(counts.values()))
     cfg.observation.radio = cfg.observation.radio or any(policy.radio for policy in policies)
     shown = {policy.name: policy.map for policy in policies if policy.map is not None}
     if len(set(shown.values())) > 1:
-        told = ", ".join(f"{word} {what}" for word, what in shown.items())
+        told = ", ".join(f"{spec} {what}" for spec, what in shown.items())
         raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
     if shown:
         cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True

@@ -220,9 +220,9 @@ def pick_tried(offered: torch.Tensor, tried: torch.Tensor) -> torch.Tensor:
 
 def check_rollout_policy(config: LookaheadConfig) -> None:
     """Raise ValueError where the rollout policy is none."""
-    word = config.rollout_policy
-    if word not in CLASSICAL and not is_exported(word):
+    spec = config.rollout_policy
+    if spec not in CLASSICAL and not is_exported(spec):
         raise ValueError(
-            f"{ROLLOUT_POLICY}={word!r} is unknown: choose one of {', '.join(CLASSICAL)}, or a trained policy: "
+            f"{ROLLOUT_POLICY}={spec!r} is unknown: choose one of {', '.join(CLASSICAL)}, or a trained policy: "
             f"{', '.join(shipped_names())}, or a folder that maexp export wrote"
         )

@@ -98,7 +98,7 @@ def _is_ours(state: object) -> bool:
     if any(not isinstance(state.get(key), kind) for key, kind in KINDS.items()):
         return False
     words, weights = [*state["overrides"], *state["followers"]], state["policy"].values()
-    if not all(isinstance(word, str) for word in words) or not all(torch.is_tensor(weight) for weight in weights):
+    if not all(isinstance(spec, str) for spec in words) or not all(torch.is_tensor(weight) for weight in weights):
         return False
     groups = [state["settings"].get(name) for name in ("scenario", "planner")]
     return all(isinstance(group, dict) and isinstance(group.get("name"), str) for group in groups)

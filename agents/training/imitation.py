@@ -44,11 +44,11 @@ def check_warm_start(cfg: TrainSettings) -> None:
     _check_kind(cfg, taught_by(teacher))
 
 
-def starts_as(word: str | None) -> list[str]:
+def starts_as(spec: str | None) -> list[str]:
     """Overrides by which a policy starts from the planner that its teacher starts from, to take its weights; none
     where the teacher has no such network, or is none (`check_warm_start` says so)."""
     try:
-        model = None if word is None else find_named_policy(word, "warm_start").model
+        model = None if spec is None else find_named_policy(spec, "warm_start").model
     except UserError:
         return []
     return [] if model is None else [f"model.starts_from={model.starts_from}"]

@@ -48,7 +48,7 @@ class Validation:
         self.sizes = team_sizes(cfg.num_robots)
         self.episodes = math.ceil(cfg.evaluate_episodes / len(self.sizes))
         words = [] if cfg.planner.name == "direct" else choices_of(cfg.classical)  # controls: no planner gives these
-        self.planners = [word for word in words if word in CLASSICAL]
+        self.planners = [spec for spec in words if spec in CLASSICAL]
         self._rivals: dict[int, EvaluationResult] = {}
 
     @cached_property

@@ -15,10 +15,10 @@ from maexp.agents.benchmarks.suites.suite import Part, Suite
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.evaluate import play
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.policies.names import plug_ins
+from maexp.agents.policies.names import policy_plugins
 from maexp.agents.policies.pretrained import is_exported
 from maexp.agents.policies.registry import NamedPolicy, find_named_policy
-from maexp.agents.policies.registry import short_name as name_of
+from maexp.agents.policies.registry import policy_label as name_of
 from maexp.agents.policies.remote.process import APART, EXEC, PolicyProcess, command_of
 from maexp.agents.policies.remote.server import SOCKET
 from maexp.agents.policies.remote.subprocess_policy import HostedPolicy, greet, guest_of
@@ -36,10 +36,10 @@ from maexp.envs.metrics import RADIO, episode_metrics
 
 
 class SuitePolicy:
-    """A policy by the word that names it.
+    """A policy by its spec.
 
     Args:
-        word: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks
+        spec: what `policy=` takes everywhere; `exec:COMMAND`, a program that speaks
             `maexp.agents.policies.remote.protocol`; `socket:HOST:PORT`, where one listens; or `process:NAME`, one of
             ours as if it were a stranger's. A class with `act` always plays in processes.
         limit: processor time that a decision may take a policy in processes of its own, or time elsewhere [s].
@@ -50,26 +50,26 @@ class SuitePolicy:
         UserError: there is none of that name, it is damaged, does not start, or gives controls.
     """
 
-    def __init__(self, word: str, limit: float = 60.0, patience: float = 120.0, name: str | None = None):
-        self.word, self.limit, self.patience = word, limit, patience
+    def __init__(self, spec: str, limit: float = 60.0, patience: float = 120.0, name: str | None = None):
+        self.spec, self.limit, self.patience = spec, limit, patience
         self.start_process = self._find_guest()
-        self.name = name or short_name(word)
-        self.found: NamedPolicy | None = None if self.hosted else find_named_policy(word, name=self.name)
+        self.name = name or policy_label(spec)
+        self.found: NamedPolicy | None = None if self.hosted else find_named_policy(spec, name=self.name)
         if self.found is not None and self.found.direct:
-            raise UserError(f"policy={word} gives controls (planner=direct), and the robots of a suite drive to goals.")
+            raise UserError(f"policy={spec} gives controls (planner=direct), and the robots of a suite drive to goals.")
 
     def _find_guest(self) -> Callable[[], PolicyProcess] | None:
         """What plays a team in a process of its own or elsewhere; None: it plays in this one."""
-        if not self.word.startswith((EXEC, APART, SOCKET)) and not is_own(self.word):
+        if not self.spec.startswith((EXEC, APART, SOCKET)) and not is_own(self.spec):
             return None
         try:
-            start_process = guest_of(self.word)
+            start_process = guest_of(self.spec)
         except ValueError as error:
-            raise UserError(f"policy={self.word} cannot be played: {error}.") from error
-        if greet(start_process, self.word):
+            raise UserError(f"policy={self.spec} cannot be played: {error}.") from error
+        if greet(start_process, self.spec):
             return start_process
-        if self.word.startswith(APART):
-            raise UserError(f"policy={self.word} is no class with act(observation): see docs/arena.md.")
+        if self.spec.startswith(APART):
+            raise UserError(f"policy={self.spec} is no class with act(observation): see docs/arena.md.")
         return None
 
     @property
@@ -80,7 +80,7 @@ class SuitePolicy:
     @property
     def most_teams(self) -> int:
         """How many a hosted one plays at once unless told: who listens at a socket may serve one after another."""
-        return 1 if self.word.startswith(SOCKET) else os.cpu_count() or 1
+        return 1 if self.spec.startswith(SOCKET) else os.cpu_count() or 1
 
     def observation(self) -> ObservationConfig:
         """What its env shows."""
@@ -97,18 +97,18 @@ class SuitePolicy:
         return nullcontext(self.found.make(env))
 
 
-def is_own(word: str) -> bool:
+def is_own(spec: str) -> bool:
     """Whether this is module:Class or the name of a plug-in: told without running anything of it."""
-    if word in POLICIES or is_exported(word):
+    if spec in POLICIES or is_exported(spec):
         return False
-    return word in plug_ins() or (":" in word and not os.path.exists(word))
+    return spec in policy_plugins() or (":" in spec and not os.path.exists(spec))
 
 
-def short_name(word: str) -> str:
+def policy_label(spec: str) -> str:
     """What tables call a policy: its name, that of its folder, or that of its program."""
-    if word.startswith(EXEC):
-        return os.path.basename(command_of(word)[0])
-    return word if ":" in word else name_of(word)
+    if spec.startswith(EXEC):
+        return os.path.basename(command_of(spec)[0])
+    return spec if ":" in spec else name_of(spec)
 
 
 @dataclass

@@ -57,7 +57,7 @@ class SuiteRun:
             "maps": points,
             "files": run_files.list_files(self.where),
             "run": {
-                "policy": self.policy.word,
+                "policy": self.policy.spec,
                 **code,
                 "machine": run_files.describe_machine(),
                 "device": str(self.device),

@@ -202,15 +202,15 @@ def suite_names() -> list[str]:
     return sorted((path.stem for path in FOLDER.glob("*.yaml")), key=lambda name: (name != "minival", name))
 
 
-def load_suite(word: str) -> Suite:
+def load_suite(spec: str) -> Suite:
     """A suite by its name, or by the path of its .yaml file.
 
     Raises:
         UserError: there is none of that name, or its file does not define one.
     """
-    path = FOLDER / f"{word}.yaml" if word in suite_names() else Path(word).expanduser()
+    path = FOLDER / f"{spec}.yaml" if spec in suite_names() else Path(spec).expanduser()
     if path.suffix not in (".yaml", ".yml") or not path.is_file():
-        raise UserError(f"{word} is no suite: choose one of {', '.join(suite_names())}, or give a .yaml file.")
+        raise UserError(f"{spec} is no suite: choose one of {', '.join(suite_names())}, or give a .yaml file.")
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

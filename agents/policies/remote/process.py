@@ -29,18 +29,18 @@ CHUNK = 2**16
 MOST_REASON = 400  # characters
 
 
-def command_of(word: str) -> list[str]:
+def command_of(spec: str) -> list[str]:
     """The command that `exec:COMMAND` gives, or that of a policy in Python.
 
     Raises:
         ValueError: the quotes of COMMAND do not match, or there is none.
     """
-    if word.startswith(EXEC):
-        words = shlex.split(word.removeprefix(EXEC))
-        if not words:
+    if spec.startswith(EXEC):
+        specs = shlex.split(spec.removeprefix(EXEC))
+        if not specs:
             raise ValueError("it names no command")
-        return words
-    return [sys.executable, "-m", "maexp.agents.policies.remote.worker", word.removeprefix(APART)]
+        return specs
+    return [sys.executable, "-m", "maexp.agents.policies.remote.worker", spec.removeprefix(APART)]
 
 
 class Lost(Exception):

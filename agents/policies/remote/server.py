@@ -22,15 +22,15 @@ CLOSED = getattr(select, "POLLRDHUP", select.POLLHUP)
 POLL_MS = 100  # between two looks at whether a process has ended
 
 
-def address_of(word: str) -> tuple[str, int]:
+def address_of(spec: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, which `socket:` may stand before; of IPv6 in brackets, as [::1]:5000.
 
     Raises:
         ValueError: it is none.
     """
-    host, _, port = word.removeprefix(SOCKET).rpartition(":")
+    host, _, port = spec.removeprefix(SOCKET).rpartition(":")
     if not host or not port.isascii() or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise ValueError(f"{word.removeprefix(SOCKET)!r} is no HOST:PORT, as localhost:5000")
+        raise ValueError(f"{spec.removeprefix(SOCKET)!r} is no HOST:PORT, as localhost:5000")
     return host.removeprefix("[").removesuffix("]"), int(port)
 
 
@@ -80,11 +80,11 @@ def _attend(link: socket.socket, process: Session, running: set[Session]) -> Non
         running.discard(process)
 
 
-def main(words: list[str]) -> int:
+def main(specs: list[str]) -> int:
     """Serve until Ctrl-C, SIGTERM or SIGHUP."""
     try:
-        where, word = words
-        command = command_of(word)
+        where, spec = specs
+        command = command_of(spec)
         if shutil.which(command[0]) is None:
             raise ValueError(f"{command[0]} is no program")
         with ended_by_signals():

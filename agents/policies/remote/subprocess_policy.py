@@ -21,15 +21,15 @@ from maexp.envs import ExplorationEnv
 START = 120.0  # seconds that a process may take to say hello: some import a lot
 
 
-def guest_of(word: str) -> Callable[[], PolicyProcess]:
+def guest_of(spec: str) -> Callable[[], PolicyProcess]:
     """What makes a guest for one team: of `socket:HOST:PORT` a connection, of any other word a process.
 
     Raises:
         ValueError: there is no address or no command in it.
     """
-    if word.startswith(SOCKET):
-        return partial(Connection, *address_of(word))
-    return partial(Process, command_of(word))
+    if spec.startswith(SOCKET):
+        return partial(Connection, *address_of(spec))
+    return partial(Process, command_of(spec))
 
 
 class HostedPolicy:

@@ -22,7 +22,7 @@ import torch
 from tensordict import TensorDictBase
 
 from maexp.agents.errors import UserError
-from maexp.agents.policies.names import plug_ins
+from maexp.agents.policies.names import policy_plugins
 from maexp.agents.policies.remote.numpy_policy import as_policy, describe_error
 from maexp.agents.policies.remote.worker import GROUP
 from maexp.envs import ExplorationEnv
@@ -32,21 +32,21 @@ REFERENCE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 WANTED = "give a function that takes the env and returns a policy on tensordicts, or a class with act"
 
 
-def is_reference(word: str) -> bool:
+def is_module_reference(spec: str) -> bool:
     """Whether a word reads as module:function."""
-    return REFERENCE.fullmatch(word) is not None
+    return REFERENCE.fullmatch(spec) is not None
 
 
-def find_own(word: str, setting: str = "policy") -> Callable[..., Any]:
-    """What `word`, module:function or the name of a plug-in, stands for.
+def find_user_policy(spec: str, setting: str = "policy") -> Callable[..., Any]:
+    """What `spec`, module:function or the name of a plug-in, stands for.
 
     Raises:
         UserError: there is no such module, it has nothing of that name, or that cannot be called.
     """
-    plug_in = plug_ins().get(word)
-    reference = word if plug_in is None else plug_in.value.partition("[")[0].replace(" ", "")
-    given = f"{setting}={word}" + ("" if plug_in is None else f" (of the package {_package(plug_in)}, {reference})")
-    if not is_reference(reference):
+    plug_in = policy_plugins().get(spec)
+    reference = spec if plug_in is None else plug_in.value.partition("[")[0].replace(" ", "")
+    given = f"{setting}={spec}" + ("" if plug_in is None else f" (of the package {_package(plug_in)}, {reference})")
+    if not is_module_reference(reference):
         raise UserError(f"{given} names no function: an entry point of {GROUP} is written module:function.")
     module, _, names = reference.partition(":")
     place = _import(module, given)
@@ -93,7 +93,7 @@ def is_numpy_policy(found: Callable) -> bool:
     return inspect.isclass(found) and callable(getattr(found, "act", None))
 
 
-def source_of(found: Callable) -> str:
+def read_source(found: Callable) -> str:
     """Sixteen hexadecimal digits that change with the file of what was found; "" where there is none."""
     try:
         path = inspect.getsourcefile(found)
@@ -102,8 +102,8 @@ def source_of(found: Callable) -> str:
         return ""
 
 
-def make_own(found: Callable, env: ExplorationEnv, name: str) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The policy of what `find_own` has found.
+def make_user_policy(found: Callable, env: ExplorationEnv, name: str) -> Callable[[TensorDictBase], TensorDictBase]:
+    """The policy of what `find_user_policy` has found.
 
     Raises:
         UserError: making it raises, or gives nothing that can be called.

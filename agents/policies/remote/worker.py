@@ -24,7 +24,7 @@ from maexp.agents.policies.remote import protocol
 GROUP = "maexp.policies"
 
 
-def main(word: str) -> int:
+def main(spec: str) -> int:
     """Answer until the input ends."""
     inbox, outbox = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
@@ -33,7 +33,7 @@ def main(word: str) -> int:
     while (message := protocol.read(inbox)) is not None:
         try:
             if message["type"] == "hello":
-                make = find(word)
+                make = find(spec)
                 agent = None if make is None else make()
                 answer = {"type": "hello", "version": protocol.VERSION, "foreign": make is not None}
             elif message["type"] == "reset":
@@ -49,16 +49,16 @@ def main(word: str) -> int:
     return 0
 
 
-def find(word: str) -> Callable[[], Any] | None:
+def find(spec: str) -> Callable[[], Any] | None:
     """What makes the policy; None: the word names something that is no class with `act`."""
     plug_in = next(
-        (entry_point for entry_point in metadata.entry_points(group=GROUP) if entry_point.name == word), None
+        (entry_point for entry_point in metadata.entry_points(group=GROUP) if entry_point.name == spec), None
     )
-    reference = word if plug_in is None else plug_in.value.partition("[")[0].replace(" ", "")
+    reference = spec if plug_in is None else plug_in.value.partition("[")[0].replace(" ", "")
     if ":" not in reference or os.path.exists(reference):
         from maexp.agents.deploy.planner.arena_policy import TeamAgent
 
-        return partial(TeamAgent, word)
+        return partial(TeamAgent, spec)
     module, _, names = reference.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())

@@ -248,8 +248,8 @@ def test_an_unknown_rollout_policy_is_named():
 
 def test_it_competes_with_the_classical_planners(tmp_path):
     """`maexp evaluate` tells how far it is ahead, and its share of the headroom where that was played."""
-    words = ["policy=lookahead,cost_utility,clairvoyant", "scenario=maze_small", "episodes=4", "num_envs=4"]
-    assert main(["evaluate", *words, f"hydra.run.dir={tmp_path / 'run'}"]) == 0
+    specs = ["policy=lookahead,cost_utility,clairvoyant", "scenario=maze_small", "episodes=4", "num_envs=4"]
+    assert main(["evaluate", *specs, f"hydra.run.dir={tmp_path / 'run'}"]) == 0
     found = json.loads((tmp_path / "run" / "results.json").read_text())
     assert "coverage_auc" in found["difference"]["lookahead"]["cost_utility"]
     assert set(found["difference"]) == {"lookahead"} and set(found.get("headroom_share", {})) <= {"lookahead"}

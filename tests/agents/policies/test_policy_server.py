@@ -30,9 +30,9 @@ SERVE = "import sys; from maexp.agents.policies.remote.server import serve; serv
 
 
 @contextmanager
-def listening(word: str, folder: Path = TESTS):
-    """A machine elsewhere that plays `word`; gives socket:HOST:PORT and its process."""
-    command = [sys.executable, "-c", SERVE, *command_of(word)]
+def listening(spec: str, folder: Path = TESTS):
+    """A machine elsewhere that plays `spec`; gives socket:HOST:PORT and its process."""
+    command = [sys.executable, "-c", SERVE, *command_of(spec)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder, text=True)
     try:
         yield f"socket:127.0.0.1:{server.stdout.readline().split()[-1]}", server
@@ -79,8 +79,8 @@ def test_it_chooses_as_its_class_does_inside(monkeypatch):
     envs = [make_env(3, macro_steps=6) for _ in range(2)]
     inside = as_policy(envs[0], Nearest)
     with (
-        listening("nearest:Nearest", EXAMPLES) as (word, _),
-        HostedPolicy(envs[1], guest_of(word), word, 60.0, 60.0) as outside,
+        listening("nearest:Nearest", EXAMPLES) as (spec, _),
+        HostedPolicy(envs[1], guest_of(spec), spec, 60.0, 60.0) as outside,
     ):
         states = [env.reset() for env in envs]
         for _ in range(6):
@@ -109,8 +109,8 @@ def test_it_chooses_as_its_class_does_inside(monkeypatch):
     }.items(),
 )
 def test_a_fault_costs_its_episode_and_nothing_else(kind, reason):
-    with listening(f"hostile:{kind}") as (word, _):
-        final, reasons, bad, _ = play_hosted(word, 60.0, 3.0 if "no answer" in reason else 60.0)
+    with listening(f"hostile:{kind}") as (spec, _):
+        final, reasons, bad, _ = play_hosted(spec, 60.0, 3.0 if "no answer" in reason else 60.0)
     assert 0 < sum(bad) < ENVS and [bool(said) for said in reasons] == bad
     assert all(said.startswith(reason) for said in reasons if said), reasons
     steps = [20 * ((kind != "BadReset") if lost else STEPS) for lost in bad]
@@ -118,8 +118,8 @@ def test_a_fault_costs_its_episode_and_nothing_else(kind, reason):
 
 
 def test_an_answer_too_many_is_no_answer_to_the_next_question():
-    with listening("hostile:Twice") as (word, _):
-        _, reasons, bad, _ = play_hosted(word)
+    with listening("hostile:Twice") as (spec, _):
+        _, reasons, bad, _ = play_hosted(spec)
     assert [bool(reason) for reason in reasons] == bad and {reason for reason in reasons if reason} == {
         "it spoke without being asked"
     }
@@ -127,8 +127,8 @@ def test_an_answer_too_many_is_no_answer_to_the_next_question():
 
 def test_who_is_gone_loses_its_episodes_and_the_run_goes_on():
     env = make_env(1, macro_steps=3)
-    with listening("hostile:Stays") as (word, server):
-        with HostedPolicy(env, guest_of(word), word, 60.0, 60.0) as policy:
+    with listening("hostile:Stays") as (spec, server):
+        with HostedPolicy(env, guest_of(spec), spec, 60.0, 60.0) as policy:
             play(policy, env, torch.tensor([0]))
             assert policy.reasons == [""]
             server.send_signal(signal.SIGINT)
@@ -144,8 +144,8 @@ def test_what_plays_elsewhere_ends_with_its_connection(tmp_path):
     script = tmp_path / "spin"
     script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/number\nwhile :; do :; done\n")
     script.chmod(0o755)
-    with listening(f"exec:{script}") as (word, _):
-        worker = guest_of(word)()
+    with listening(f"exec:{script}") as (spec, _):
+        worker = guest_of(spec)()
         wait_for(lambda: (tmp_path / "number").exists() and (tmp_path / "number").read_text().strip())
         number = int((tmp_path / "number").read_text())
         assert alive(number)
@@ -186,9 +186,9 @@ def free_port() -> int:
 
 
 def test_a_listener_that_takes_one_after_another_is_enough():
-    with answering(stays) as word:
-        player = SuitePolicy(word)
-        assert player.hosted and player.most_teams == 1 and player.name == word
+    with answering(stays) as spec:
+        player = SuitePolicy(spec)
+        assert player.hosted and player.most_teams == 1 and player.name == spec
         env = make_env(1, macro_steps=2)
         with player.open(env) as policy:
             for number in range(3):
@@ -223,9 +223,9 @@ def replies(message: bytes):
 )
 def test_who_is_no_policy_is_told_before_anything_is_played(reply, told, monkeypatch):
     monkeypatch.setattr(subprocess_policy, "START", 1.0 if reply is silent else 30.0)
-    with answering(reply) as word, pytest.raises(UserError, match=told) as error:
-        SuitePolicy(word)
-    assert str(error.value).startswith(f"policy={word}") and "\n" not in str(error.value)
+    with answering(reply) as spec, pytest.raises(UserError, match=told) as error:
+        SuitePolicy(spec)
+    assert str(error.value).startswith(f"policy={spec}") and "\n" not in str(error.value)
 
 
 def test_nobody_there_is_told_before_anything_is_played():
@@ -240,10 +240,10 @@ def test_nobody_there_is_told_before_anything_is_played():
 @pytest.mark.parametrize(
     "word", ["socket:", "socket:5000", "socket:a:", "socket:a:0", "socket:a:65536", "socket:a:x", "socket:a:²"]
 )
-def test_what_is_no_address_is_told(word):
+def test_what_is_no_address_is_told(spec):
     with pytest.raises(UserError, match="is no HOST:PORT, as localhost:5000") as error:
-        SuitePolicy(word)
-    assert str(error.value).startswith(f"policy={word} ")
+        SuitePolicy(spec)
+    assert str(error.value).startswith(f"policy={spec} ")
 
 
 def test_addresses():

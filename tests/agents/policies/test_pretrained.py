@@ -35,9 +35,9 @@ def test_one_is_shown(capsys):
         ["train", "warm_start=universl"],
     ],
 )
-def test_a_name_that_is_none_is_a_sentence_with_the_near_ones(words, tmp_path, monkeypatch, capsys):
+def test_a_name_that_is_none_is_a_sentence_with_the_near_ones(specs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(words) == 2
+    assert main(specs) == 2
     told = capsys.readouterr().err
     assert "universl is " in told and "did you mean universal" in told and told.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -100,14 +100,14 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
     ],
 )
 @pytest.mark.parametrize("words", [["evaluate", "policy=mine"], ["view", "policy=mine"], ["train", "warm_start=mine"]])
-def test_a_damaged_folder_is_a_sentence(file, change, part, words, tmp_path, monkeypatch, capsys):
+def test_a_damaged_folder_is_a_sentence(file, change, part, specs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(SHIPPED / "universal", "mine")
     data = (tmp_path / "mine" / file).read_bytes()
     (tmp_path / "mine" / file).unlink()
     if change is not None:
         (tmp_path / "mine" / file).write_bytes(change(data))
-    assert main(words) == 2
+    assert main(specs) == 2
     told = capsys.readouterr().err
     assert part in told and told.count("\n") == 1
 
@@ -134,10 +134,10 @@ def test_trained_and_classical_policies_play_the_same_episodes(tmp_path, monkeyp
     """By name and by folder; the classical one plays as it would alone, and the card of an export tells the results."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(SHIPPED / "small_mazes", "mine")
-    words = ["evaluate", *SMALL, "episodes=2", "num_robots=2"]
-    assert main([*words, "policy=universal,mine,nearest_frontier", "hydra.run.dir=all"]) == 0
+    specs = ["evaluate", *SMALL, "episodes=2", "num_robots=2"]
+    assert main([*specs, "policy=universal,mine,nearest_frontier", "hydra.run.dir=all"]) == 0
     assert "nearest_frontier, the best classical planner" in capsys.readouterr().out
-    assert main([*words, "policy=nearest_frontier", "hydra.run.dir=alone"]) == 0
+    assert main([*specs, "policy=nearest_frontier", "hydra.run.dir=alone"]) == 0
     results, alone = (json.loads((tmp_path / name / "results.json").read_text()) for name in ("all", "alone"))
     assert set(results) == {"universal", "mine", "nearest_frontier", "difference", "run"}
     assert results["nearest_frontier"] == alone["nearest_frontier"] and results["universal"] != results["mine"]
@@ -174,7 +174,7 @@ def test_what_does_not_fit_is_a_sentence(tmp_path, monkeypatch, capsys):
     shutil.copytree(SHIPPED / "universal", "wide")
     contract = tmp_path / "wide" / "contract.json"
     whole = json.loads(contract.read_text())
-    for words, change, part in (
+    for specs, change, part in (
         (["train", "warm_start=universal", "action=regions"], {}, "universal chooses targets, which a policy with"),
         (["train", "warm_start=universal", "observation.targets=9"], {}, "different numbers of targets"),
         (["evaluate", "policy=universal", "planner=direct"], {}, "planner=direct takes controls, and universal pick"),
@@ -183,6 +183,6 @@ def test_what_does_not_fit_is_a_sentence(tmp_path, monkeypatch, capsys):
         (["evaluate", "policy=universal,wide", *SMALL], {"candidates": 9}, "different numbers of targets"),
     ):
         contract.write_text(json.dumps(whole | change))
-        assert main(words) == 2
+        assert main(specs) == 2
         told = capsys.readouterr().err
         assert part in told and told.count("\n") == 1, told

@@ -121,10 +121,10 @@ def test_the_next_episode_has_a_new_process():
         ("hostile:Inert", "it gave up: TypeError: Inert is a class without act"),
     ],
 )
-def test_what_does_not_start_is_told_before_anything_is_played(word, told, monkeypatch):
-    monkeypatch.setattr(subprocess_policy, "START", 2.0 if "sleep" in word else 60.0)
+def test_what_does_not_start_is_told_before_anything_is_played(spec, told, monkeypatch):
+    monkeypatch.setattr(subprocess_policy, "START", 2.0 if "sleep" in spec else 60.0)
     with pytest.raises(UserError, match=f"(?s){told}") as error:
-        SuitePolicy(word)
+        SuitePolicy(spec)
     assert "\n" not in str(error.value)
 
 
@@ -170,7 +170,7 @@ time.sleep(1000)
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="NO LINUX: policies of a killed run may stay")
 @pytest.mark.parametrize("word", ["sleeper:Sleeper", "exec:sh -c 'setsid sleep 1000 & exec sleep 1000'"])
-def test_a_run_that_is_killed_outright_leaves_no_policy_behind(word, tmp_path):
+def test_a_run_that_is_killed_outright_leaves_no_policy_behind(spec, tmp_path):
     """Nor what that has started, though it left the session; the thread that started the policy is gone by then."""
     (tmp_path / "sleeper.py").write_text(
         "import os, time\n\n\nclass Sleeper:\n    def __init__(self):\n        os.fork()\n        time.sleep(1e9)\n\n"
@@ -178,7 +178,7 @@ def test_a_run_that_is_killed_outright_leaves_no_policy_behind(word, tmp_path):
     )
     name = f"KILLED_RUN={tmp_path.name}-{time.time_ns()}"
     run = subprocess.Popen(
-        [sys.executable, "-c", RUN, word],
+        [sys.executable, "-c", RUN, spec],
         env=os.environ | dict([name.split("=")]),
         cwd=tmp_path,
         stdout=subprocess.PIPE,

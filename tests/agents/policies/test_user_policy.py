@@ -13,7 +13,7 @@ from mazes import OFFSET, REGION, make_env
 from maexp.agents import make_policy
 from maexp.agents.cli import main
 from maexp.agents.errors import UserError
-from maexp.agents.policies.registry import NamedPolicy, find_named_policy, name_policies, short_name, suit_observation
+from maexp.agents.policies.registry import NamedPolicy, find_named_policy, name_policies, policy_label, suit_observation
 from maexp.agents.policies.remote import user_policy
 from maexp.agents.settings.overrides import make_overrides
 from maexp.envs import ObservationConfig
@@ -103,10 +103,10 @@ def module(tmp_path, monkeypatch):
     sys.path[:] = [folder for folder in sys.path if folder != str(tmp_path)]
 
 
-def evaluated(folder: str, *words: str) -> dict:
-    said = {word.partition("=")[0] for word in words}
-    small = [word for word in SMALL if word.partition("=")[0] not in said]
-    assert main(["evaluate", *small, *words, f"hydra.run.dir={folder}"]) == 0
+def evaluated(folder: str, *specs: str) -> dict:
+    said = {spec.partition("=")[0] for spec in specs}
+    small = [spec for spec in SMALL if spec.partition("=")[0] not in said]
+    assert main(["evaluate", *small, *specs, f"hydra.run.dir={folder}"]) == 0
     return json.loads(Path(folder, "results.json").read_text())
 
 
@@ -123,9 +123,9 @@ def test_ones_own_policies_stand_in_the_table_beside_the_others(capsys):
 def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
     shown = ObservationConfig(pictures=False, targets=24)
     env = make_env(2, observation=shown)
-    for word in ("my_robots:First", "my_robots:Stay", "universal", "voronoi"):
-        state = make_policy(word, env)(env.reset())
-        assert ("agents", "action") in state.keys(True), word
+    for spec in ("my_robots:First", "my_robots:Stay", "universal", "voronoi"):
+        state = make_policy(spec, env)(env.reset())
+        assert ("agents", "action") in state.keys(True), spec
         env.step(state)
     made = make_policy(make_env(1))
     assert len(list(made.parameters())) and len(list(make_policy(env=make_env(1), model="small").parameters()))
@@ -168,10 +168,10 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
         ("x" * 5000, "policy=x+ is unknown"),
     ],
 )
-def test_every_mistake_is_a_sentence_that_names_the_policy(word, told):
+def test_every_mistake_is_a_sentence_that_names_the_policy(spec, told):
     env = make_env(1)
     with pytest.raises(UserError, match=told) as error:
-        find_named_policy(word).make(env)(env.reset())
+        find_named_policy(spec).make(env)(env.reset())
     assert "\n" not in str(error.value) and len(str(error.value)) < 600
 
 
@@ -194,14 +194,14 @@ def test_a_plug_in_is_found_by_its_name(monkeypatch, capsys):
 def test_names_in_tables_are_unique_and_readable(tmp_path):
     for folder in ("a/best", "b/best", "run"):
         (tmp_path / folder).mkdir(parents=True)
-    assert short_name("my_robots:Corner") == "my_robots.Corner"
-    words = ["outputs/mappo_3/checkpoints/iteration_000040.pt", "outputs/mappo_3/checkpoints/best.pt"]
-    assert [short_name(word) for word in words] == ["mappo_3_iteration_40", "mappo_3_best"]
+    assert policy_label("my_robots:Corner") == "my_robots.Corner"
+    specs = ["outputs/mappo_3/checkpoints/iteration_000040.pt", "outputs/mappo_3/checkpoints/best.pt"]
+    assert [policy_label(spec) for spec in specs] == ["mappo_3_iteration_40", "mappo_3_best"]
     named = name_policies(["a/best", "b/best", "run", "voronoi"], taken=["mappo"])
     assert list(named.values()) == ["best", "b-best", f"{tmp_path.name}-run", "voronoi"]
-    for words in (["voronoi", "voronoi"], ["a/best", "./a/best"]):
+    for specs in (["voronoi", "voronoi"], ["a/best", "./a/best"]):
         with pytest.raises(UserError, match="twice"):
-            name_policies(words)
+            name_policies(specs)
 
 
 def policy(name: str, **shown) -> NamedPolicy:
@@ -211,21 +211,21 @@ def policy(name: str, **shown) -> NamedPolicy:
 def test_an_env_shows_what_its_policies_look_at_and_no_more():
     from maexp.agents.settings.compose import compose_config
 
-    def suited(*policies, words=()):
-        cfg = compose_config("evaluate", ["policy=random", *words])
+    def suited(*policies, specs=()):
+        cfg = compose_config("evaluate", ["policy=random", *specs])
         suit_observation(cfg, policies)
         return cfg.observation.targets, cfg.observation.pictures, cfg.observation.map
 
     assert suited(policy("a")) == (0, False, "seen"), "pictures that nobody looks at"
     assert suited(policy("a", targets=24), policy("b", pictures=True)) == (24, True, "seen")
     assert suited(policy("a", pictures=True, map="known")) == (0, True, "known")
-    for policies, words in (
+    for policies, specs in (
         ([policy("a", targets=24), policy("b", targets=8)], []),
         ([policy("a", targets=24)], ["observation.targets=8"]),
         ([policy("a", pictures=True, map="known"), policy("b", pictures=True, map="seen")], []),
     ):
         with pytest.raises(UserError, match="cannot play together"):
-            suited(*policies, words=words)
+            suited(*policies, specs=specs)
 
 
 def test_folders_of_any_name_stand_in_lists(tmp_path):

@@ -49,9 +49,9 @@ def place(tmp_path_factory):
     (folder / "teachers.py").write_text(TEACHER)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for name, words in (("aims", ["action=targets"]), ("regions", ["action=regions", "model.channels=4"])):
-            words = [*TINY, *words, "total_frames=6", "episodes=0", f"hydra.run.dir={name}"]
-            assert main(["train", *words]) == 0
+        for name, specs in (("aims", ["action=targets"]), ("regions", ["action=regions", "model.channels=4"])):
+            specs = [*TINY, *specs, "total_frames=6", "episodes=0", f"hydra.run.dir={name}"]
+            assert main(["train", *specs]) == 0
     return folder
 
 
@@ -61,8 +61,8 @@ def inside(place, monkeypatch):
 
 
 def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
-    words = ["policy=aims,regions,universal", "episodes=2", "num_envs=2", "num_robots=2", "scenario.macro_steps=2"]
-    assert main(["evaluate", *words, "scenario.held_out=[70]", "device=cpu", "hydra.run.dir=beside"]) == 0
+    specs = ["policy=aims,regions,universal", "episodes=2", "num_envs=2", "num_robots=2", "scenario.macro_steps=2"]
+    assert main(["evaluate", *specs, "scenario.held_out=[70]", "device=cpu", "hydra.run.dir=beside"]) == 0
     found = json.loads(Path("beside/results.json").read_text())
     assert list(found)[:3] == ["aims", "regions", "universal"] and set(found["difference"]["aims"]) > {"universal"}
     alone = ["checkpoint=aims", "episodes=2", "scenario.macro_steps=2", "reward=default"]
@@ -81,7 +81,7 @@ def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
 
 
 def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
-    words = [
+    specs = [
         *TINY[:4],
         "scenarios=maze_small",
         "algorithms=[]",
@@ -94,7 +94,7 @@ def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
         "device=cpu",
     ]
     policies = "policies=[voronoi,universal,teachers:First,aims,./regions]"
-    assert main(["benchmark", *words, policies, "hydra.run.dir=table"]) == 0
+    assert main(["benchmark", *specs, policies, "hydra.run.dir=table"]) == 0
     names = ["voronoi", "universal", "teachers.First", "aims", "regions"]
     summary = json.loads(Path("table/summary.json").read_text())
     assert [name for name in summary["maze_small"] if name != "difference"] == names
@@ -119,37 +119,37 @@ def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
         (["policies=aims,aims"], "names aims twice"),
     ],
 )
-def test_a_benchmark_names_what_it_cannot_play(words, told, capsys):
-    assert main(["benchmark", "algorithms=[]", *words]) == 2
+def test_a_benchmark_names_what_it_cannot_play(specs, told, capsys):
+    assert main(["benchmark", "algorithms=[]", *specs]) == 2
     assert told in capsys.readouterr().err
 
 
 def test_ones_own_policy_is_a_teacher_and_is_told_what_it_must_choose(capsys):
-    words = [*TINY, "total_frames=6", "episodes=0", "warm_start_frames=6"]
-    assert main(["train", *words, "warm_start=teachers:First", "hydra.run.dir=pupil"]) == 0
+    specs = [*TINY, "total_frames=6", "episodes=0", "warm_start_frames=6"]
+    assert main(["train", *specs, "warm_start=teachers:First", "hydra.run.dir=pupil"]) == 0
     assert Path("pupil/warm_start.csv").is_file()
-    assert main(["train", *words, "warm_start=teachers:regions", "hydra.run.dir=lost"]) == 2
+    assert main(["train", *specs, "warm_start=teachers:regions", "hydra.run.dir=lost"]) == 2
     told = capsys.readouterr().err
     assert "warm_start=teachers:regions wrote region and offset, and the policy that is to imitate it chooses" in told
-    for word, sentence in (
+    for spec, sentence in (
         ("regions", "chooses regions, which a policy with action=targets"),
         ("nobody", "warm_start=nobody is unknown"),
     ):
-        assert main(["train", *words, f"warm_start={word}", "hydra.run.dir=no"]) == 2
+        assert main(["train", *specs, f"warm_start={spec}", "hydra.run.dir=no"]) == 2
         assert sentence in capsys.readouterr().err
 
 
 def test_a_team_of_ones_own_can_be_seen(capsys):
-    words = ["view", "policy=teachers:regions", "scenario=maze_small", "out=team.png", "renderer=painter"]
-    assert main([*words, "scenario.macro_steps=2", "num_robots=2", "hydra.run.dir=seen"]) == 0
+    specs = ["view", "policy=teachers:regions", "scenario=maze_small", "out=team.png", "renderer=painter"]
+    assert main([*specs, "scenario.macro_steps=2", "num_robots=2", "hydra.run.dir=seen"]) == 0
     assert Path("team.png").is_file() and "teachers.regions" in capsys.readouterr().out
     assert Path("seen/episodes/teachers.regions_0.npz").is_file()
 
 
 def test_what_stands_beside_a_training_may_be_ones_own(capsys):
     shutil.rmtree("beside_training", ignore_errors=True)
-    words = [*TINY, "total_frames=6", "episodes=2", "classical=[voronoi,universal,teachers:regions]"]
-    assert main(["train", *words, "hydra.run.dir=beside_training"]) == 0
+    specs = [*TINY, "total_frames=6", "episodes=2", "classical=[voronoi,universal,teachers:regions]"]
+    assert main(["train", *specs, "hydra.run.dir=beside_training"]) == 0
     summary = json.loads(Path("beside_training/summary.json").read_text())
     assert list(summary)[:6] == ["trained", "untrained", "random", "voronoi", "universal", "teachers.regions"]
     assert summary["voronoi"] == summary["teachers.regions"]
@@ -182,13 +182,13 @@ def test_a_suite_takes_what_policy_takes_elsewhere(tmp_path, monkeypatch, capsys
     monkeypatch.syspath_prepend(tmp_path / "site")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     suite, found = make_small_suite(tmp_path / "small.yaml"), {}
-    for word in ("voronoi", "teachers:regions", "swarm_voronoi", "swarm_stay", "aims", "regions"):
-        where = tmp_path / word.replace(":", "_")
-        assert main(["suite", "run", str(suite), f"policy={word}", f"hydra.run.dir={where}"]) == 0
-        assert main(["suite", "verify", str(where), f"suite={suite}"]) == 0, word
-        found[word] = json.loads((where / "results.json").read_text())
+    for spec in ("voronoi", "teachers:regions", "swarm_voronoi", "swarm_stay", "aims", "regions"):
+        where = tmp_path / spec.replace(":", "_")
+        assert main(["suite", "run", str(suite), f"policy={spec}", f"hydra.run.dir={where}"]) == 0
+        assert main(["suite", "verify", str(where), f"suite={suite}"]) == 0, spec
+        found[spec] = json.loads((where / "results.json").read_text())
     assert found["teachers:regions"]["episodes"] == found["swarm_voronoi"]["episodes"] == found["voronoi"]["episodes"]
-    means = {word: results["score"]["mean"] for word, results in found.items()}
+    means = {spec: results["score"]["mean"] for spec, results in found.items()}
     assert means["swarm_stay"] == min(means.values()) and len(set(means.values())) == 4
     assert SuitePolicy("swarm_stay").hosted and not SuitePolicy("swarm_voronoi").hosted
 
