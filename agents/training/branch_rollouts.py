@@ -172,7 +172,7 @@ class BranchingActor(TensorDictModuleBase):
         super().__init__()
         self.policy, self.share = policy, settings.branch_share
         horizon, learn_from = settings.branch_horizon, settings.learn_from
-        self.policy = BranchRollouts(env, settings.candidates, horizon, learn_from=learn_from)
+        self.rollouts = BranchRollouts(env, settings.candidates, horizon, learn_from=learn_from)
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]
 
     @torch.no_grad()
@@ -180,13 +180,13 @@ class BranchingActor(TensorDictModuleBase):
         tensordict = self.policy(tensordict)
         features = tensordict[TARGETS]
         among = torch.rand(len(features), device=features.device) < self.share
-        tried, worth = self.policy.try_candidates(features, tensordict[PREFERENCE], among)
+        tried, worth = self.rollouts.try_candidates(features, tensordict[PREFERENCE], among)
         tensordict[TRIED], tensordict[ADVANTAGE] = tried.to(torch.int8), worth
         return tensordict
 
 
 @torch.no_grad()
-def play_round(env: ExplorationEnv, policy: BranchRollouts, config: BranchingConfig) -> dict[str, np.ndarray]:
+def play_round(env: ExplorationEnv, rollouts: BranchRollouts, config: BranchingConfig) -> dict[str, np.ndarray]:
     """An episode of every team; what was seen and found at the decisions that were branched at.
 
     Returns:
@@ -196,7 +196,7 @@ def play_round(env: ExplorationEnv, policy: BranchRollouts, config: BranchingCon
     Raises:
         UserError: no decision was branched at.
     """
-    found, td, draw = [], env.reset(), policy.draw
+    found, td, draw = [], env.reset(), rollouts.draw
     running = torch.ones(env.num_envs, dtype=torch.bool)
     phase = int(torch.randint(config.every, (1,), generator=draw))
     share = 2.0 * config.departures * torch.rand(env.num_envs, 1, generator=draw)
@@ -204,9 +204,9 @@ def play_round(env: ExplorationEnv, policy: BranchRollouts, config: BranchingCon
         features, mask = td[TARGETS], td[TARGETS_MASK]
         preference = torch.where(mask, features[..., SCORE], NEVER)
         if step % config.every == phase:
-            found += [describe(env, step, features, mask, *policy.try_candidates(features, preference))]
+            found += [describe(env, step, features, mask, *rollouts.try_candidates(features, preference))]
         leaves = torch.rand(mask.shape[:2], generator=draw) < share
-        other = policy.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
+        other = rollouts.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
         preference = torch.where(leaves.unsqueeze(-1), other, preference).clamp_min(NEVER)
         td[(*ACTION, "preference")], td[(*ACTION, "target")] = preference, preference.argmax(-1)
         td = env.step(td)

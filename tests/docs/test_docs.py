@@ -36,7 +36,7 @@ SHIPPED = {
     "planners": (len(PLANNERS), 3),
     "features": (len(FEATURES), 32),
     "channels": (PICTURE_CHANNELS, 4),
-    "arrays of the state": (len(STATE), 56),
+    "arrays of the state": (len(STATE), 59),
 }
 """What the patches add to: how many there are, and how many they are written for."""
 

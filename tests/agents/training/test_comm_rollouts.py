@@ -89,8 +89,8 @@ def test_a_branch_is_worth_what_comes_of_it(learner, strategy):
         likes = prefer(td)
         td = begin(env, td, likes, likes.argmax(-1))
     likes, saved = prefer(td), env.state_dict()
-    policy = BranchRollouts(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
-    index, advantage = policy.try_candidates(td[TARGETS], likes)
+    rollouts = BranchRollouts(env, candidates=4, horizon=HORIZON, seed=0, learn_from=learner)
+    index, advantage = rollouts.try_candidates(td[TARGETS], likes)
     after = env.state_dict()
     assert all(torch.equal(tensor, after[name]) for name, tensor in saved.items()), "the episode was touched"
     own, worth, compared, telling = index[..., 0].clamp_min(0), {}, 0, 0
@@ -113,10 +113,10 @@ def test_who_is_on_its_way_to_tell_tries_nothing():
     for _ in range(BEFORE):
         likes = prefer(td)
         td = begin(env, td, likes, likes.argmax(-1))
-    policy, likes = BranchRollouts(env, candidates=3, horizon=1, seed=0, learn_from="base"), prefer(td)
-    tried = policy.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    rollouts, likes = BranchRollouts(env, candidates=3, horizon=1, seed=0, learn_from="base"), prefer(td)
+    tried = rollouts.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
     env.strategy.state["duty"][:] = True
-    fewer = policy.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
+    fewer = rollouts.try_candidates(td[TARGETS], likes)[0][..., 1:] >= 0
     can = env.strategy.can_tell()
     assert can.any() and tried[can].any()
     assert not fewer[can].any() and torch.equal(fewer[~can], tried[~can])
