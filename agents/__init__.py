@@ -6,12 +6,12 @@ Names are looked up on first use, so that `maexp maps ...` need not wait for Tor
 from maexp.kernels.lazy import lazy_names
 
 _HOMES = {
-    "make_env": "command_env",
+    "make_env": "cli.env",
     "make_policy": "training.make",
     "make_critic": "algorithms.registry",
     "make_loss": "algorithms.registry",
     "ALGORITHMS": "algorithms.registry",
-    "ModelConfig": "settings.model",
+    "ModelConfig": "config.model",
 }
 __all__ = ["ALGORITHMS", "ModelConfig", "make_critic", "make_env", "make_loss", "make_policy"]
 

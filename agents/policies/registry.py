@@ -10,10 +10,14 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from maexp.agents.config.checks import check_distinct
+from maexp.agents.config.groups import CommonSettings
+from maexp.agents.config.model import ModelConfig
+from maexp.agents.config.resolved import flatten
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import STARTS
 from maexp.agents.files import warn_of_changed_maps
@@ -21,10 +25,6 @@ from maexp.agents.policies.classical import CLASSICAL, POLICIES, REFERENCES
 from maexp.agents.policies.names import describe_unknown, plug_ins
 from maexp.agents.policies.pretrained import is_exported, load_policy_folder, open_policy, read_model
 from maexp.agents.policies.remote.user_policy import find_own, is_foreign, is_reference, make_own, source_of
-from maexp.agents.settings.checks import check_distinct
-from maexp.agents.settings.groups import CommonSettings
-from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.resolved import flatten
 from maexp.agents.training.checkpoint import (
     BEST,
     NAME,
@@ -246,13 +246,13 @@ def suit_observation(cfg: CommonSettings, players: Sequence[NamedPolicy]) -> Non
         if len(set(counts.values())) > 1:
             told = ", ".join(f"{word} {count}" for word, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
-        cfg.observation.targets = next(iter(counts.values()))
-    cfg.observation.radio = cfg.observation.radio or any(player.radio for player in players)
+        cfg.observation = replace(cfg.observation, targets=next(iter(counts.values())))
+    cfg.observation = replace(cfg.observation, radio=cfg.observation.radio or any(player.radio for player in players))
     shown = {player.name: player.map for player in players if player.map is not None}
     if len(set(shown.values())) > 1:
         told = ", ".join(f"{word} {what}" for word, what in shown.items())
         raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
     if shown:
-        cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True
+        cfg.observation = replace(cfg.observation, map=next(iter(shown.values())), pictures=True)
     elif not any(player.pictures for player in players):
-        cfg.observation.pictures = False
+        cfg.observation = replace(cfg.observation, pictures=False)

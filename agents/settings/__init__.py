@@ -1,1 +1,1 @@
-"""From the words of a command line to checked settings: overrides, Hydra composition, the typed schema, ranges."""
+"""The name that `maexp.agents.config` had up to version 0.2: documented paths stay."""
