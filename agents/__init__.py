@@ -8,12 +8,12 @@ from maexp.kernels.moved import redirect_modules
 
 _HOMES = {
     "load_policy": "training.make",
-    "make_env": "command_env",
+    "make_env": "cli.env",
     "make_policy": "training.make",
     "make_critic": "algorithms.registry",
     "make_loss": "algorithms.registry",
     "ALGORITHMS": "algorithms.registry",
-    "ModelConfig": "settings.model",
+    "ModelConfig": "config.model",
 }
 __all__ = ["ALGORITHMS", "ModelConfig", "load_policy", "make_critic", "make_env", "make_loss", "make_policy"]
 

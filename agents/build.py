@@ -3,36 +3,30 @@
 import copy
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
 from maexp.agents.algorithms.registry import TRAININGS, find_algorithm
 from maexp.agents.algorithms.updaters import Updater
+from maexp.agents.config.checks import check_distinct
+from maexp.agents.config.env import env_settings, map_indices
+from maexp.agents.config.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
+from maexp.agents.config.overrides import split_paths
+from maexp.agents.config.schema import make_value
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.models.actor import make_policy
-from maexp.agents.settings.checks import check_distinct
-from maexp.agents.settings.env import env_settings, find_followers
-from maexp.agents.settings.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
-from maexp.agents.settings.indices import map_indices
-from maexp.agents.settings.overrides import split_paths
-from maexp.agents.settings.resolved import (
-    algorithm_settings,
-    model_settings,
-)
-from maexp.agents.settings.schema import RULES
-from maexp.agents.settings.storable import read
-from maexp.agents.settings.verbs import TrainSettings
+from maexp.conf import groups_of_choice
 from maexp.envs import ExplorationEnv, PointCloudMap, make_map
-from maexp.envs.config import STARTS
+from maexp.envs.config import GROUPS, STARTS
+from maexp.envs.config_fields import kinds
 from maexp.envs.scenarios import GENERATED, SCENARIOS, find_scenario
 from maexp.envs.spawn import read_starts
 
@@ -125,16 +119,15 @@ def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
 
 def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
     """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
-    from maexp.envs.io import ImportOptions
-
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
-    maps = [import_file(path, read(ImportOptions, scenario.importing)) for path in split_paths(scenario.path)]
+    maps = [import_file(path, scenario.importing) for path in split_paths(scenario.path)]
     names = [world.name for world in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")
     kinds = sorted({world.scenario for world in maps})
-    if scenario.name in RULES and (other := next((world for world in maps if world.scenario != scenario.name), None)):
+    protocol = bool(groups_of_choice("scenario", scenario.name))  # of pictures
+    if protocol and (other := next((world for world in maps if world.scenario != scenario.name), None)):
         raise UserError(
             f"scenario={scenario.name} counts in the pixels of a picture, and {other.name} is a saved map of "
             f"scenario={other.scenario}: give its picture, or use scenario=pointcloud."
@@ -171,22 +164,20 @@ def choose_starts(cfg: CommonSettings, num_robots: int) -> str | np.ndarray:
     return starts if starts in STARTS else read_starts(starts, num_robots)
 
 
-def other_scenarios(cfg: DictConfig, words: DictConfig) -> list[DictConfig]:
+def other_scenarios(cfg: CommonSettings) -> list[CommonSettings]:
     """The settings once more for each entry of `scenario.also`, with what a scenario supplies left to it.
 
-    An entry is a scenario's name, or settings of `scenario` with the name among them. `words` tell what a scenario
-    supplies: settings that hold no values of a checkpoint.
+    An entry is a scenario's name, or settings of `scenario` with the name among them.
 
     Raises:
         UserError: an entry that is unknown or given twice, or a scenario without maps of its own and without a path.
     """
-    entries = [] if cfg.scenario.also is None else OmegaConf.to_container(cfg.scenario.also)
-    entries = [{"name": entry} if isinstance(entry, str) else entry for entry in entries]
+    entries = [{"name": entry} if isinstance(entry, str) else entry for entry in cfg.scenario.also or []]
     for entry in entries:
         _check_entry(entry)
     names = [entry["name"] if len(entry) == 1 else str(entry) for entry in entries]
     check_distinct("scenario.also", [cfg.scenario.name, *names])
-    return [_with_scenario(cfg, words, entry) for entry in entries]
+    return [_with_scenario(cfg, entry) for entry in entries]
 
 
 def title_scenario(entry: str | Mapping[str, Any]) -> str:
@@ -218,20 +209,22 @@ def _check_entry(entry: Any) -> None:
         raise UserError(f"scenario.also has no setting {unknown[0]}: choose among {', '.join(settings)}.")
 
 
-def _with_scenario(cfg: DictConfig, words: DictConfig, entry: dict[str, Any]) -> DictConfig:
+def _with_scenario(cfg: CommonSettings, entry: dict[str, Any]) -> CommonSettings:
     other = copy.deepcopy(cfg)
-    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED):
-        other.scenario[setting] = None
-    for setting, value in entry.items():
-        try:
-            other.scenario[setting] = value
-        except OmegaConfBaseException as error:
-            why = str(error).splitlines()[0]
-            raise UserError(f"scenario.also: {setting}={value} of {entry['name']} cannot be: {why}") from error
-    unresolved = OmegaConf.to_container(words, resolve=False)
-    for group, setting in (follower.split(".") for follower in find_followers(words)):
-        if group != "scenario":
-            other[group][setting] = unresolved[group][setting]
+    left = ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED)
+    metadata = {field.name: field.metadata for field in fields(ScenarioSettings)}
+    try:
+        given = {
+            name: make_value(name, value, kinds(ScenarioSettings)[name], metadata[name])
+            for name, value in entry.items()
+        }
+    except UserError as error:
+        raise UserError(f"scenario.also: of {entry['name']}, {error}") from error
+    other.scenario = replace(cfg.scenario, **(dict.fromkeys(left) | given))
+    for group in GROUPS:
+        followers = [name.partition(".")[2] for name in cfg.followers if name.startswith(f"{group}.")]
+        changed = dict.fromkeys(name for name in followers if name != "team")
+        setattr(other, group, replace(getattr(cfg, group), **changed))
     return other
 
 
@@ -256,6 +249,6 @@ class Learner:
 def make_learner(cfg: LearnerSettings, env: ExplorationEnv) -> Learner:
     """Policy, critic and updater of the settings, for the specs of `env`."""
     row = find_algorithm(cfg.algorithm.name, TRAININGS)
-    settings, model = algorithm_settings(cfg), model_settings(cfg)
+    settings, model = cfg.algorithm, cfg.model
     policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
     return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))

@@ -1,7 +1,7 @@
 """Settings as fields of dataclasses: type, default, range, unit and one line of help, each said once.
 
 From these come the check of a value and its message (`check_settings`), the comments of a run's `config.yaml`, the
-types and defaults of the command line (`maexp.agents.settings.storable`), and the manual's table of settings. Imports
+types and defaults of the command line (`maexp.agents.config.storable`), and the manual's table of settings. Imports
 neither torch nor Warp: whoever asks for help does not wait for them.
 """
 

@@ -61,7 +61,7 @@ def somewhere(tmp_path, monkeypatch) -> None:
 def no_pictures(monkeypatch) -> None:
     """Trainings draw nothing: pictures have tests of their own."""
     for name in ("draw_rollout", "draw_curves"):
-        monkeypatch.setattr(f"maexp.agents.commands.train.{name}", lambda *args: None)
+        monkeypatch.setattr(f"maexp.agents.cli.train.{name}", lambda *args: None)
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from torchrl.modules import PopArtValueNorm
 from maexp.agents.algorithms.expert_iteration import ExpertUpdater
 from maexp.agents.algorithms.losses import ActorCriticLoss, ClippedLoss, TrustRegionLoss
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
+from maexp.agents.config.algorithms import TUNINGS, AlgorithmSettings, Tunings
+from maexp.agents.config.model import ModelConfig, model_config
 from maexp.agents.models.critics import build_critic
-from maexp.agents.settings.algorithms import TUNINGS, AlgorithmSettings, Tunings
-from maexp.agents.settings.model import ModelConfig, model_config
 
 
 @dataclass(frozen=True)

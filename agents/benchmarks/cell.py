@@ -6,6 +6,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,10 @@ from maexp.agents.benchmarks.plan import (
     training_cell,
     word_names,
 )
-from maexp.agents.build import load_maps, make_env, model_settings
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.config.resolved import resolve
+from maexp.agents.config.runs import PLAYED
+from maexp.agents.config.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.evaluation.cache import FOLDER, EpisodeCache, identify
 from maexp.agents.evaluation.comparison import CHOOSING
@@ -30,9 +34,6 @@ from maexp.agents.files import command, lock, short, write_file, write_json
 from maexp.agents.policies.classical import CLASSICAL
 from maexp.agents.policies.registry import NamedPolicy, suit_observation
 from maexp.agents.progress import Progress
-from maexp.agents.settings.resolved import resolve
-from maexp.agents.settings.runs import PLAYED
-from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints, restore_policy
 from maexp.agents.training.train import CONFIG, TrainingRun, train, write_config
 
@@ -125,7 +126,7 @@ def play_suite(
         size = min(cfg.num_envs, episodes)
         starts = {"starts": "together"} if suite == "held_out_together" else {}
         env = shelf.find(suite, key, lambda: make_env(settings, maps, cfg.num_robots, size, **starts))
-        policy = restore_policy(env, model_settings(settings), team) if player is None else player.make(env)
+        policy = restore_policy(env, settings.model, team) if player is None else player.make(env)
         if suite != VALIDATION and not (folder / CONFIG).is_file():  # where a policy was trained, that has written it
             write_config(played_settings(settings, maps), folder, "benchmark", [], **who_played(cfg, cell, episodes))
     source = "" if player is None else player.source
@@ -150,7 +151,7 @@ def play_suite(
 def show_what_it_looks_at(settings: TrainSettings, player: NamedPolicy, maps: list) -> None:
     """Let the env of a cell show what its policy looks at; say which maps of its training have changed."""
     if player.targets is not None:  # the cell has an env of its own
-        settings.observation.targets = 0
+        settings.observation = replace(settings.observation, targets=0)
     suit_observation(settings, [player])
     player.check_maps(maps)
 

@@ -20,13 +20,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from maexp.agents import cli
+from maexp.agents.config.overrides import quote, split_paths
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.baseline import load_baseline
 from maexp.agents.evaluation.cache import is_begun
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.metric_format import MEASURES, Measure
 from maexp.agents.files import lock, write_json, write_text
-from maexp.agents.settings.overrides import quote, split_paths
 from maexp.agents.tables import markdown_table
 from maexp.envs.config_fields import check_settings, setting
 from maexp.envs.scenarios import SCENARIOS

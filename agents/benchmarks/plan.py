@@ -7,19 +7,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-
 from maexp.agents.algorithms.registry import TRAININGS
-from maexp.agents.command_words import as_list, check_names
+from maexp.agents.config.checks import as_list, check_distinct, check_names, check_seed
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import quote
+from maexp.agents.config.resolved import flatten, plain
+from maexp.agents.config.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.registry import NamedPolicy, check_planner, find_named_policy, name_policies
-from maexp.agents.settings.checks import check_distinct, check_seed
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import quote
-from maexp.agents.settings.resolved import flatten, plain, without_hydra
-from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
 from maexp.envs.scenarios import cut_last_fifth, find_scenario, split
 
 PLAN, FORMAT = "benchmark.json", "maexp-benchmark-1"
@@ -165,19 +162,19 @@ def policy_sources(cfg: BenchmarkSettings) -> dict[str, str]:
     return {policy.name: policy.source for policy in policies if policy.source}
 
 
-def check_lists(cfg: DictConfig) -> None:
+def check_lists(cfg: BenchmarkSettings) -> None:
     """Raise UserError unless scenarios, policies, seeds and maps are lists of what there is."""
     check_names(cfg)
     for value in as_list(cfg.maps):
         if value not in SUITES:
             raise UserError(f"maps={value} is unknown: choose of {', '.join(SUITES)}.")
     for name in ("scenarios", "maps", "seeds"):
-        if not as_list(cfg[name]):
+        if not as_list(getattr(cfg, name)):
             raise UserError(f"{name}=[] leaves nothing to do: give at least one.")
     if not policy_names(cfg):
         raise UserError("algorithms=[] and policies=[] leave nothing to compare: give at least one of either.")
     for name in ("scenarios", "algorithms", "policies", "maps", "seeds"):
-        check_distinct(name, as_list(cfg[name]))
+        check_distinct(name, as_list(getattr(cfg, name)))
     for seed in as_list(cfg.seeds):
         check_seed(seed, "seeds")
     policies = [find_named_policy(word, "policies", name) for word, name in word_names(cfg).items()]
@@ -186,13 +183,13 @@ def check_lists(cfg: DictConfig) -> None:
     _check_together(cfg)
 
 
-def _check_together(cfg: DictConfig) -> None:
+def _check_together(cfg: BenchmarkSettings) -> None:
     if not cfg.together:
         return
     if cfg.iterations is not None:
         raise UserError(f"iterations={cfg.iterations} and together=true: give total_frames, and iterations=null.")
     for name in ("policy_per_map", "train_maps"):
-        if cfg[name] is not None:
+        if getattr(cfg, name) is not None:
             raise UserError(f"{name} and together=true: one policy is trained on all maps of all scenarios.")
     for scenario in as_list(cfg.scenarios):
         if find_scenario(scenario).build is None:
@@ -202,7 +199,7 @@ def _check_together(cfg: DictConfig) -> None:
 def _check_policy_per_map(cfg: BenchmarkSettings) -> None:
     if cfg.policy_per_map is None:
         return
-    counts = plain(cfg.policy_per_map) if OmegaConf.is_dict(cfg.policy_per_map) else cfg.policy_per_map
+    counts = cfg.policy_per_map
     good = isinstance(counts, dict) and all(type(count) is int and count >= 1 for count in counts.values())
     if not good:
         raise UserError(f"policy_per_map={counts} must say how many maps of each scenario, as {{maze: 4}}.")
@@ -220,7 +217,7 @@ def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
     words = [f"scenario={first}", f"seed={cell.seed}"]
     words += [f"scenario.also={render(others)}"] if others else []
     words += [f"algorithm={cell.policy}"] if cell.trains else []
-    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), unresolved(cfg)))
+    usual, ours = (flatten({name: node[name] for name in SECTIONS}) for node in (_usual(), plain(cfg)))
     changed = {name: value for name, value in ours.items() if value != usual[name] and name not in OWN}
     changed |= _maps_of(cfg, cell) | length_of(cfg, cell)
     changed |= {"episodes": 0, "evaluate_every": 0, "num_threads": cfg.num_threads or 1}
@@ -234,13 +231,8 @@ def cell_overrides(cfg: BenchmarkSettings, cell: Cell) -> list[str]:
 def _usual() -> dict:
     """The settings of maexp train without overrides; of scenario and algorithm, which are each cell's own, what is set
     for all cells without overrides."""
-    own = unresolved(compose_settings("benchmark", []))
-    return unresolved(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
-
-
-def unresolved(cfg: DictConfig) -> dict:
-    """Settings as plain containers, references to the scenario as they are."""
-    return OmegaConf.to_container(cfg, resolve=False)
+    own = plain(compose_settings("benchmark", []))
+    return plain(compose_settings("train", [])) | {name: own[name] for name in ("scenario", "algorithm")}
 
 
 def _maps_of(cfg: BenchmarkSettings, cell: Cell) -> dict[str, Any]:
@@ -274,11 +266,6 @@ def cell_config(cfg: BenchmarkSettings, cell: Cell) -> tuple[TrainSettings, list
     return compose_settings("train", words), words
 
 
-def compose_settings(verb: str, overrides: list[str]) -> DictConfig:
-    """The settings of a verb without Hydra's own."""
-    return without_hydra(compose_config(verb, overrides))
-
-
 def render(value: Any) -> str:
     """A value as Hydra reads it on the command line."""
     if value is None:
@@ -301,7 +288,7 @@ def cell_folder(where: Path, cell: Cell) -> Path:
     return where / "cells" / cell.name
 
 
-def write_plan(where: Path, cfg: DictConfig, overrides: list[str]) -> None:
+def write_plan(where: Path, cfg: BenchmarkSettings, overrides: list[str]) -> None:
     """benchmark.json: the words of the command line, the settings that all cells share, the names of those that each
     cell has from its scenario or algorithm (its own config.yaml holds them), and what tells that a policy changed."""
     shared = shared_settings(cfg)
@@ -332,7 +319,7 @@ def read_plan(place: str | Path) -> dict:
         raise UserError(f"{path} is damaged, or not of the kind {FORMAT}: start anew in another folder.") from error
 
 
-def shared_settings(cfg: DictConfig) -> dict[str, Any]:
+def shared_settings(cfg: BenchmarkSettings) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable; None: left open, see `write_plan`."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
     shared = {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
@@ -343,7 +330,7 @@ def _is_free(name: str) -> bool:
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in FREE)
 
 
-def check_unchanged(where: Path, cfg: DictConfig) -> None:
+def check_unchanged(where: Path, cfg: BenchmarkSettings) -> None:
     """Raise UserError if a setting differs from that of the cells already there."""
     if not (where / PLAN).is_file() or not any((where / "cells").glob("*/*/*")):
         return

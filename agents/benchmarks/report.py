@@ -18,12 +18,12 @@ from maexp.agents.benchmarks.paper_table import (
     table_markdown,
 )
 from maexp.agents.benchmarks.plan import SUITES, Cell, as_list, is_learned, training_cell
+from maexp.agents.config.verbs import BenchmarkSettings
 from maexp.agents.evaluation.comparison import find_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, join, pool
 from maexp.agents.evaluation.metric_format import compared
 from maexp.agents.files import short, write_json, write_text
 from maexp.agents.policies.classical import CLASSICAL
-from maexp.agents.settings.verbs import BenchmarkSettings
 from maexp.agents.tables import markdown_table
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.metrics import LEAST_DISTINCT

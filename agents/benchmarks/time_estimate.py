@@ -11,9 +11,9 @@ from torchrl.envs.utils import step_mdp
 
 from maexp.agents.benchmarks.plan import Cell, as_list, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner, set_steps
+from maexp.agents.config.verbs import BenchmarkSettings
 from maexp.agents.errors import blame_input
 from maexp.agents.policies.classical import POLICIES
-from maexp.agents.settings.verbs import BenchmarkSettings
 from maexp.envs.scenarios import find_scenario
 
 FRAMES = 48  # macro steps of teams in a measured batch, at least, where a batch of the training has as many

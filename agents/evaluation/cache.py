@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from maexp.agents.config.groups import CommonSettings
+from maexp.agents.config.overrides import from_root, set_names
+from maexp.agents.config.resolved import flatten, plain, resolve
+from maexp.agents.config.runs import PLAYED, Recipe
+from maexp.agents.config.verbs import EvaluateSettings
 from maexp.agents.errors import UserError
 from maexp.agents.files import checksums, short, write_file, write_text
-from maexp.agents.settings.groups import CommonSettings
-from maexp.agents.settings.overrides import from_root, set_names
-from maexp.agents.settings.resolved import flatten, plain, resolve
-from maexp.agents.settings.runs import PLAYED, Recipe
-from maexp.agents.settings.verbs import EvaluateSettings
 from maexp.agents.versions import find_commit
 from maexp.envs import ExplorationEnv
 from maexp.envs.maps.point_cloud import MapError, read_npz

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.build import MapSuite, make_env
+from maexp.agents.config.verbs import EpisodeSettings
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.metric_format import compared, verdict
 from maexp.agents.evaluation.results import result_names
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.settings.verbs import EpisodeSettings
 from maexp.envs import ExplorationEnv
 
 _kept: ContextVar[dict[tuple, EvaluationResult] | None] = ContextVar("kept", default=None)

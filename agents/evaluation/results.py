@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from maexp.agents.config.verbs import EpisodeSettings
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.metric_format import MEASURES, describe_evidence
 from maexp.agents.files import write_json
-from maexp.agents.settings.verbs import EpisodeSettings
 from maexp.agents.tables import NONE, estimate, print_table, reached
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs.metrics import LEAST_DISTINCT, in_reach, resample_weights, resampled_means

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from maexp.agents.config.verbs import EvaluateSettings
 from maexp.agents.errors import UserError
-from maexp.agents.settings.verbs import EvaluateSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.render.episode import Episode, EpisodeRecorder
 from maexp.envs.render.frames import add_headline, draw_frame, draw_grid, watch_episode

@@ -7,12 +7,12 @@ from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, distributions, nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from maexp.agents.config.model import ModelConfig, model_config
 from maexp.agents.errors import UserError
 from maexp.agents.models.distributions import ACTION, Heads, RegionHeads
 from maexp.agents.models.encoder import compact, pools_pictures
 from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.models.target_generator import TargetGenerator
-from maexp.agents.settings.model import ModelConfig, model_config
 from maexp.envs.targets.features import FEATURES
 
 

@@ -5,6 +5,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from maexp.agents.config.model import ModelConfig, model_config
 from maexp.agents.models.actor import (
     ALIVE,
     COMM,
@@ -18,7 +19,6 @@ from maexp.agents.models.actor import (
 )
 from maexp.agents.models.encoder import CellEncoder, add_state
 from maexp.agents.models.target_chooser import SeenReader, TargetReader
-from maexp.agents.settings.model import ModelConfig, model_config
 
 
 class VDNMixer(nn.Module):

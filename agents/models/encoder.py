@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.config.model import ModelConfig
 
 STRIDE = 4  # both stems shrink the picture by this factor
 SUBCELLS = 4  # cells a side that the CNN sees of one region

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.models.target_generator import contact_bias
-from maexp.agents.settings.model import ModelConfig
 from maexp.envs.targets.features import FEATURES, feature_names
 from maexp.envs.targets.heuristics import APART, BEYOND, WAY
 from maexp.envs.targets.observation import first_if_none

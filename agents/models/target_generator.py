@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.models.encoder import CellEncoder, add_state
-from maexp.agents.settings.model import ModelConfig
 
 MIN_SCALE = 0.05  # a narrower offset makes probability ratios explode, a wider one than 1 leaves the region
 MAX_SCALE = 1.0

@@ -4,10 +4,10 @@ import os
 import re
 from importlib import metadata
 
+from maexp.agents.config.verbs import NAMES
 from maexp.agents.deploy.planner.bundle import CONTRACT, advise, shipped_names
 from maexp.agents.errors import UserError
 from maexp.agents.policies.remote.worker import GROUP
-from maexp.agents.settings.verbs.evaluate import NAMES
 
 
 def policy_plugins() -> dict[str, metadata.EntryPoint]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.deploy.planner.bundle import (
     AGAIN,
     CONTRACT,
@@ -22,7 +23,6 @@ from maexp.agents.models.actor import make_policy, mismatched
 from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.export import find_chooser
-from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
 

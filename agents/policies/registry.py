@@ -10,10 +10,14 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from maexp.agents.config.checks import check_distinct
+from maexp.agents.config.groups import CommonSettings
+from maexp.agents.config.model import ModelConfig
+from maexp.agents.config.resolved import flatten
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import STARTS
 from maexp.agents.files import warn_of_changed_maps
@@ -27,10 +31,6 @@ from maexp.agents.policies.remote.user_policy import (
     make_user_policy,
     read_source,
 )
-from maexp.agents.settings.checks import check_distinct
-from maexp.agents.settings.groups import CommonSettings
-from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.resolved import flatten
 from maexp.agents.training.checkpoint import (
     BEST,
     NAME,
@@ -252,13 +252,13 @@ def suit_observation(cfg: CommonSettings, policies: Sequence[NamedPolicy]) -> No
         if len(set(counts.values())) > 1:
             told = ", ".join(f"{spec} {count}" for spec, count in counts.items())
             raise UserError(f"Policies that look at different numbers of targets cannot play together: {told}.")
-        cfg.observation.targets = next(iter(counts.values()))
-    cfg.observation.radio = cfg.observation.radio or any(policy.radio for policy in policies)
+        cfg.observation = replace(cfg.observation, targets=next(iter(counts.values())))
+    cfg.observation = replace(cfg.observation, radio=cfg.observation.radio or any(policy.radio for policy in policies))
     shown = {policy.name: policy.map for policy in policies if policy.map is not None}
     if len(set(shown.values())) > 1:
         told = ", ".join(f"{spec} {what}" for spec, what in shown.items())
         raise UserError(f"Policies whose pictures show different things cannot play together: {told}.")
     if shown:
-        cfg.observation.map, cfg.observation.pictures = next(iter(shown.values())), True
+        cfg.observation = replace(cfg.observation, map=next(iter(shown.values())), pictures=True)
     elif not any(policy.pictures for policy in policies):
-        cfg.observation.pictures = False
+        cfg.observation = replace(cfg.observation, pictures=False)

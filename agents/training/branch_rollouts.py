@@ -22,6 +22,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import step_mdp
 
 from maexp.agents.algorithms.expert_iteration import ADVANTAGE, TRIED
+from maexp.agents.config.algorithms import ExpertSettings
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_file, write_text
 from maexp.agents.models.actor import PREFERENCE, TARGETS, TARGETS_MASK
@@ -29,7 +30,6 @@ from maexp.agents.models.distributions import ACTION
 from maexp.agents.models.target_chooser import NEVER, SCORE, TRAVEL
 from maexp.agents.policies.lookahead import list_candidates
 from maexp.agents.policies.rollouts import Rollouts, branches_of, pick_tried
-from maexp.agents.settings.algorithms import ExpertSettings
 from maexp.envs import ExplorationEnv, LookaheadConfig, ObservationConfig, PlannerConfig, make_map
 from maexp.envs.comm.strategy import Strategy
 from maexp.envs.config_fields import check_settings, setting

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torchrl.modules import ProbabilisticActor
 
+from maexp.agents.config.groups import LearnerSettings
+from maexp.agents.config.model import SIZES, ModelConfig
+from maexp.agents.config.resolved import flatten
 from maexp.agents.errors import UserError, advise_on_disk
 from maexp.agents.files import command, short, write_file
 from maexp.agents.models.actor import load_matching, make_policy
-from maexp.agents.settings.groups import LearnerSettings
-from maexp.agents.settings.model import SIZES, ModelConfig
-from maexp.agents.settings.resolved import flatten
 from maexp.envs import ExplorationEnv
 
 NAME = re.compile(r"iteration_(\d+)\.pt")

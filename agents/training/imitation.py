@@ -17,14 +17,13 @@ from torchrl.modules import ProbabilisticActor
 from maexp.agents.algorithms.losses import check_finite
 from maexp.agents.algorithms.updaters import Meter
 from maexp.agents.build import Learner, choose_device, make_env
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.files import write_text
 from maexp.agents.models.actor import ALIVE, load_matching
 from maexp.agents.models.distributions import ACTION
 from maexp.agents.policies.registry import NamedPolicy, check_planner, find_named_policy, suit_observation
 from maexp.agents.progress import Progress
-from maexp.agents.settings.resolved import model_settings
-from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collectors import batch_statistics, divide_teams
 from maexp.agents.training.train import TrainingRun
 
@@ -65,7 +64,7 @@ def taught_by(teacher: NamedPolicy) -> str | None:
 
 def _check_kind(cfg: TrainSettings, taught: str | None) -> None:
     """Raise UserError where the teacher chooses something else than the policy that is to imitate it."""
-    chosen = "controls" if cfg.planner.name == "direct" else model_settings(cfg).action
+    chosen = "controls" if cfg.planner.name == "direct" else cfg.model.action
     if taught not in (None, chosen):
         raise UserError(
             f"warm_start={cfg.warm_start} chooses {taught}, which a policy with action={chosen} cannot imitate: "
@@ -105,7 +104,7 @@ def take_weights(run: TrainingRun) -> bool:
     """Give the policy of `run` its teacher's weights, where both have the same network; else False."""
     cfg = run.cfg
     teacher = find_named_policy(cfg.warm_start, "warm_start")
-    if teacher.model is None or teacher.model.policy != model_settings(cfg).policy:
+    if teacher.model is None or teacher.model.policy != cfg.model.policy:
         return False
     with blame_input():
         env = make_env(cfg, run.suite.train[:1], run.sizes[0], 1, device=choose_device(cfg, "train_device"))

@@ -11,10 +11,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from maexp.agents.config.groups import LoggerSettings
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.results import COLUMNS
 from maexp.agents.files import write_text
-from maexp.agents.settings.groups import LoggerSettings
 from maexp.agents.tables import markdown_table
 
 MODES = ("online", "offline")

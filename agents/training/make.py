@@ -8,9 +8,9 @@ from typing import overload
 
 from torchrl.modules import ProbabilisticActor
 
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.models import actor
 from maexp.agents.policies.registry import find_named_policy
-from maexp.agents.settings.model import ModelConfig
 from maexp.envs import ExplorationEnv
 
 

@@ -1,6 +1,5 @@
 """Before a training: settings that go together, the networks, and what gathers their experience."""
 
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
 from maexp.agents.build import (
@@ -12,27 +11,24 @@ from maexp.agents.build import (
     other_scenarios,
     set_steps,
 )
+from maexp.agents.config.algorithms import ExpertSettings
+from maexp.agents.config.checks import team_sizes
+from maexp.agents.config.groups import CollectorSettings
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.memory import check_batch_memory
-from maexp.agents.settings.algorithms import ExpertSettings
-from maexp.agents.settings.checks import team_sizes
-from maexp.agents.settings.resolved import algorithm_settings, model_settings
-from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collectors import Experience, divide_teams, make_collector
 from maexp.envs import ExplorationEnv, PointCloudMap
 
 BACKENDS = ("single", "processes", "ray")
 
 
-def make_both(
-    cfg: TrainSettings, maps: list[PointCloudMap], words: TrainSettings | None = None
-) -> tuple[Learner, Experience]:
+def make_both(cfg: TrainSettings, maps: list[PointCloudMap]) -> tuple[Learner, Experience]:
     """The networks that learn and what gathers their experience, each on its device.
 
     Args:
         cfg: the settings
         maps: those of the first scenario
-        words: the settings that the run's own words come to, where `cfg` holds values of a checkpoint too
 
     Raises:
         UserError, ValueError: settings that cannot be used.
@@ -40,14 +36,13 @@ def make_both(
     check_collector(cfg.collector)
     alone, workers = cfg.collector.backend == "single", cfg.collector.workers
     here, there = choose_device(cfg, "sample_device"), choose_device(cfg, "train_device")
-    words = cfg if words is None else words
-    others = other_scenarios(cfg, words)
+    others = other_scenarios(cfg)
     if others and not alone:
         raise UserError(f"scenario.also={list(cfg.scenario.also)} needs collector=single.")
     places = [(cfg, maps), *((other, load_maps(other.scenario).train) for other in others)]
     sizes = team_sizes(cfg.num_robots)
     teams = divide_teams(cfg.num_envs, sizes * len(places), workers)
-    whole = words.collector.steps is None  # episodes, which differ in length from scenario to scenario
+    whole = "collector.steps" in cfg.followers  # episodes, which differ in length from scenario to scenario
     envs = [
         make_env(
             *places[k // len(sizes)],
@@ -75,7 +70,7 @@ def make_both(
 
 def make_actor(cfg: TrainSettings, policy: TensorDictModuleBase, env: ExplorationEnv) -> TensorDictModuleBase:
     """What acts in the training episodes of an env: the policy, with what the algorithm does besides."""
-    settings = algorithm_settings(cfg)
+    settings = cfg.algorithm
     if not isinstance(settings, ExpertSettings):
         return policy
     from maexp.agents.training.branch_rollouts import BranchingActor  # builds on the planners
@@ -87,7 +82,7 @@ def check_expert(cfg: TrainSettings) -> None:
     """Raise UserError for settings that expert iteration cannot work with."""
     if cfg.algorithm.name != "expert_iteration":
         return
-    if model_settings(cfg).action != "targets" or cfg.planner.name == "direct":
+    if cfg.model.action != "targets" or cfg.planner.name == "direct":
         raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
     if cfg.tuning == "reference":
         raise UserError("tuning=reference: the original platform has no algorithm=expert_iteration. Leave tuning out.")
@@ -98,14 +93,16 @@ def check_expert(cfg: TrainSettings) -> None:
         )
 
 
-def check_collector(settings: DictConfig) -> None:
+def check_collector(settings: CollectorSettings) -> None:
     """Raise UserError for settings of `collector` that do not go together."""
     if settings.backend not in BACKENDS:
         raise UserError(f"collector.backend={settings.backend} is unknown: choose one of {', '.join(BACKENDS)}.")
     if settings.backend == "single":
         for name, default in (("workers", 1), ("overlap", False)):
-            if settings[name] != default:
-                raise UserError(f"collector.{name}={settings[name]} needs collector=processes or collector=ray.")
+            if getattr(settings, name) != default:
+                raise UserError(
+                    f"collector.{name}={getattr(settings, name)} needs collector=processes or collector=ray."
+                )
     if settings.ray_address is not None and settings.backend != "ray":
         raise UserError(f"collector.ray_address={settings.ray_address} needs collector=ray.")
 

@@ -15,18 +15,16 @@ from maexp.agents.build import (
     MapSuite,
     load_maps,
 )
+from maexp.agents.config.checks import team_sizes
+from maexp.agents.config.model import ModelConfig
+from maexp.agents.config.overrides import without
+from maexp.agents.config.resolved import resolve, to_yaml
+from maexp.agents.config.runs import PLAYED
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError, blame_input, stop_on_signals
 from maexp.agents.files import changed_maps, checksums, command, short, write_text
 from maexp.agents.models.actor import load_matching
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import team_sizes
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.env import find_followers
-from maexp.agents.settings.model import ModelConfig
-from maexp.agents.settings.overrides import without
-from maexp.agents.settings.resolved import model_settings, resolve, to_yaml
-from maexp.agents.settings.runs import PLAYED
-from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.tables import brackets
 from maexp.agents.training.checkpoint import (
     check_action,
@@ -114,12 +112,11 @@ class TrainingRun:
         seed_everything(cfg.seed)
         with blame_input():
             suite = load_maps(cfg.scenario)
-            words = compose_config("train", overrides) if cfg.scenario.also else None
-            learner, experience = make_both(cfg, suite.train, words)
+            learner, experience = make_both(cfg, suite.train)
             run = cls(cfg, folder, overrides, suite, learner, experience)
             if saved is not None:
                 run.restore(saved)
-            elif cfg.algorithm.get("begin_from"):
+            elif getattr(cfg.algorithm, "begin_from", None):
                 run.begin_from(cfg.algorithm.begin_from)
         return run
 
@@ -138,11 +135,6 @@ class TrainingRun:
     def checksums(self) -> dict[str, str]:
         """Of the maps trained on and held out, by their names."""
         return checksums(self.suite.train) | checksums(self.suite.held_out)
-
-    @cached_property
-    def followers(self) -> list[str]:
-        """The settings that no word had set and that the scenario supplied."""
-        return find_followers(compose_config("train", self.overrides))
 
     @property
     def sizes(self) -> list[int]:
@@ -174,7 +166,7 @@ class TrainingRun:
         state = {
             "overrides": self.overrides,
             "settings": self.settings,
-            "followers": self.followers,
+            "followers": [name for name in self.cfg.followers if not name.startswith("collector.")],
             "commit": find_commit(),
             "maps": self.checksums,
             "iteration": self.iteration,
@@ -213,7 +205,7 @@ class TrainingRun:
             raise UserError(f"algorithm.begin_from={place} was not trained by expert iteration: it holds no branches.")
         check_action(saved, self.cfg)
         theirs = saved["settings"]["model"].get("starts_from", ModelConfig().starts_from)
-        if theirs != (ours := model_settings(self.cfg).starts_from):
+        if theirs != (ours := self.cfg.model.starts_from):
             raise UserError(
                 f"algorithm.begin_from={place} starts from {theirs}, and model.starts_from={ours}: leave that out."
             )

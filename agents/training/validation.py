@@ -13,11 +13,11 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from maexp.agents.build import MapSuite, choose_device, make_env
+from maexp.agents.config.checks import choices_of, team_sizes
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.evaluation.comparison import DECIDES, play_best
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, join
 from maexp.agents.policies.classical import CLASSICAL
-from maexp.agents.settings.checks import choices_of, team_sizes
-from maexp.agents.settings.verbs import TrainSettings
 from maexp.envs import ExplorationEnv
 from maexp.envs.metrics import in_reach
 

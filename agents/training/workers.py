@@ -16,16 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch.utils._pytree import tree_map_only
 from torchrl.collectors import BaseCollector, MultiSyncCollector
 
 from maexp.agents.build import choose_device, choose_starts, make_env
+from maexp.agents.config.groups import CollectorSettings
+from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.memory import keep_freed_memory
-from maexp.agents.settings.groups import CollectorSettings
-from maexp.agents.settings.verbs import TrainSettings
 from maexp.agents.training.collectors import Experience, TeamCollector, Teams, WorkerLost
 from maexp.envs import PointCloudMap
 
@@ -43,7 +42,7 @@ class WorkerEnv:
     """Makes the env of one worker, in its process.
 
     Attributes:
-        settings: those of the run, as YAML
+        settings: those of the run
         maps: trained on, or the file that holds them
         teams: of this worker; the number of the first keys its random numbers
         device: of the simulation and the policy
@@ -51,7 +50,7 @@ class WorkerEnv:
         starts: drawn, fixed or poses (their file may be on another machine)
     """
 
-    settings: str
+    settings: TrainSettings
     maps: list[PointCloudMap] | Path
     teams: Teams
     device: torch.device
@@ -62,7 +61,7 @@ class WorkerEnv:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that trains; it ends the workers
         keep_freed_memory()
-        cfg = OmegaConf.create(self.settings)
+        cfg = self.settings
         maps = pickle.loads(self.maps.read_bytes()) if isinstance(self.maps, Path) else self.maps
         key = np.random.SeedSequence([cfg.seed % 2**32, self.teams.first_env]).generate_state(1)
         torch.manual_seed(int(key[0]))
@@ -308,7 +307,7 @@ def make_workers(
         for team in teams:
             shares = team.split(settings.workers)
             rest = device, threads, choose_starts(cfg, team.num_robots)
-            factories = [WorkerEnv(OmegaConf.to_yaml(cfg), given, part, *rest) for part in shares]
+            factories = [WorkerEnv(cfg, given, part, *rest) for part in shares]
             name = "collector worker" if len(teams) == 1 else f"for teams of {team.num_robots}: collector worker"
             groups.append(start(factories, policy_there, team.num_envs * settings.steps, name))
     return WorkerExperience(groups, policy, settings.overlap)

@@ -9,7 +9,7 @@ from maexp.envs.config.env import DONE, GROUPS, STARTS, EnvSettings
 from maexp.envs.config.group import Group, supplied
 from maexp.envs.config.lookahead import LookaheadConfig
 from maexp.envs.config.observation import ObservationConfig
-from maexp.envs.config.planner import CLEARANCE, PLANNERS, PlannerConfig
+from maexp.envs.config.planner import PlannerConfig
 from maexp.envs.config.radar import RadarConfig
 from maexp.envs.config.reward import TIME_ON, RewardConfig
 from maexp.envs.config.robot import BODY, ROBOT_KINDS, RobotConfig
@@ -19,10 +19,8 @@ __all__ = [
     "BODY",
     "CELLS_OF_RADAR",
     "CELL_BYTES",
-    "CLEARANCE",
     "DONE",
     "GROUPS",
-    "PLANNERS",
     "ROBOT_KINDS",
     "STARTS",
     "STRATEGIES",

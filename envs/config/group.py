@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
 from maexp.envs.config_fields import check_settings
-from maexp.envs.scenarios import SCENARIOS, Scenario
+from maexp.envs.scenarios import Scenario, find_scenario
 
 
 @dataclass(frozen=True)
@@ -32,5 +32,5 @@ class Group:
 
 def supplied(kind: type[Group]) -> list[str]:
     """Settings of a robot, radar or planner that are None by default and that a scenario, any one, fills in."""
-    filled = kind().completed(SCENARIOS["maze"])
+    filled = kind().completed(find_scenario("maze"))
     return [field.name for field in fields(kind) if field.default is None and getattr(filled, field.name) is not None]

@@ -1,15 +1,7 @@
 """Generated maps: one file per family, and the table of what belongs to each scenario."""
 
-from maexp.envs.scenarios.table import (
-    GENERATED,
-    SCENARIOS,
-    Scenario,
-    cut_last_fifth,
-    default_macro_steps,
-    find_scenario,
-    make_map,
-    split,
-)
+from maexp.envs.scenarios.table import Scenario, cut_last_fifth, default_macro_steps, find_scenario, make_map, split
+from maexp.kernels.lazy import lazy_names
 
 __all__ = [
     "GENERATED",
@@ -21,3 +13,5 @@ __all__ = [
     "make_map",
     "split",
 ]
+
+__getattr__ = lazy_names(__name__, {"GENERATED": "table", "SCENARIOS": "table"})

@@ -1,18 +1,19 @@
-"""The table of scenarios: sizes, robots, radars and episode lengths that belong together."""
+"""The table of scenarios: sizes, robots, radars and episode lengths that belong together.
 
+A row is the `row` of a file in `conf/scenario/`.
+"""
+
+import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from numbers import Integral
 from typing import Any
 
+from maexp.conf import list_choices, read_choice
 from maexp.envs.config_fields import setting
 from maexp.envs.maps.point_cloud import PointCloudMap
-from maexp.envs.scenarios.indoor import build_indoor
-from maexp.envs.scenarios.maze import build_maze
-from maexp.envs.scenarios.outdoor import build_outdoor
-from maexp.envs.scenarios.random_obstacles import build_adaptive, build_random_obstacles
 from maexp.kernels.constants import DT
 
 LEAST_MACRO_STEPS = 10
@@ -21,26 +22,46 @@ SWEEPS = 2.0
 
 
 @dataclass(frozen=True)
+class Builder:
+    """Builds the maps of a scenario.
+
+    Attributes:
+        function: "MODULE.NAME" of this package: (index, scenario=..., ...) -> map
+        scenario: the scenario's name
+        settings: the function's other arguments
+    """
+
+    function: str
+    scenario: str
+    settings: dict[str, Any]
+
+    def __call__(self, index: int) -> PointCloudMap:
+        module, _, name = self.function.rpartition(".")
+        build = getattr(importlib.import_module(f"maexp.envs.scenarios.{module}"), name)
+        return build(index, scenario=self.scenario, **self.settings)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """One kind of place, and the robot, radar, planner and episode length that fit it."""
+    """One kind of place, and the robot, radar, planner and episode length that fit it. The defaults are those of the
+    paper's car."""
 
     name: str
-    count: int | None  # maps in the suite; None: the user brings the map
+    count: int | None = None  # maps in the suite; None: the user brings the map
     resolution: float  # spacing of the points [m]; the finest where maps of a scenario differ
-    size: float | None  # longest side of the largest maps, in points x resolution [m]
+    size: float | None = None  # longest side of the largest maps, in points x resolution [m]
     radar_range: float = setting(help="how far a radar sees", unit="m")
     max_speed: float = setting(help="of a robot", unit="m/s")
-    max_accel: float = setting(help="of a robot", unit="m/s^2")
-    body_length: float = setting(help="of a robot", unit="m")
-    body_width: float = setting(help="of a robot", unit="m")
-    collision_threshold: float = setting(help="a centre this near to a wall or another centre collides", unit="m")
+    max_accel: float = setting(2.0, "of a robot", unit="m/s^2")
+    body_length: float = setting(1.5, "of a robot", unit="m")
+    body_width: float = setting(1.0, "of a robot", unit="m")
+    collision_threshold: float = setting(0.75, "a centre this near to a wall or another centre collides", unit="m")
     clearance_factor: float = setting(help="the paper's: DWA keeps so many thresholds away (preset=paper)")
     local_steps: int = setting(help="control steps of 0.1 s in one decision")
-    macro_steps: int | None = setting(help="decisions in one episode, at most; default: from the free area")
+    macro_steps: int | None = setting(None, "decisions in one episode, at most; default: from the free area")
     num_steering: int = setting(25, "DWA's candidates of the steering angle")
     max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
-    summary: str = ""  # a line for `--help`
 
     def with_radius(self, radius: float | None) -> "Scenario":
         """With a round robot of that radius [m], which collides where its body touches a wall; None: as it is."""
@@ -49,148 +70,34 @@ class Scenario:
         return replace(self, body_length=2 * radius, body_width=2 * radius, collision_threshold=radius)
 
 
-_CAR: dict[str, Any] = dict(max_accel=2.0, body_length=1.5, body_width=1.0, collision_threshold=0.75)
-_MAZE: dict[str, Any] = dict(
-    _CAR, count=80, resolution=1.0, radar_range=10.0, max_speed=8.0, clearance_factor=4.0, local_steps=20
-)
-_RANDOM: dict[str, Any] = dict(
-    _CAR,
-    count=32,
-    resolution=1.0,
-    size=125.0,
-    radar_range=10.0,
-    max_speed=6.0,
-    clearance_factor=3.0,
-    local_steps=40,
-    macro_steps=15,
-)
-_INDOOR: dict[str, Any] = dict(
-    resolution=0.1,
-    radar_range=1.0,
-    max_speed=0.6,
-    max_accel=0.2,
-    body_length=0.15,
-    body_width=0.1,
-    collision_threshold=0.06,
-    clearance_factor=4.2,
-    local_steps=40,
-    macro_steps=15,
-    num_steering=21,
-)
+def _read_scenario(name: str) -> Scenario:
+    row = dict(read_choice("scenario", name)["row"])
+    if "build" in row:
+        settings = dict(row["build"])
+        row["build"] = Builder(settings.pop("function"), name, settings)
+    return Scenario(name=name, **row)
 
-_ROWS = [
-    Scenario(
-        "random_obstacles",
-        summary="125 m of corridors, rooms and scattered obstacles (paper)",
-        **_RANDOM,
-        build=partial(build_random_obstacles, scenario="random_obstacles", resolution=1.0),
-    ),
-    Scenario(
-        "random_obstacles_adaptive",
-        summary="the same with points 2 m apart in open ground: a fifth fewer",
-        **_RANDOM,
-        build=partial(build_adaptive, scenario="random_obstacles_adaptive", resolution=1.0, near=2.0),
-    ),
-    Scenario(
-        "maze",
-        summary="125 m mazes, corridors of constant width, no loops (paper)",
-        size=125.0,
-        macro_steps=30,
-        **_MAZE,
-        build=partial(build_maze, scenario="maze", cells=12, corridor=5, wall=5, resolution=1.0),
-    ),
-    Scenario(
-        "maze_small",
-        summary="37 m mazes, 1 m points: small enough to learn in minutes",
-        size=37.0,
-        macro_steps=15,
-        **_MAZE,
-        build=partial(build_maze, scenario="maze_small", cells=6, corridor=5, wall=1, resolution=1.0),
-    ),
-    Scenario(
-        "indoor_small",
-        summary="furnished floor plans under 10 m, 0.1 m points",
-        count=17,
-        size=10.0,
-        **_INDOOR,
-        build=partial(build_indoor, scenario="indoor_small", longest=(6.5, 9.8)),
-    ),
-    Scenario(
-        "indoor_medium",
-        summary="furnished floor plans of 10 to 14 m, 0.1 m points",
-        count=32,
-        size=14.0,
-        **_INDOOR,
-        build=partial(build_indoor, scenario="indoor_medium", longest=(10.2, 13.8)),
-    ),
-    Scenario(
-        "indoor_large",
-        summary="furnished floor plans over 14 m, 0.1 m points",
-        count=22,
-        size=20.0,
-        **_INDOOR,
-        build=partial(build_indoor, scenario="indoor_large", longest=(14.4, 19.8)),
-    ),
-    Scenario(
-        "outdoor",
-        summary="288 m of city blocks, trees and open ground, 1.5 to 2 m points",
-        count=32,
-        resolution=1.5,
-        size=288.0,
-        radar_range=20.0,
-        max_speed=6.0,
-        **_CAR,
-        clearance_factor=4.2,
-        local_steps=40,
-        macro_steps=20,
-        num_steering=21,
-        build=partial(build_outdoor, scenario="outdoor"),
-    ),
-    Scenario(
-        "pointcloud",
-        summary="a map of your own: set scenario.path=FILE or FILE,FILE "
-        "(.yaml .pcd .ply .xyz .las .laz .obj .glb .npz .npy)",
-        count=None,
-        resolution=0.25,
-        size=None,
-        radar_range=5.0,
-        max_speed=2.0,
-        max_accel=1.0,
-        body_length=0.6,
-        body_width=0.4,
-        collision_threshold=0.3,
-        clearance_factor=3.0,
-        local_steps=20,
-        macro_steps=None,
-    ),
-    Scenario(
-        "ir2",
-        summary="IR2's protocol (arXiv 2409.04730) on plans of your own: set scenario.path=PLAN.png or several",
-        count=None,
-        resolution=0.3,
-        size=None,
-        radar_range=16.0,
-        max_speed=2.0,
-        max_accel=1.0,
-        body_length=0.4,
-        body_width=0.4,
-        collision_threshold=0.3,
-        clearance_factor=3.0,
-        local_steps=40,
-        macro_steps=196,
-    ),
-]
 
-SCENARIOS: dict[str, Scenario] = {row.name: row for row in _ROWS}
-GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
-"""Those with maps of their own; the user brings the map of the others."""
+@cache
+def scenarios() -> dict[str, Scenario]:
+    """The table. Its files are read when it is first asked for: robots that only plan do without."""
+    return {name: _read_scenario(name) for name in list_choices("scenario")}
+
+
+def __getattr__(name: str) -> Any:
+    """`SCENARIOS`, the table, and `GENERATED`: those with maps of their own; the user brings the map of the others."""
+    if name == "SCENARIOS":
+        return scenarios()
+    if name == "GENERATED":
+        return tuple(name for name, row in scenarios().items() if row.build is not None)
+    raise AttributeError(name)
 
 
 def find_scenario(name: str) -> Scenario:
     """The scenario called `name`; ValueError naming the choices if there is none."""
-    if name not in SCENARIOS:
-        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(SCENARIOS)}.")
-    return SCENARIOS[name]
+    if name not in scenarios():
+        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(scenarios())}.")
+    return scenarios()[name]
 
 
 def make_map(name: str, index: int = 0) -> PointCloudMap:

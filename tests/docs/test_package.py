@@ -33,7 +33,7 @@ def test_no_folder_shadows_the_package():
 
 
 def test_imports_go_one_way():
-    above = {"kernels": ("envs", "agents", "conf"), "envs": ("agents", "conf"), "agents": (), "conf": ROOMS}
+    above = {"kernels": ("envs", "agents", "conf"), "envs": ("agents",), "agents": (), "conf": ROOMS}
     for room, others in above.items():
         for path in (ROOT / room).rglob("*.py"):
             text = path.read_text()
@@ -42,8 +42,8 @@ def test_imports_go_one_way():
 
 
 LAYERS = (
-    "deploy.planner settings models algorithms policies evaluation training policies.registry deploy.irsim benchmarks "
-    "deploy.ros2 commands runtime"
+    "deploy.planner config models algorithms policies evaluation training policies.registry deploy.irsim benchmarks "
+    "deploy.ros2 cli runtime"
 ).split()
 """Rooms of `agents/` from the bottom up; a module belongs to the longest name that fits."""
 

@@ -10,9 +10,9 @@ import pytest
 import torch
 from worlds import room
 
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.env import team_configs
-from maexp.agents.settings.resolved import describe_radius, resolve
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.env import team_configs
+from maexp.agents.config.resolved import describe_radius, resolve
 from maexp.envs import ExplorationEnv, MapError, RadarConfig, RobotConfig
 from maexp.envs.render.frames import draw_teams
 from maexp.envs.render.painter import make_quads
@@ -101,20 +101,20 @@ def test_a_radius_that_cannot_be(body, told):
 def test_a_radius_in_settings():
     """It replaces what the scenario says of bodies, not what is set by hand; teams may mix sizes."""
     words = ["scenario=maze", "robot.radius=0.35", "robot=differential"]
-    cfg = compose_config("train", words)
-    robot, _ = team_configs(cfg, 3)
+    cfg = compose_settings("train", words)
+    robot = team_configs(cfg, 3)[0][0]
     maze = SCENARIOS["maze"]
     assert robot.completed(maze) == RobotConfig("differential", radius=0.35).completed(maze)
     shown = resolve(cfg)["robot"]
     assert shown.items() >= (ROUND | {"radius": 0.35, "wheelbase": 0.7, "max_speed": 8.0}).items()
     assert describe_radius(cfg).startswith("robot.radius=0.35: round, 0.7 m across; collides")
     with pytest.raises(ValueError, match=r"robot\.radius=0\.35 makes robot\.width 0\.7 m, and 0\.5 is given"):
-        resolve(compose_config("train", [*words, "robot.width=0.5"]))
-    mixed = compose_config("train", ["scenario=maze", "robot.team=[{radius: 0.35}, {}]"])
+        resolve(compose_settings("train", [*words, "robot.width=0.5"]))
+    mixed = compose_settings("train", ["scenario=maze", "robot.team=[{radius: 0.35}, {}]"])
     small, car = (config.completed(SCENARIOS["maze"]) for config in team_configs(mixed, 2)[0])
     assert (small.width, small.collision_threshold) == (0.7, 0.35) and (car.width, car.radius) == (1.0, None)
     assert "radius" not in resolve(mixed)["robot"]["team"][1] and describe_radius(mixed) is None
-    own = compose_config("train", ["scenario=pointcloud", "scenario.path=x.yaml", "robot.radius=0.35"])
+    own = compose_settings("train", ["scenario=pointcloud", "scenario.path=x.yaml", "robot.radius=0.35"])
     assert own.scenario.importing.robot_radius == 0.35, "the import makes room for it"
 
 

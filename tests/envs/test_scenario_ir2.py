@@ -9,10 +9,10 @@ from PIL import Image
 
 from maexp.agents.build import load_maps, make_env
 from maexp.agents.cli import main
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.resolved import flatten, resolve
+from maexp.agents.config.runs import continue_run
 from maexp.agents.errors import UserError
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.resolved import flatten, resolve
-from maexp.agents.settings.runs import continue_run
 from maexp.envs.maps.point_cloud import MapError
 
 WALL, GROUND, START = 127, 195, 208  # shades of IR2's own plans
@@ -31,7 +31,7 @@ def plan(tmp_path_factory) -> str:
 
 
 def compose(*words: str):
-    return compose_config("evaluate", ["scenario=ir2", "policy=random", *words])
+    return compose_settings("evaluate", ["scenario=ir2", "policy=random", *words])
 
 
 def test_the_protocol_counts_in_pixels(plan):
@@ -69,7 +69,7 @@ def test_words_of_the_command_come_before_the_protocol():
 
 def test_a_run_of_elsewhere_plays_by_the_protocol(tmp_path):
     words = ["scenario=maze_small", "num_robots=2", "comm.loss=0.5", "seed=7"]
-    values = flatten(resolve(compose_config("train", words)))
+    values = flatten(resolve(compose_settings("train", words)))
     saved = {"settings": values, "overrides": words, "followers": []}
     recipe = continue_run(tmp_path, saved, ["scenario=ir2", "scenario.path=x.png"], "evaluate")
     assert not {"num_robots", "comm.loss", "comm.signal", "scenario.done"} & {*recipe.values}
@@ -84,7 +84,7 @@ def test_what_is_no_plan_is_refused(plan, tmp_path):
     with pytest.raises(UserError, match="scenario=ir2 needs a map: add scenario.path=FILE"):
         load_maps(compose().scenario)
     load_maps(
-        compose_config(
+        compose_settings(
             "evaluate",
             [
                 "scenario=pointcloud",

@@ -9,8 +9,8 @@ import torch
 from worlds import room
 
 from maexp.agents.build import make_env
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides
 from maexp.envs import ExplorationEnv, MapError, RobotConfig, make_map
 from maexp.envs.spawn import fixed_starts, read_starts
 
@@ -202,7 +202,7 @@ def test_a_file_of_starts(tmp_path, monkeypatch, suffix, header):
     monkeypatch.chdir(tmp_path)
     words = make_overrides("evaluate", ["scenario=maze_small", f"scenario.starts={path.name}", "device=cpu"])
     monkeypatch.chdir("/")
-    cfg = compose_config("evaluate", words)
+    cfg = compose_settings("evaluate", words)
     env = make_env(cfg, [make_map("maze_small", 0)], 2, 3)
     env.reset()
     np.testing.assert_allclose(where(env), np.broadcast_to(POSES, (3, 2, 3)), atol=1e-6)
@@ -221,6 +221,6 @@ def test_files_that_are_none(tmp_path):
 
 def test_the_setting_takes_drawn_and_fixed():
     for word, fixed in (("drawn", False), ("fixed", True)):
-        cfg = compose_config("train", make_overrides("train", [f"scenario.starts={word}", "device=cpu"]))
+        cfg = compose_settings("train", make_overrides("train", [f"scenario.starts={word}", "device=cpu"]))
         env = make_env(cfg, [make_map("maze_small", 0)], 2, 2)
         assert bool(env.simulation.map_starts.isfinite().all()) == fixed

@@ -7,11 +7,11 @@ from scipy.spatial import cKDTree
 from worlds import room
 
 from maexp.agents.benchmarks.cell import EnvShelf, read_result, run_cell
-from maexp.agents.benchmarks.plan import Cell, compose_settings
+from maexp.agents.benchmarks.plan import Cell
 from maexp.agents.build import choose_starts, load_maps, make_env
-from maexp.agents.commands.benchmark import prepare
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides
+from maexp.agents.cli.benchmark import prepare
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides
 from maexp.envs import ExplorationEnv, MapError, RobotConfig, make_map
 from maexp.envs.spawn import check_gathering
 
@@ -90,7 +90,7 @@ def test_no_room_is_said_clearly():
 
 
 def test_the_setting_reaches_the_env():
-    cfg = compose_config("evaluate", ["scenario.starts=together", "scenario.held_out=[70]"])
+    cfg = compose_settings("evaluate", ["scenario.starts=together", "scenario.held_out=[70]"])
     assert choose_starts(cfg, 3) == "together"
     env = make_env(cfg, load_maps(cfg.scenario, train=False).held_out, 3, num_envs=2)
     team = starts_of(env)

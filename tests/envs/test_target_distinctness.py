@@ -7,11 +7,11 @@ from mazes import MAPS
 from tensordict.nn import InteractionType
 from tools.distinct import steps_to
 
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.models.actor import TARGETS_MASK, make_policy
 from maexp.agents.policies.classical import CLASSICAL, POLICIES
 from maexp.agents.policies.pretrained import load_policy_folder
-from maexp.agents.settings.model import ModelConfig
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig, TargetsConfig
 from maexp.envs.targets.tracker import TargetTracker
 

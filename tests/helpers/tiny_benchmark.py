@@ -1,8 +1,8 @@
 """A tiny benchmark: its words, its cells, and settings as `maexp benchmark` would compose them."""
 
 from maexp.agents.benchmarks.plan import Cell, compose_settings
-from maexp.agents.commands.benchmark import prepare
-from maexp.agents.settings.overrides import make_overrides
+from maexp.agents.cli.benchmark import prepare
+from maexp.agents.config.overrides import make_overrides
 
 TINY = [
     "preset=smoke",

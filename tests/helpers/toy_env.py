@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.config.model import ModelConfig
 
 SIDE = 2
 PIXELS = 16

@@ -41,9 +41,9 @@ def make_stepper(scenario="maze", planner="wavefront", goals="random", robots="3
 
 def make_trainer(*overrides: str) -> Callable[[], dict]:
     from maexp.agents.benchmarks.throughput.train import Trainee
-    from maexp.agents.settings.compose import compose_config
+    from maexp.agents.config.compose import compose_settings
 
-    trainee = Trainee.build(compose_config("train", list(overrides)))
+    trainee = Trainee.build(compose_settings("train", list(overrides)))
     share = MACRO_STEPS / (trainee.env.num_envs * trainee.cfg.collector.steps)
 
     def turn() -> dict[str, float]:

@@ -9,8 +9,8 @@ import torch
 
 from maexp.agents.benchmarks.throughput.shared import LEAST_LAPS, describe_point, sweep_points, write_report
 from maexp.agents.build import load_maps, make_env
+from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.progress import Progress
-from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.tables import print_table
 from maexp.envs import ExplorationEnv
 from maexp.envs.simulation import bytes_per_env

@@ -26,9 +26,9 @@ from maexp.agents.benchmarks.throughput.shared import (
     write_report,
 )
 from maexp.agents.build import load_maps, make_env, pick_device
+from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.errors import UserError
 from maexp.agents.progress import Progress
-from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.tables import TableCell, print_table
 from maexp.envs import ExplorationEnv
 from maexp.kernels.launches import RecordedLaunch, current_stream

@@ -16,13 +16,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from maexp.agents.benchmarks.throughput.env import MeasuredBatch
 from maexp.agents.benchmarks.throughput.shared import LEAST_LAPS, write_report
 from maexp.agents.build import load_maps, make_env
+from maexp.agents.config.checks import check_counts, check_distinct
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import without
+from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.plots import COLOURS, LOOK, save
 from maexp.agents.progress import Progress
-from maexp.agents.settings.checks import check_counts, check_distinct
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import without
-from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.tables import print_table
 from maexp.envs import PointCloudMap
 from maexp.envs.scenarios.maze import build_maze
@@ -125,7 +125,7 @@ def plan_axis(axis: Axis, cfg: BenchSettings, overrides: list[str]) -> list[tupl
     kept = without(overrides, varied)
     given = {word.partition("=")[0] for word in kept}
     meanwhile = [f"{name}={value}" for name, value in axis.meanwhile.items() if name not in given]
-    points = [compose_config("bench", [*meanwhile, *kept, axis.setting(value)]) for value in values]
+    points = [compose_settings("bench", [*meanwhile, *kept, axis.setting(value)]) for value in values]
     for point in points:
         check_counts(point, "num_envs", "num_robots")
     return list(zip(values, points, strict=True))

@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from rich.console import Console
 
+from maexp.agents.config.checks import check_counts, team_sizes
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.groups import CommonSettings
+from maexp.agents.config.overrides import find_sweeps, without
+from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.files import write_json
-from maexp.agents.settings.checks import check_counts, team_sizes
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.groups import CommonSettings
-from maexp.agents.settings.overrides import split_sweeps, without
-from maexp.agents.settings.verbs import BenchSettings
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs import ExplorationEnv
 
@@ -28,7 +27,7 @@ OWN = ("task", "seconds", "baseline", "sweep", "axes")
 LEAST_LAPS = 5
 
 
-def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[DictConfig]:
+def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], verb: str = "bench") -> list[Any]:
     """The settings of every combination of the settings given several values, team sizes last.
 
     Args:
@@ -41,10 +40,11 @@ def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], ver
         UserError: one of the values does not fit.
     """
     drop = ("sweep", "num_robots", *(OWN if verb != "bench" else ()))
-    names, axes = split_sweeps(cfg.sweep or [])
-    fixed = without(overrides, *drop, *names)
+    swept = find_sweeps(cfg.sweep or [])
+    axes = [*swept.values()]
+    fixed = without(overrides, *drop, *swept)
     axes.append([f"num_robots={n}" for n in (sizes if cfg.num_robots is None else team_sizes(cfg.num_robots))])
-    points = [compose_config(verb, [*fixed, *point]) for point in itertools.product(*axes)]
+    points = [compose_settings(verb, [*fixed, *point]) for point in itertools.product(*axes)]
     for point in points:
         check_counts(point, "num_envs", "num_robots")
     return points

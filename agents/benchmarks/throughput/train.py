@@ -8,11 +8,10 @@ import torch
 
 from maexp.agents.benchmarks.throughput.shared import describe_point, spread, sweep_points, write_report
 from maexp.agents.build import Learner, load_maps, make_env, make_learner, set_steps
+from maexp.agents.config.model import SIZES
+from maexp.agents.config.verbs import BenchSettings, TrainSettings
 from maexp.agents.memory import check_batch_memory
 from maexp.agents.progress import Progress
-from maexp.agents.settings.model import SIZES
-from maexp.agents.settings.resolved import model_settings
-from maexp.agents.settings.verbs import BenchSettings, TrainSettings
 from maexp.agents.tables import print_table
 from maexp.agents.training.checkpoint import seed_everything
 from maexp.agents.training.collectors import Stopwatch, TeamCollector, make_collector
@@ -79,7 +78,7 @@ class Trainee:
 
 def _model_name(cfg: TrainSettings) -> str:
     """The name of these sizes."""
-    sizes = replace(model_settings(cfg), action="regions")
+    sizes = replace(cfg.model, action="regions")
     return next((name for name, size in SIZES.items() if size == sizes), "own")
 
 

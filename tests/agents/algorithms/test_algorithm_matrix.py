@@ -9,8 +9,8 @@ import torch
 from worlds import room
 
 from maexp.agents import ALGORITHMS, make_policy
-from maexp.agents.build import load_maps, make_env, model_settings
-from maexp.agents.settings.compose import compose_config
+from maexp.agents.build import load_maps, make_env
+from maexp.agents.config.compose import compose_settings
 from maexp.agents.training.collectors import make_collector
 from maexp.envs import SCENARIOS
 from maexp.envs.io.map_server import export_ros_map
@@ -24,11 +24,11 @@ def experience(scenario: str, path: str | None):
     torch.manual_seed(0)
     place = [f"scenario.path='{path}'"] if path else ["scenario.maps=[0]", "scenario.held_out=[0]"]
     small = ["action=regions", "model.channels=4", "scenario.local_steps=4", "num_envs=2", "device=cpu"]
-    cfg = compose_config("train", [f"scenario={scenario}", *place, *small])
+    cfg = compose_settings("train", [f"scenario={scenario}", *place, *small])
     env = make_env(cfg, load_maps(cfg.scenario).held_out, TEAM.get(scenario, 3))
-    policy = make_policy(env, model_settings(cfg))
+    policy = make_policy(env, cfg.model)
     batch = make_collector(env, policy, 3).next().clone()
-    return env, policy, model_settings(cfg), batch
+    return env, policy, cfg.model, batch
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from maexp.agents import make_policy
 from maexp.agents.algorithms.losses import NonFiniteLoss
 from maexp.agents.algorithms.registry import find_algorithm
 from maexp.agents.algorithms.updaters import Meter, at_once
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.training.collectors import make_collector
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig, make_map
 

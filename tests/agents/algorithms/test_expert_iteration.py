@@ -12,9 +12,9 @@ from maexp.agents import ALGORITHMS, make_policy
 from maexp.agents.algorithms.expert_iteration import ADVANTAGE, TRIED
 from maexp.agents.algorithms.registry import TRAININGS
 from maexp.agents.cli import main
+from maexp.agents.config.model import model_config
 from maexp.agents.models.actor import ALIVE, COMM, PREFERENCE, TARGETS, TARGETS_MASK
 from maexp.agents.policies import POLICIES
-from maexp.agents.settings.model import model_config
 from maexp.agents.training.branch_rollouts import BranchingActor
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint
 from maexp.envs import ExplorationEnv, ObservationConfig

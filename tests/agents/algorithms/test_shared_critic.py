@@ -9,10 +9,10 @@ from mazes import MAPS
 from maexp.agents.algorithms.gae import write_advantages
 from maexp.agents.algorithms.registry import find_algorithm
 from maexp.agents.algorithms.updaters import Meter
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.models import target_chooser
 from maexp.agents.models.actor import COMM, SEEN, TARGETS, TARGETS_MASK, make_policy
 from maexp.agents.models.critics import TEAM_VALUE, VALUE
-from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collectors import make_collector
 from maexp.envs import ExplorationEnv, ObservationConfig, PlannerConfig
 

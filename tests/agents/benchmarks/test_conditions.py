@@ -7,10 +7,10 @@ import pytest
 
 from maexp.agents import cli
 from maexp.agents.benchmarks import conditions
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.resolved import resolve
 from maexp.agents.evaluation.baseline import load_baseline
 from maexp.agents.evaluation.evaluate import EvaluationResult
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.resolved import resolve
 from maexp.envs import make_map
 
 WORDS = [
@@ -25,7 +25,7 @@ WORDS = [
 
 @pytest.mark.parametrize("words", conditions.CONDITIONS.values(), ids=list(conditions.CONDITIONS))
 def test_conditions_are_settings(words):
-    resolve(compose_config("evaluate", ["policy=cost_utility", *words]))
+    resolve(compose_settings("evaluate", ["policy=cost_utility", *words]))
 
 
 def test_the_table_is_made_once_and_goes_on(tmp_path, capsys, monkeypatch):

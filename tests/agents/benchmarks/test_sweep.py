@@ -13,8 +13,8 @@ import pytest
 import small_run
 from metrics_file import read_metrics
 
+from maexp.agents.cli import evaluate as command
 from maexp.agents.cli import main
-from maexp.agents.commands import evaluate as command
 from maexp.agents.evaluation import comparison
 from maexp.agents.evaluation.comparison import keeping_episodes, play_once
 from maexp.agents.training.checkpoint import find_checkpoint

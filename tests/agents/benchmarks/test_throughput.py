@@ -10,8 +10,8 @@ from maexp.agents.benchmarks.throughput import kernels
 from maexp.agents.benchmarks.throughput.scale import large_maze
 from maexp.agents.benchmarks.throughput.shared import spread, sweep_points
 from maexp.agents.cli import main
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides, move_sweeps
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides, move_sweeps
 from maexp.envs import ExplorationEnv, make_map
 
 pytestmark = pytest.mark.slow  # measurements of speed
@@ -33,7 +33,7 @@ def report(folder: str, name: str) -> dict:
 def test_settings_with_several_values_become_every_combination():
     words = make_overrides("bench", ["env", "num_envs=2,4", "scenario=maze,maze_small", "num_robots=3,5"], ("task",))
     prepared = move_sweeps(words)
-    cfg = compose_config("bench", prepared)
+    cfg = compose_settings("bench", prepared)
     points = sweep_points(cfg, prepared, [2])
     found = [(point.num_envs, point.scenario.name, point.num_robots) for point in points]
     assert found == [(e, s, n) for e in (2, 4) for s in ("maze", "maze_small") for n in (3, 5)]

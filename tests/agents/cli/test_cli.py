@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from maexp.agents.cli import VERBS, main
-from maexp.agents.commands.run_folder import claim_folder
+from maexp.agents.cli.run_folder import claim_folder
 from maexp.agents.policies import POLICIES
 from maexp.envs import make_map
 

@@ -275,7 +275,7 @@ def trained(tmp_path_factory):
     """The checkpoint of a small run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("maexp.agents.commands.train.finish", lambda done: None)
+        patch.setattr("maexp.agents.cli.train.finish", lambda done: None)
         assert main(["train", *RUN, f"hydra.run.dir={folder}", "total_frames=4"]) == 0
     return find_checkpoint(folder)[0]
 

@@ -5,11 +5,11 @@ import torch
 
 from maexp.agents import make_env, make_policy
 from maexp.agents.cli import main
-from maexp.agents.commands.evaluate import evaluate_all
+from maexp.agents.cli.evaluate import evaluate_all
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides
 from maexp.agents.errors import UserError
 from maexp.agents.policies.registry import find_named_policy
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training import train
 from maexp.envs import ExplorationEnv, RewardConfig, make_map
 
@@ -41,7 +41,7 @@ def same(first, second) -> None:
 
 
 def test_the_env_is_that_of_maexp_train(tmp_path):
-    cfg = compose_config("train", make_overrides("train", WORDS))
+    cfg = compose_settings("train", make_overrides("train", WORDS))
     run = train.TrainingRun.build(cfg, tmp_path, WORDS)
     (collector,) = run.experience.collectors
     env = make_env(*WORDS)
@@ -66,7 +66,7 @@ def test_maps_of_each_kind_and_the_settings_of_a_run(tmp_path, monkeypatch):
     assert (again.radar_configs[0].range, again.num_envs, again.num_robots) == (8.0, 3, 2)
     held_out = make_env("checkpoint=run", "num_envs=2", verb="evaluate")
     assert held_out.settings.reward == again.settings.reward and held_out.num_envs == 2
-    cfg = compose_config("evaluate", [*words, "policy=voronoi", "episodes=2"])
+    cfg = compose_settings("evaluate", [*words, "policy=voronoi", "episodes=2"])
     first, second = (
         evaluate_all(cfg, env, [find_named_policy("voronoi")], tmp_path / f"kept_{place}")[0].episodes["coverage_auc"]
         for place, env in enumerate((make_env(*words, verb="evaluate"), make_env(*words, split="held_out")))

@@ -10,7 +10,7 @@ from test_import_grids import write_ros
 from worlds import room
 
 from maexp.agents.cli import main
-from maexp.agents.commands.maps_folder import find_files
+from maexp.agents.cli.maps_folder import find_files
 from maexp.envs import PointCloudMap, import_map
 from maexp.envs.io import draw_import, import_map_with_report
 from maexp.envs.io.report import SHOWN_POINTS, ScannedPoints

@@ -12,15 +12,15 @@ from tensordict import TensorDict
 from maexp.agents import make_policy
 from maexp.agents.build import import_files, load_maps
 from maexp.agents.cli import main
-from maexp.agents.commands.evaluate import describe_episodes
+from maexp.agents.cli.evaluate import describe_episodes
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides, split_paths
 from maexp.agents.errors import UserError
 from maexp.agents.evaluation.comparison import describe_differences, describe_training, find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate, evaluate_recorded, play, pool
 from maexp.agents.evaluation.metric_format import Evidence, describe_evidence
 from maexp.agents.evaluation.results import COLUMNS, paired_differences, print_results
 from maexp.agents.policies import POLICIES
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides, split_paths
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.metrics import episode_metrics, in_reach, label_copies, resample_weights, summarise
 
@@ -196,7 +196,7 @@ def test_several_maps_of_ones_own_are_told_apart_and_pooled(tmp_path, monkeypatc
     ],
 )
 def test_episodes_are_called_held_out_where_they_are(words, wanted):
-    cfg = compose_config("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
+    cfg = compose_settings("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
     results = [EvaluationResult("random", 2, {"exploration_ratio": np.zeros(cfg.episodes)}, 1.0, np.array(["a"]))]
     assert describe_episodes(cfg.episodes, results, load_maps(cfg.scenario, train=False)) == wanted
 
@@ -389,7 +389,7 @@ def test_maps_of_several_scenarios_are_not_played_in_one_run(tmp_path):
     make_map("maze_small", 70).save(tmp_path / "a.npz")
     make_map("indoor_small", 70).save(tmp_path / "b.npz")
     words = [f"scenario.path={tmp_path}/a.npz,{tmp_path}/b.npz", *POINTCLOUD]
-    cfg = compose_config("evaluate", make_overrides("evaluate", words))
+    cfg = compose_settings("evaluate", make_overrides("evaluate", words))
     with pytest.raises(UserError, match="scenarios indoor_small and maze_small, .* a run of their own"):
         import_files(cfg.scenario)
 
@@ -398,9 +398,9 @@ def test_a_comma_in_a_files_name_and_two_maps_of_one_name(tmp_path):
     (tmp_path / "far").mkdir()
     for path in ("a,b.npz", "a.npz", "far/a.npz"):
         make_map("maze_small", 70).save(tmp_path / path)
-    comma = compose_config("evaluate", make_overrides("evaluate", [f"scenario.path={tmp_path}/a,b.npz", *POINTCLOUD]))
+    comma = compose_settings("evaluate", make_overrides("evaluate", [f"scenario.path={tmp_path}/a,b.npz", *POINTCLOUD]))
     assert [m.name for m in import_files(comma.scenario)] == ["maze_small_70"]
     words = [f"scenario.path={tmp_path}/a.npz,{tmp_path}/far/a.npz", *POINTCLOUD]
-    namesakes = compose_config("evaluate", make_overrides("evaluate", words))
+    namesakes = compose_settings("evaluate", make_overrides("evaluate", words))
     with pytest.raises(UserError, match="two maps called"):
         import_files(namesakes.scenario)

@@ -10,14 +10,13 @@ import pytest
 import torch
 from small_run import SMALL
 
-from maexp.agents.build import model_settings
 from maexp.agents.cli import main
+from maexp.agents.config.compose import compose_settings
 from maexp.agents.evaluation.cache import FOLDER, EpisodeCache, digest_weights, identify
 from maexp.agents.evaluation.evaluate import evaluate_recorded
 from maexp.agents.models.actor import make_policy
 from maexp.agents.policies import POLICIES
 from maexp.agents.progress import Progress
-from maexp.agents.settings.compose import compose_config
 from maexp.envs import ExplorationEnv, make_map
 
 pytestmark = pytest.mark.slow  # evaluations that are stopped
@@ -168,7 +167,7 @@ def test_damaged_batches_are_played_again(tmp_path):
 
 def test_batches_are_of_what_their_bits_follow_from(tmp_path):
     def settings(*words: str):
-        return compose_config("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
+        return compose_settings("evaluate", ["policy=random", "scenario.held_out=[70]", *words])
 
     cfg, env, policy = settings(), build(), POLICIES["random"]
     base = identify(cfg, env, 6, policy, "random")
@@ -193,7 +192,7 @@ def test_batches_are_of_what_their_bits_follow_from(tmp_path):
 
 def test_a_digest_changes_with_the_weights():
     env = build()
-    policy = make_policy(env, model_settings(compose_config("evaluate", ["policy=random", "action=regions"])))
+    policy = make_policy(env(compose_settings("evaluate", ["policy=random", "action=regions"])))
     before = digest_weights(policy)
     assert before == digest_weights(policy) != "" and digest_weights(POLICIES["random"]) == ""
     with torch.no_grad():

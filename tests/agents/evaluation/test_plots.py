@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from maexp.agents.commands.evaluate import draw_results
+from maexp.agents.cli.evaluate import draw_results
 from maexp.agents.evaluation import learning_curves, plots
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.evaluation.learning_curves import draw_curves

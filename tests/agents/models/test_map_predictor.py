@@ -13,6 +13,8 @@ from tools.predictor.beliefs import NEVER, BeliefConfig, BeliefEpisode
 from tools.predictor.export import Guess, predictor_to_onnx
 from tools.predictor.train import PredictorConfig
 
+from maexp.agents.config.env import map_indices
+from maexp.agents.config.groups import ScenarioSettings
 from maexp.agents.deploy.planner.bundle import CARD, WEIGHTS
 from maexp.agents.errors import UserError
 from maexp.agents.models.map_predictor import (
@@ -29,8 +31,6 @@ from maexp.agents.models.map_predictor import (
     predictor_names,
     sample_worlds,
 )
-from maexp.agents.settings.groups import ScenarioSettings
-from maexp.agents.settings.indices import map_indices
 from maexp.envs import make_map
 from maexp.envs.maps.nav_grid import build_nav_grid, open_cells
 

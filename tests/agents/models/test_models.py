@@ -10,10 +10,10 @@ from toy_env import ToyEnv
 
 from maexp.agents import ModelConfig, make_policy
 from maexp.agents.algorithms.registry import find_algorithm
+from maexp.agents.config.model import SIZES, model_config
 from maexp.agents.models.actor import CELLS, MAP
 from maexp.agents.models.critics import TEAM_VALUE, VALUE, build_critic
 from maexp.agents.models.encoder import STRIDE, add_rows, add_state, compact, pool_regions, resampling
-from maexp.agents.settings.model import SIZES, model_config
 from maexp.agents.training.collectors import make_collector
 
 PIXELS, SIDE = 29, 3

@@ -12,10 +12,10 @@ from mazes import OFFSET, REGION, make_env
 
 from maexp.agents import make_policy
 from maexp.agents.cli import main
+from maexp.agents.config.overrides import make_overrides
 from maexp.agents.errors import UserError
 from maexp.agents.policies.registry import NamedPolicy, find_named_policy, name_policies, policy_label, suit_observation
 from maexp.agents.policies.remote import user_policy
-from maexp.agents.settings.overrides import make_overrides
 from maexp.envs import ObservationConfig
 
 SMALL = ["scenario.held_out=[70,71]", "episodes=2", "num_envs=2", "scenario.macro_steps=2", "device=cpu"]
@@ -209,11 +209,11 @@ def policy(name: str, **shown) -> NamedPolicy:
 
 
 def test_an_env_shows_what_its_policies_look_at_and_no_more():
-    from maexp.agents.settings.compose import compose_config
+    from maexp.agents.config.compose import compose_settings
 
-    def suited(*policies, specs=()):
-        cfg = compose_config("evaluate", ["policy=random", *specs])
-        suit_observation(cfg, policies)
+    def suited(*players, words=()):
+        cfg = compose_settings("evaluate", ["policy=random", *words])
+        suit_observation(cfg, players)
         return cfg.observation.targets, cfg.observation.pictures, cfg.observation.map
 
     assert suited(policy("a")) == (0, False, "seen"), "pictures that nobody looks at"

@@ -6,11 +6,11 @@ import torch
 from torchrl.envs.utils import step_mdp
 from worlds import room
 
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.env import map_indices
 from maexp.agents.models.actor import TARGETS, TARGETS_MASK
 from maexp.agents.models.distributions import ACTION
 from maexp.agents.models.target_chooser import NEVER, SCORE
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.indices import map_indices
 from maexp.agents.training import branch_rollouts
 from maexp.agents.training.branch_rollouts import BranchRollouts, main, training_maps
 from maexp.envs import ExplorationEnv, ObservationConfig, make_map
@@ -77,7 +77,7 @@ def _goes_there(env: ExplorationEnv, team: int, robot: int, wanted: torch.Tensor
 
 def test_only_training_maps_are_played():
     for scenario in ("maze_small", "indoor_medium"):
-        indices, validation, held_out = map_indices(compose_config("train", [f"scenario={scenario}"]).scenario)
+        indices, validation, held_out = map_indices(compose_settings("train", [f"scenario={scenario}"]).scenario)
         assert training_maps(scenario) == indices
         assert not {*validation, *held_out} & {*training_maps(scenario)}
 

@@ -16,9 +16,9 @@ from metrics_file import read_metrics
 
 from maexp.agents.build import load_maps
 from maexp.agents.cli import main
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.overrides import make_overrides
 from maexp.agents.errors import UserError
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.overrides import make_overrides
 from maexp.agents.training.checkpoint import find_checkpoint
 from maexp.agents.training.collectors import Teams, WorkerLost, batch_statistics, divide_teams
 from maexp.agents.training.logs import tag
@@ -149,7 +149,7 @@ def make_experience():
 
     def make(*words: str):
         torch.manual_seed(0)
-        cfg = compose_config("train", make_overrides("train", [*TINY, *words]))
+        cfg = compose_settings("train", make_overrides("train", [*TINY, *words]))
         learner, experience = make_both(cfg, load_maps(cfg.scenario).train)
         made.append(experience)
         return learner, experience
@@ -281,7 +281,7 @@ def test_a_worker_that_cannot_start_is_reported(make_experience, monkeypatch):
 
 PROGRAM = """
 import sys
-from maexp.agents.commands import train
+from maexp.agents.cli import train
 train.draw_rollout = train.draw_curves = lambda *args: None
 from maexp.agents.cli import main
 if __name__ == "__main__":
@@ -417,7 +417,7 @@ def test_tensorboard_and_wandb_hold_the_numbers_of_metrics_csv(tmp_path, monkeyp
         pytest.skip("LOGGERS ABSENT: pip install -c constraints.txt 'maexp[tensorboard,wandb]' to test them")
     monkeypatch.chdir(tmp_path)
     for place in ("draw_rollout", "draw_curves"):
-        monkeypatch.setattr(f"maexp.agents.commands.train.{place}", lambda *args: None)
+        monkeypatch.setattr(f"maexp.agents.cli.train.{place}", lambda *args: None)
     words = [f"logger.backends=[{','.join(present)}]", "logger.mode=offline", "evaluate_every=1", "evaluate_episodes=2"]
     assert main(["train", *TINY, *words, "hydra.run.dir=run", f"total_frames={2 * BATCH}"]) == 0
     assert main(["train", "resume=run", f"total_frames={3 * BATCH}"]) == 0

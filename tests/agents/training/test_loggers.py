@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from maexp.agents.config.groups import LoggerSettings
 from maexp.agents.evaluation.results import COLUMNS
-from maexp.agents.settings.groups import LoggerSettings
 from maexp.agents.training.logs import MetricsLog, log_results
 
 

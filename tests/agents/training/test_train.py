@@ -13,8 +13,8 @@ from tiny_training import BATCH, CLOCKS, TINY, assert_same, assert_same_runs, re
 
 from maexp.agents.build import load_maps, make_env, other_scenarios, title_scenario
 from maexp.agents.cli import main
-from maexp.agents.commands.train import draw_rollout
-from maexp.agents.settings.compose import compose_config
+from maexp.agents.cli.train import draw_rollout
+from maexp.agents.config.compose import compose_settings
 from maexp.agents.training.checkpoint import find_checkpoint, list_checkpoints
 from maexp.agents.training.logs import MetricsLog
 from maexp.envs import make_map
@@ -81,7 +81,7 @@ def test_the_film_is_of_the_episode_that_stands_for_the_mean(monkeypatch):
         seen.update(episodes=episodes, caption=caption, columns=columns)
         return [np.zeros((8, 8, 3), dtype=np.uint8)]
 
-    monkeypatch.setattr("maexp.agents.commands.train.draw_rollout", film)
+    monkeypatch.setattr("maexp.agents.cli.train.draw_rollout", film)
     monkeypatch.setattr("maexp.agents.evaluation.video.draw_film", draw_film)
     run("run", 1, "episodes=5", "classical=[nearest_frontier]", "num_robots=2,3", "num_envs=6")
     known = {result.policy: result for result in seen["results"] if result.num_robots == 2}
@@ -101,7 +101,7 @@ def test_the_film_is_of_the_episode_that_stands_for_the_mean(monkeypatch):
 
 def test_a_metric_that_comes_late_is_an_error(tmp_path):
     """The first row's names are the columns of all; a run that goes on keeps those that are there."""
-    cfg = compose_config("train", []).logger
+    cfg = compose_settings("train", []).logger
     for kept in (0, 1):
         with closing(MetricsLog(tmp_path, cfg, kept=kept, frames=kept, config={})) as log:
             log.write({"iteration": kept + 1, "coverage": 0.5})
@@ -180,7 +180,7 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
 def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
     """The same places with shorter decisions, beside a map of the user's."""
     make_map("maze_small", 3).save(tmp_path / "mine.npz")
-    cfg = compose_config(
+    cfg = compose_settings(
         "train",
         [
             "scenario=maze_small",

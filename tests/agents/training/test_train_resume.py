@@ -56,7 +56,7 @@ def test_resumed_the_planners_need_not_play_again(monkeypatch, capsys):
 PROGRAM = """
 import sys, torch
 torch.set_num_threads(1)
-from maexp.agents.commands import train
+from maexp.agents.cli import train
 train.draw_rollout = train.draw_curves = lambda *args: None
 from maexp.agents.cli import main
 sys.exit(main(sys.argv[1:]))

@@ -11,6 +11,9 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from worlds import room
 
 from maexp.agents import make_policy
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.model import ModelConfig
+from maexp.agents.deploy.planner import TeamPlanner
 from maexp.agents.deploy.planner.bundle import read_contract
 from maexp.agents.errors import UserError
 from maexp.agents.models.actor import TARGETS, TARGETS_MASK
@@ -18,9 +21,6 @@ from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.policies.export import export_policy
 from maexp.agents.policies.lookahead import LookaheadPlanner
 from maexp.agents.policies.registry import find_named_policy, suit_observation
-from maexp.agents.runtime import TeamPlanner
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.imitation import widened
 from maexp.envs import CommConfig, ExplorationEnv, LookaheadConfig, ObservationConfig, PlannerConfig
 from maexp.envs.targets.features import FAR, FEATURES, RADIO_TABLE, feature_names
@@ -244,7 +244,7 @@ def test_exported_it_plays_on_here_and_planners_on_robots_ask_for_the_radios(tmp
         TeamPlanner(folder)
     with pytest.raises(UserError, match=r"add observation\.radio=true"):
         make_policy(str(folder), plain)
-    cfg = compose_config("evaluate", ["policy=cost_utility"])
+    cfg = compose_settings("evaluate", ["policy=cost_utility"])
     suit_observation(cfg, [find_named_policy("universal"), find_named_policy(str(folder))])
     assert cfg.observation.radio and cfg.observation.targets == COUNT
     config = LookaheadConfig(rollout_policy=str(folder), horizon=2, candidates=3)

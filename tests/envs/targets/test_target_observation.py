@@ -10,10 +10,10 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from worlds import ways_to_blocks
 
 from maexp.agents.algorithms.registry import find_algorithm
+from maexp.agents.config.model import ModelConfig
 from maexp.agents.models.actor import TARGETS, TARGETS_MASK, make_policy
 from maexp.agents.models.target_chooser import score_by_criteria
 from maexp.agents.policies.classical import CLASSICAL, FrontierPlanner
-from maexp.agents.settings.model import ModelConfig
 from maexp.agents.training.collectors import make_collector
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, PlannerConfig
 from maexp.envs.targets.features import FEATURES, feature_names

@@ -7,15 +7,14 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from maexp.agents.config.schema import default_values, make_settings
 from maexp.agents.errors import UserError
-from maexp.agents.settings.storable import storable
 
 
 def run(kind: type, work: Callable[[Any], None]) -> int:
     """Do `work` with the settings, a dataclass of `kind`, that the command line comes to; the exit status."""
     try:
-        words = OmegaConf.merge(OmegaConf.structured(storable(kind)), OmegaConf.from_cli())
-        work(kind(**vars(OmegaConf.to_object(words))))
+        work(make_settings(kind, default_values(kind) | OmegaConf.to_container(OmegaConf.from_cli())))
     except (OmegaConfBaseException, UserError, OSError, ValueError) as error:
         print(str(error).splitlines()[0], file=sys.stderr)
         return 1
