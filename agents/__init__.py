@@ -48,6 +48,7 @@ redirect_modules(
         "runtime.team": "deploy.planner.team",
         "runtime.ways": "deploy.planner.grid_search",
         "runtime.words": "deploy.planner.messages",
+        "settings": "config",
         "speed": "benchmarks.throughput",
         "suites": "benchmarks.suites",
     },
