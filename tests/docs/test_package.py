@@ -42,8 +42,8 @@ def test_imports_go_one_way():
 
 
 LAYERS = (
-    "deploy.planner config models algorithms policies evaluation training.checkpoint policies.registry training "
-    "deploy.irsim benchmarks deploy.ros2 cli runtime"
+    "deploy.planner config evaluation.metric_format models algorithms policies evaluation training.checkpoint "
+    "policies.registry training deploy.irsim benchmarks deploy.ros2 cli runtime"
 ).split()
 """Rooms of `agents/` from the bottom up; a module belongs to the longest name that fits."""
 
