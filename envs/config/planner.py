@@ -12,7 +12,7 @@ PLANNERS = {
     "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
     "direct": "none: the policy itself accelerates and steers",
 }
-CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (docs/log/2026-11-22-planner-constants.md)
+CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (docs/reports/planners.md)
 
 
 @dataclass(frozen=True)
