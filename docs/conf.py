@@ -6,7 +6,7 @@ from pathlib import Path
 project = "MAexp"
 release = metadata.version("maexp")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build", "log"]
+exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"MAexp {release}"
 html_static_path = ["static"]

@@ -11,7 +11,7 @@ has to say so.
 Each who looks has grids of its own, the local planner as well as a policy's `Navigation`: the list is of what has
 changed since it looked, and a policy that shared it would take from the planner what that has not seen. They look at
 different moments, and where both look at one, looking for what is new is most of the work
-(docs/log/2026-11-25-one-fact.md).
+(docs/reports/conditions.md).
 """
 
 import warp as wp

@@ -5,7 +5,7 @@ up, the distance from the robot is searched over cells not known to be blocked u
 unknown cells count as passable, tight ones (near obstacles) as a detour. A goal inside an obstacle or out of
 reach is replaced by the reached cell nearest to it. Every local step the waypoint becomes the farthest cell of
 the path that is in the robot's radar range and in sight, drawn nearer where the robot could not brake in time.
-`COMFORT`, `CREEP` and `HEADROOM` are tuned: docs/log/2026-11-22-planner-constants.md.
+`COMFORT`, `CREEP` and `HEADROOM` are tuned: docs/reports/planners.md.
 
 A path holds its first `PATH_CELLS` cells only; the search is repeated long before a robot gets there. What is
 held never outlives a macro step: a new goal always searches anew.

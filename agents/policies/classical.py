@@ -5,7 +5,7 @@ All but `random` look into the env: what the team knows as a grid, its frontiers
 every robot to every target. They differ in which targets each robot likes best (`envs/targets/heuristics.py`). That the
 robots of a team go to different ones, and how a target is approached, they share (`envs/targets/tracker.py`).
 
-Sources: docs/planners.md. Tuning: docs/log/2026-11-22-planner-constants.md.
+Sources: docs/planners.md. Tuning: docs/reports/planners.md.
 """
 
 from __future__ import annotations

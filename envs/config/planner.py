@@ -9,12 +9,12 @@ from maexp.envs.config.group import Group
 from maexp.envs.config_fields import setting
 from maexp.envs.scenarios import Scenario
 
-
-@cache
-def clearance_factors() -> dict[str, float]:
-    """The clearance factors of the planners that have one of their own."""
-    choices = [read_choice("planner", name) for name in list_choices("planner")]
-    return {values["name"]: factor for values in choices if (factor := values.get("clearance_factor"))}
+PLANNERS = {
+    "dwa": "dynamic window: straight to the goal, around what is near (paper)",
+    "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
+    "direct": "none: the policy itself accelerates and steers",
+}
+CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (docs/reports/planners.md)
 
 
 @dataclass(frozen=True)

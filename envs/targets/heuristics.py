@@ -24,7 +24,7 @@ REPULSION = 1.0  # potential_field: push of a robot one radar range away, in pul
 WAY_AHEAD = 3.0  # cells from a robot to the point that tells where its way begins
 FAR = 1e5  # longer than any way [m]: puts targets that a robot takes for want of better ones behind all others
 
-# Weights of multi_criteria, in discs of unknown cells (docs/log/2026-11-25-planner-weights.md).
+# Weights of multi_criteria, in discs of unknown cells (docs/reports/planners.md).
 WAY = 0.2  # taken off for log(1 + radar ranges of travel): the first metres of a way count most
 BEYOND = 0.3  # for each radar range from the target to the middle of what is to be seen: open ground before corners
 APART = 0.06  # for each radar range to the nearest target that another robot wants

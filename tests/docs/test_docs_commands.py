@@ -24,8 +24,8 @@ from maexp.envs.io.report import ImportReport
 
 HAS_ONNX = all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript", "safetensors"))
 HAS_BAGS = importlib.util.find_spec("rosbags") is not None
-LOG = ROOT / "docs" / "log"  # what was run once, with the code of its day
-PAGES = [*(page for page in sorted((ROOT / "docs").rglob("*.md")) if LOG not in page.parents), ROOT / "README.md"]
+REPORTS = ROOT / "docs" / "reports"  # what was run once, with the code of its day
+PAGES = [*(page for page in sorted((ROOT / "docs").rglob("*.md")) if REPORTS not in page.parents), ROOT / "README.md"]
 PLACES = ("scenario.macro_steps=2", "scenario.local_steps=3", "num_envs=3", "device=cpu")
 OWN_MAPS = ("scenario.maps=[0]", "scenario.held_out=[1]")
 SMALLER = {  # verb -> what makes it small, last and so stronger

@@ -1,4 +1,4 @@
-"""How the weights of `multi_criteria` were found (docs/log/2026-11-25-planner-weights.md).
+"""How the weights of `multi_criteria` were found (docs/reports/planners.md).
 
     python tests/tools/criteria_weights.py imitate
     python tests/tools/criteria_weights.py play indoor_medium 240 WAY=0.24 WAY=0.32 APART=0.1

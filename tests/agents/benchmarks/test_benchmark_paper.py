@@ -1,4 +1,4 @@
-"""The paper's Table II in the benchmark, and its slips in docs/log, against the paper's own source."""
+"""The paper's Table II in the benchmark, and its slips in docs/reports, against the paper's own source."""
 
 import os
 import re
@@ -60,7 +60,7 @@ def paper_best(scenario: str, metric: str) -> set[str]:
 
 
 def paper_page() -> str:
-    return (ROOT / "docs" / "log" / "2026-11-22-paper-slips.md").read_text()
+    return (ROOT / "docs" / "reports" / "paper.md").read_text()
 
 
 def test_the_slips_that_the_log_lists_are_the_papers_bold_against_its_numbers():

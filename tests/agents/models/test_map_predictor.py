@@ -309,7 +309,7 @@ def test_histograms_are_the_shares_of_free_cells():
 
 
 def test_the_predictor_beats_distance_where_nobody_trained(played):
-    """On two validation maps; the guesses are those of docs/log."""
+    """On two validation maps; the guesses are those of docs/reports/lookahead.md."""
     episodes, loss = [beliefs.until_covered(episode) for episode in played], {}
     for guess in (predict, predict_by_distance):
         cells = score.look_at(episodes, 3, lambda known, guess=guess: guess(as_batch(known))[0].numpy())
