@@ -1,10 +1,8 @@
 """Local planners: how robots drive to their goals."""
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal
 
-from maexp.conf import list_choices, read_choice
 from maexp.envs.config.group import Group
 from maexp.envs.config_fields import setting
 from maexp.envs.scenarios import Scenario
