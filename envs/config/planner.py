@@ -1,18 +1,20 @@
 """Local planners: how robots drive to their goals."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
+from maexp.conf import list_choices, read_choice
 from maexp.envs.config.group import Group
 from maexp.envs.config_fields import setting
 from maexp.envs.scenarios import Scenario
 
-PLANNERS = {
-    "dwa": "dynamic window: straight to the goal, around what is near (paper)",
-    "wavefront": "shortest way through the known map to a waypoint in sight, driven there by dwa",
-    "direct": "none: the policy itself accelerates and steers",
-}
-CLEARANCE = {"wavefront": 2.0, "dwa": 3.0}  # clearance factors (docs/reports/planners.md)
+
+@cache
+def clearance_factors() -> dict[str, float]:
+    """The clearance factors of the planners that have one of their own."""
+    choices = [read_choice("planner", name) for name in list_choices("planner")]
+    return {values["name"]: factor for values in choices if (factor := values.get("clearance_factor"))}
 
 
 @dataclass(frozen=True)
