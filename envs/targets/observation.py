@@ -125,7 +125,7 @@ class TargetView:
         speed, at = tracker.speed(nav), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
         left = 1.0 - nav.state["macro_step"].float() / env.macro_steps
-        cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
+        cells = nav.known_count.float() * nav.cell_of_env().unsqueeze(-1) ** 2
         return Moment(
             xp=torch,
             reach=reach,
