@@ -1,7 +1,8 @@
 """Settings of the seven algorithms: types, ranges, defaults and those of the original platform."""
 
+import math
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from maexp.envs.config.env import Knower
 from maexp.envs.config_fields import check_settings, replaced, setting
@@ -11,11 +12,23 @@ from maexp.envs.config_fields import check_settings, replaced, setting
 class AlgorithmSettings:
     """Settings that all algorithms share. A team step is one macro step of one team.
 
-    ValueError where one is out of its range (all subclasses).
+    Horizons are in seconds, so that they do not depend on how often robots decide; `at_pace` turns them into discounts
+    per decision. ValueError where one is out of its range (all subclasses).
     """
 
-    gamma: float = setting(0.99, "discount per macro step", low=0, high=1)
-    lmbda: float = setting(0.95, "trace decay of the generalised advantages", low=0, high=1)
+    horizon_seconds: float = setting(200.0, "rewards so much later count 1 / e [s]", above=0)
+    trace_seconds: float = setting(40.0, "generalised advantages trust rewards, not values, about so long [s]", above=0)
+    gamma: float | None = setting(None, "discount per macro step; default: from horizon_seconds", low=0, high=1)
+    lmbda: float | None = setting(
+        None, "trace decay of the generalised advantages per macro step; default: from trace_seconds", low=0, high=1
+    )
+    learn_share: float | None = setting(
+        None,
+        "share of the batch, drawn anew for each pass, that is learned from; default: less where decisions come faster "
+        "than in the scenario's own protocol, so that gradient steps per simulated second stay the same",
+        above=0,
+        high=1,
+    )
     finite_horizon: bool = setting(
         True, "an episode that ran out of time is over: nothing that would come after it counts"
     )
@@ -43,8 +56,23 @@ class AlgorithmSettings:
     def __post_init__(self):
         check_settings(self, "algorithm")
 
+    def at_pace(self, seconds: float = 1.0, protocol_seconds: float | None = None) -> Self:
+        """With discounts and the share that is learned from, where none are set, for one pace.
+
+        Args:
+            seconds: from decision to decision [s]
+            protocol_seconds: the same in the scenario's own protocol [s]; None: as here
+        """
+        share = min(1.0, seconds / (protocol_seconds or seconds))
+        found = {
+            "gamma": math.exp(-seconds / self.horizon_seconds),
+            "lmbda": math.exp(-seconds / self.trace_seconds),
+            "learn_share": share,
+        }
+        return replace(self, **{name: value for name, value in found.items() if getattr(self, name) is None})
+
     def loss_arguments(self) -> dict:
-        """What the loss's constructor takes from these settings."""
+        """What the loss's constructor takes from these settings (`at_pace`)."""
         names = ("gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage")
         names += ("mask_collided",)
         return {name: getattr(self, name) for name in names}
@@ -73,7 +101,7 @@ class MixedClippedSettings(ClippedSettings):
     The advantage is the team's, with the noise of all robots in it: a shorter trace learned faster.
     """
 
-    lmbda: float = replaced(AlgorithmSettings, "lmbda", 0.8)
+    trace_seconds: float = replaced(AlgorithmSettings, "trace_seconds", 10.0)
     mixer: Literal["qmix", "vdn"] = setting("qmix", "how the robots' values make the team's, vdn or qmix")
 
 
@@ -100,7 +128,7 @@ class ActorCriticSettings(AlgorithmSettings):
     step, so the learning rate must fall: at a constant one steps grow as the policy narrows.
     """
 
-    lmbda: float = replaced(AlgorithmSettings, "lmbda", 0.8)
+    trace_seconds: float = replaced(AlgorithmSettings, "trace_seconds", 10.0)
     lr: float = replaced(AlgorithmSettings, "lr", 2e-3)
     final_lr_share: float = replaced(AlgorithmSettings, "final_lr_share", 0.1)
     entropy_coeff: float = replaced(AlgorithmSettings, "entropy_coeff", 5e-4)
@@ -132,8 +160,11 @@ class ExpertSettings(AlgorithmSettings):
     )
 
     unused: ClassVar[tuple[str, ...]] = (
+        "horizon_seconds",
+        "trace_seconds",
         "gamma",
         "lmbda",
+        "learn_share",
         "finite_horizon",
         "critic_lr",
         "entropy_coeff",
@@ -147,7 +178,7 @@ class ExpertSettings(AlgorithmSettings):
 
 def _reference(settings: AlgorithmSettings, **others) -> AlgorithmSettings:
     """The original platform's settings (MARLlib's), where they differ from `settings`."""
-    shared = dict(lmbda=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
+    shared = dict(gamma=0.99, lmbda=1.0, learn_share=1.0, entropy_coeff=1e-3, value_norm=False, final_lr_share=1.0)
     shared |= dict(finite_horizon=False, mask_collided=False)
     return replace(settings, **shared, **others)
 

@@ -18,6 +18,7 @@ from maexp.agents.settings.storable import helps, read
 from maexp.envs.config import GROUPS, PlannerConfig, RadarConfig
 from maexp.envs.io.options import ImportOptions
 from maexp.envs.scenarios import Scenario, find_scenario
+from maexp.kernels.constants import DT
 
 PLANNER_LACKS = {
     "direct": [field.name for field in fields(PlannerConfig) if field.name != "name"],
@@ -110,9 +111,11 @@ def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:
 
 
 def algorithm_settings(cfg: LearnerSettings) -> AlgorithmSettings:
-    """The settings of the algorithm."""
+    """The settings of the algorithm, at the pace of the scenario."""
     given = {name: value for name, value in cfg.algorithm.items() if name != "name" and value is not None}
-    return find_tunings(cfg.algorithm.name).configure(**given)
+    row, steps = find_scenario(cfg.scenario.name), cfg.scenario.local_steps
+    pace = DT * (steps or row.local_steps), DT * row.local_steps
+    return find_tunings(cfg.algorithm.name).configure(**given).at_pace(*pace)
 
 
 def model_settings(cfg: LearnerSettings) -> ModelConfig:

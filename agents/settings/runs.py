@@ -59,7 +59,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         leave_out: settings of the run that do not matter here
     """
     known = schema(verb).__dataclass_fields__
-    values = flatten(saved["settings"])
+    values = {"algorithm.learn_share": 1.0} | flatten(saved["settings"])  # runs from before that was a setting
     for name in ("preset", "tuning"):
         if choice := find_override(new, name):
             raise UserError(
