@@ -220,7 +220,8 @@ def _check_entry(entry: Any) -> None:
 
 def _with_scenario(cfg: DictConfig, words: DictConfig, entry: dict[str, Any]) -> DictConfig:
     other = copy.deepcopy(cfg)
-    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED):
+    supplied = [name for name in SUPPLIED if name != "decision_seconds"]  # one pace for all, where it is set
+    for setting in ("also", "path", "maps", "validation", "held_out", "held_out_count", *supplied):
         other.scenario[setting] = None
     for setting, value in entry.items():
         try:

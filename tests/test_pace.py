@@ -9,7 +9,11 @@ from tensordict import TensorDict
 from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.settings.algorithms import TUNINGS
 from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.resolved import algorithm_settings
+from maexp.agents.settings.env import decision_steps, episode_decisions
+from maexp.agents.settings.resolved import algorithm_settings, resolve
+from maexp.agents.settings.runs import continue_run
+from maexp.envs import ExplorationEnv, make_map
+from maexp.envs.scenarios import find_scenario
 
 
 @pytest.mark.parametrize("seconds", [0.5, 1.0, 4.0])
@@ -46,3 +50,87 @@ def test_a_pass_takes_its_share_of_the_minibatches(share, count):
     for own, size in zip(zip(*parts, strict=True), (8, 2), strict=True):
         numbers = torch.cat([part["number"] for part in own])
         assert len(numbers) == count * size and len(numbers.unique()) == len(numbers)
+
+
+@pytest.fixture(scope="module")
+def office():
+    return make_map("indoor_small", 0)
+
+
+@pytest.mark.parametrize("seconds, steps, decisions", [(1.0, 10, 60), (2, 20, 30), (0.5, 5, 120), ("protocol", 40, 15)])
+def test_an_episode_lasts_as_long_at_every_pace(office, seconds, steps, decisions):
+    env = ExplorationEnv(office, 1, decision_seconds=seconds)
+    assert (env.local_steps, env.macro_steps) == (steps, decisions)
+    assert env.lookahead_config.local_steps == 40  # imagined decisions do not change with the pace
+
+
+def test_local_steps_win_and_keep_the_number_of_decisions(office):
+    env = ExplorationEnv(office, 1, local_steps=7)
+    assert (env.local_steps, env.macro_steps, env.lookahead_config.local_steps) == (7, 15, None)
+
+
+@pytest.mark.parametrize(
+    "settings, words",
+    [
+        ({"local_steps": 10, "decision_seconds": 1.0}, ["local_steps=10", "decision_seconds=1.0", "give one"]),
+        ({"decision_seconds": 0.25}, ["decision_seconds=0.25", "0.1 s", "protocol"]),
+        ({"decision_seconds": 0.0}, ["decision_seconds=0.0"]),
+        ({"decision_seconds": "often"}, ["decision_seconds='often'", "protocol"]),
+    ],
+)
+def test_a_pace_that_is_none_is_refused(office, settings, words):
+    with pytest.raises(ValueError) as caught:
+        ExplorationEnv(office, 1, **settings)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_a_decision_of_many_steps_is_several_of_few(office):
+    """The same goals held for as long: the same episode, whatever the pace."""
+    slow, fast = (ExplorationEnv(office, 2, num_robots=2, seed=3, decision_seconds=s, num_threads=1) for s in (2, 1))
+    goals = torch.tensor(office.free[[0, -1], :2]).float().expand(2, 2, 2)
+    ends = []
+    for env, count in ((slow, 1), (fast, 2)):
+        state = env.reset()
+        for _ in range(count):
+            state["agents", "action", "goal"] = goals
+            state = env.step(state)["next"]
+        ends.append((state["info", "local_steps"], state["agents", "observation", "time_left"]))
+    assert torch.equal(ends[0][0], ends[1][0]) and torch.allclose(ends[0][1], ends[1][1])
+
+
+def compose(*words: str):
+    return compose_config("train", ["algorithm=mappo", "scenario=indoor_medium", *words])
+
+
+def test_a_run_stores_its_pace_as_steps():
+    scenario = resolve(compose("scenario.decision_seconds=2"))["scenario"]
+    assert (scenario["local_steps"], scenario["macro_steps"]) == (20, 30)
+    assert "decision_seconds" not in scenario
+
+
+def pace(cfg) -> tuple[int, int]:
+    row = find_scenario(cfg.scenario.name)
+    return decision_steps(cfg.scenario, row), episode_decisions(cfg.scenario, row)
+
+
+@pytest.mark.parametrize(
+    "run, new, wanted",
+    [
+        (["scenario.decision_seconds=2"], [], (20, 30)),
+        (["scenario.decision_seconds=2"], ["scenario.local_steps=5"], (5, 30)),
+        (["scenario.decision_seconds=2"], ["scenario.decision_seconds=0.5"], (5, 120)),
+        (["scenario.local_steps=5"], ["scenario.decision_seconds=0.5", "scenario.macro_steps=7"], (5, 7)),
+        (["scenario.local_steps=8"], [], (8, 15)),
+        (["scenario.decision_seconds=2"], ["scenario=maze_small"], (20, 15)),
+    ],
+)
+def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):
+    from maexp.agents.settings.compose import compose_recipe
+    from maexp.agents.settings.env import find_followers
+
+    words = ["algorithm=mappo", "scenario=indoor_medium", *run]
+    cfg = compose_config("train", words)
+    saved = {"settings": resolve(cfg), "overrides": words, "followers": find_followers(cfg)}
+    for verb in ("train", "evaluate"):
+        again = compose_recipe(verb, continue_run(tmp_path, saved, new, verb))
+        assert pace(again) == wanted

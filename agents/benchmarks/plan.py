@@ -17,6 +17,7 @@ from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.registry import NamedPolicy, check_planner, find_player, name_players
 from maexp.agents.settings.checks import check_distinct, check_seed
 from maexp.agents.settings.compose import compose_config
+from maexp.agents.settings.env import episode_decisions
 from maexp.agents.settings.overrides import quote
 from maexp.agents.settings.resolved import flatten, plain, without_hydra
 from maexp.agents.settings.verbs import BenchmarkSettings, TrainSettings
@@ -262,7 +263,7 @@ def length_of(cfg: BenchmarkSettings, cell: Cell) -> dict[str, Any]:
     """For `iterations`: each collects one whole episode of every team."""
     if cfg.iterations is None:
         return {}
-    steps = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps
+    steps = episode_decisions(cfg.scenario, find_scenario(cell.scenario))
     if steps is None:
         raise UserError(f"iterations={cfg.iterations} are of whole episodes: set scenario.macro_steps too.")
     return {"collector.steps": steps, "total_frames": cfg.iterations * cfg.num_envs * steps}

@@ -6,7 +6,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from maexp.agents.errors import UserError
-from maexp.agents.settings.groups import CommonSettings, read_free_groups
+from maexp.agents.settings.groups import PACE, CommonSettings, ScenarioSettings, read_free_groups
 from maexp.agents.settings.storable import read
 from maexp.envs.config import BODY, GROUPS, EnvSettings, PlannerConfig, RadarConfig, RobotConfig, supplied
 from maexp.envs.scenarios import Scenario
@@ -15,7 +15,7 @@ from maexp.envs.scenarios import Scenario
 def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int) -> EnvSettings:
     """The settings of an env on maps of a scenario, as far as they are known without the machine: no device."""
     robot, radar = team_configs(cfg, num_robots)
-    same = ("local_steps", "macro_steps", "collision", "success_coverage", "done")
+    same = (*PACE, "collision", "success_coverage", "done")
     return EnvSettings(
         num_envs=cfg.num_envs,
         num_robots=num_robots,
@@ -27,6 +27,16 @@ def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int) -> EnvSett
         **{name: cfg.scenario[name] for name in same},
         **read_free_groups(cfg),
     )
+
+
+def decision_steps(scenario: ScenarioSettings, row: Scenario) -> int:
+    """Control steps from decision to decision."""
+    return row.decision_steps(scenario.local_steps, scenario.decision_seconds)
+
+
+def episode_decisions(scenario: ScenarioSettings, row: Scenario) -> int | None:
+    """Decisions of an episode; None: that depends on the map."""
+    return scenario.macro_steps or row.episode_decisions(scenario.local_steps, decision_steps(scenario, row))
 
 
 def team_configs(

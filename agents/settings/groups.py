@@ -22,6 +22,8 @@ AlgorithmSettings = optional_settings(*{type(row.default): None for row in TUNIN
 ImportSettings = storable(ImportOptions)
 SUPPLIED = tuple(setting.name for setting in fields(Scenario) if setting.metadata.get("help"))
 """What a scenario's row supplies; null: what the map's own scenario says."""
+PACE = ("decision_seconds", "local_steps", "macro_steps")
+"""Of these what is not set follows from what is (`Scenario.decision_steps`)."""
 
 
 def import_settings(**references: str) -> Any:
@@ -55,6 +57,7 @@ class ScenarioSettings(optional_settings(Scenario)):
     starts: str = setting(
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
     )
+    decision_seconds: Any = same(EnvSettings, "decision_seconds")
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: str = same(EnvSettings, "done")
     collision: str = same(EnvSettings, "collision")

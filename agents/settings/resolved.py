@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from maexp.agents.settings.algorithms import AlgorithmSettings, find_tunings
 from maexp.agents.settings.checks import team_sizes
 from maexp.agents.settings.comments import with_comments
-from maexp.agents.settings.env import env_settings, robot_config
+from maexp.agents.settings.env import decision_steps, env_settings, episode_decisions, robot_config
 from maexp.agents.settings.groups import CommonSettings, LearnerSettings, ScenarioSettings, read_free_groups
 from maexp.agents.settings.indices import map_indices
 from maexp.agents.settings.model import ModelConfig
@@ -75,8 +75,8 @@ def resolve(cfg: DictConfig, maps: list | None = None) -> dict[str, Any]:
 
 
 def _resolve_scenario(scenario: ScenarioSettings, row: Scenario) -> dict[str, Any]:
-    settings = {"local_steps": scenario.local_steps or row.local_steps}
-    settings["macro_steps"] = scenario.macro_steps or row.macro_steps
+    settings = {"local_steps": decision_steps(scenario, row), "decision_seconds": None}  # one of the two says it
+    settings["macro_steps"] = episode_decisions(scenario, row)
     if find_scenario(scenario.name).build is None:
         return settings | {"importing": asdict(read(ImportOptions, scenario.importing, robot_radius=None))}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
@@ -113,8 +113,8 @@ def _own_planner(planner: dict[str, Any]) -> dict[str, Any]:
 def algorithm_settings(cfg: LearnerSettings) -> AlgorithmSettings:
     """The settings of the algorithm, at the pace of the scenario."""
     given = {name: value for name, value in cfg.algorithm.items() if name != "name" and value is not None}
-    row, steps = find_scenario(cfg.scenario.name), cfg.scenario.local_steps
-    pace = DT * (steps or row.local_steps), DT * row.local_steps
+    row = find_scenario(cfg.scenario.name)
+    pace = [DT * steps for steps in (decision_steps(cfg.scenario, row), row.local_steps)]
     return find_tunings(cfg.algorithm.name).configure(**given).at_pace(*pace)
 
 

@@ -7,7 +7,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from maexp.agents.settings.algorithms import TUNINGS
-from maexp.agents.settings.groups import SUPPLIED
+from maexp.agents.settings.groups import PACE, SUPPLIED
 from maexp.agents.settings.model import SIZES, SUMMARIES
 from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import CLEARANCE, PLANNERS
@@ -74,4 +74,4 @@ def _place(row: Scenario) -> dict[str, Any]:
     """What a scenario's row supplies; of a map of one's own that is known when it is read."""
     if row.build is None:
         return {"name": row.name, "path": MISSING}
-    return {"name": row.name} | {name: getattr(row, name) for name in SUPPLIED}
+    return {"name": row.name} | {name: getattr(row, name) for name in SUPPLIED if name not in PACE}
