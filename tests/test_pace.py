@@ -64,8 +64,9 @@ def test_an_episode_lasts_as_long_at_every_pace(office, seconds, steps, decision
     assert env.lookahead_config.local_steps == 40  # imagined decisions do not change with the pace
 
 
-def test_local_steps_win_and_keep_the_number_of_decisions(office):
-    env = ExplorationEnv(office, 1, local_steps=7)
+@pytest.mark.parametrize("seconds", [None, "protocol"])
+def test_local_steps_win_and_keep_the_number_of_decisions(office, seconds):
+    env = ExplorationEnv(office, 1, local_steps=7, decision_seconds=seconds)
     assert (env.local_steps, env.macro_steps, env.lookahead_config.local_steps) == (7, 15, None)
 
 
@@ -96,6 +97,9 @@ def test_a_decision_of_many_steps_is_several_of_few(office):
             state = env.step(state)["next"]
         ends.append((state["info", "local_steps"], state["agents", "observation", "time_left"]))
     assert torch.equal(ends[0][0], ends[1][0]) and torch.allclose(ends[0][1], ends[1][1])
+
+
+IR2 = ["algorithm=mappo", "scenario=ir2", "scenario.path=plan.png"]
 
 
 def compose(*words: str):
@@ -134,3 +138,10 @@ def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):
     for verb in ("train", "evaluate"):
         again = compose_recipe(verb, continue_run(tmp_path, saved, new, verb))
         assert pace(again) == wanted
+
+
+@pytest.mark.parametrize("verb, words", [("train", ["preset=paper"]), ("bench", ["task=env"]), ("train", IR2)])
+def test_protocols_and_throughput_keep_their_pace(verb, words):
+    cfg = compose_config(verb, words)
+    row = find_scenario(cfg.scenario.name)
+    assert pace(cfg) == (row.local_steps, row.macro_steps)

@@ -15,7 +15,7 @@ from maexp.envs.config.reward import RewardConfig
 from maexp.envs.config.robot import RobotConfig
 from maexp.envs.config.targets import TargetsConfig
 from maexp.envs.config_fields import setting, words_of
-from maexp.envs.scenarios import Scenario, default_macro_steps
+from maexp.envs.scenarios.table import PROTOCOL, Scenario, default_macro_steps
 
 if TYPE_CHECKING:
     from maexp.envs.maps.point_cloud import PointCloudMap
@@ -91,7 +91,7 @@ class EnvSettings:
         Raises:
             ValueError: a value of a group is out of its range (named), or two settings say how often robots decide.
         """
-        if self.local_steps is not None and self.decision_seconds is not None:
+        if self.local_steps is not None and self.decision_seconds not in (None, PROTOCOL):
             raise ValueError(
                 f"local_steps={self.local_steps} and decision_seconds={self.decision_seconds} both say how often "
                 "robots decide: give one of them"
