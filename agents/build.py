@@ -259,4 +259,7 @@ def make_learner(cfg: LearnerSettings, env: ExplorationEnv) -> Learner:
     row = find_algorithm(cfg.algorithm.name, TRAININGS)
     settings, model = algorithm_settings(cfg), model_settings(cfg)
     policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
-    return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))
+    loss = row.make_loss(policy, critic, settings)
+    if env.settings.decide == "arrival":
+        loss.decision_steps = env.local_steps
+    return Learner(policy, critic, row.make_updater(loss, settings))

@@ -19,7 +19,7 @@ from torch import Tensor
 from maexp.agents.algorithms.gae import look, write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.models.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
+from maexp.agents.models.actor import ALIVE, CELLS, COMM, DECIDING, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
 from maexp.agents.models.encoder import compact, pools_pictures
 
 Task = Callable[[], Any]
@@ -145,7 +145,7 @@ class Updater:
         self._calibrate(batch)
         needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
         needed += [keys.advantage, keys.value_target, keys.value, *keys.action]
-        needed += [key for key in (ALIVE, PARAMS, *keys.sample_log_prob) if key in batch.keys(True)]
+        needed += [key for key in (ALIVE, DECIDING, PARAMS, *keys.sample_log_prob) if key in batch.keys(True)]
         return self._add_anchor(batch.select(*needed).flatten())
 
     def set_anchor(self) -> None:

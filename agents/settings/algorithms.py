@@ -7,6 +7,8 @@ from typing import ClassVar, Literal, Self
 from maexp.envs.config.env import Knower
 from maexp.envs.config_fields import check_settings, replaced, setting
 
+BRANCH_SHARE = 0.5
+
 
 @dataclass(frozen=True)
 class AlgorithmSettings:
@@ -147,7 +149,13 @@ class ExpertSettings(AlgorithmSettings):
     branch_horizon: int = setting(
         4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
     )
-    branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
+    branch_share: float | None = setting(
+        None,
+        "share of the teams' decisions that are branched at; default: 0.5 at the pace of the scenario's protocol, less "
+        "where decisions come faster",
+        low=0.01,
+        high=1,
+    )
     learn_from: Knower = setting(
         "union",
         "whose knowledge a branch is worth: the team's, the base station's, or that of the robot that knows least",
@@ -158,6 +166,11 @@ class ExpertSettings(AlgorithmSettings):
     begin_from: str | None = setting(
         None, "run of expert iteration whose policy and branched decisions this one begins with, on whatever scenarios"
     )
+
+    def at_pace(self, seconds: float = 1.0, protocol_seconds: float | None = None) -> Self:
+        found = super().at_pace(seconds, protocol_seconds)
+        share = BRANCH_SHARE * min(1.0, seconds / (protocol_seconds or seconds))
+        return found if found.branch_share is not None else replace(found, branch_share=max(0.01, share))
 
     unused: ClassVar[tuple[str, ...]] = (
         "horizon_seconds",

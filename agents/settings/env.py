@@ -15,7 +15,7 @@ from maexp.envs.scenarios import Scenario
 def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int) -> EnvSettings:
     """The settings of an env on maps of a scenario, as far as they are known without the machine: no device."""
     robot, radar = team_configs(cfg, num_robots)
-    same = (*PACE, "collision", "success_coverage", "done")
+    same = (*PACE, "decide", "collision", "success_coverage", "done")
     return EnvSettings(
         num_envs=cfg.num_envs,
         num_robots=num_robots,
@@ -31,7 +31,7 @@ def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int) -> EnvSett
 
 def decision_steps(scenario: ScenarioSettings, row: Scenario) -> int:
     """Control steps from decision to decision."""
-    return row.decision_steps(scenario.local_steps, scenario.decision_seconds)
+    return row.decision_steps(scenario.local_steps, scenario.decision_seconds, scenario.decide)
 
 
 def episode_decisions(scenario: ScenarioSettings, row: Scenario) -> int | None:
@@ -90,6 +90,7 @@ def find_followers(cfg: DictConfig) -> list[str]:
     names = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
     for group, kind in GROUPS.items():
         names += [f"{group}.{name}" for name in supplied(kind)]
+    names.append("lookahead.local_steps")
     found = [name for name in names if _follows(cfg, *name.split("."))]
     return found + ["robot.team"] * bool(cfg.robot.team)
 

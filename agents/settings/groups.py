@@ -58,6 +58,7 @@ class ScenarioSettings(optional_settings(Scenario)):
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
     )
     decision_seconds: Any = same(EnvSettings, "decision_seconds")
+    decide: str = same(EnvSettings, "decide")
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: str = same(EnvSettings, "done")
     collision: str = same(EnvSettings, "collision")

@@ -89,6 +89,11 @@ def check_expert(cfg: TrainSettings) -> None:
         return
     if model_settings(cfg).action != "targets" or cfg.planner.name == "direct":
         raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
+    if cfg.scenario.decide == "arrival":
+        raise UserError(
+            "scenario.decide=arrival: algorithm=expert_iteration branches at decisions of whole teams. Add "
+            "algorithm=mappo, or leave that out."
+        )
     if cfg.tuning == "reference":
         raise UserError("tuning=reference: the original platform has no algorithm=expert_iteration. Leave tuning out.")
     if cfg.collector.backend != "single":

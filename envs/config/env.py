@@ -77,6 +77,11 @@ class EnvSettings:
         unit="s",
         above=0,
     )
+    decide: Literal["together", "arrival"] = setting(
+        "together",
+        "when: together, all robots at once; or arrival: each when it has arrived or its target is explored or taken, "
+        "and all after decision_seconds at the latest",
+    )
     first_env: int = setting(
         0, "number of the first env in the random keys, where processes share one batch of envs", low=0
     )
@@ -102,7 +107,7 @@ class EnvSettings:
         )
         others = {name: kind for name, kind in GROUPS.items() if name not in ("robot", "radar")}
         groups: dict[str, Any] = {name: one_config(name, getattr(self, name), kind) for name, kind in others.items()}
-        local_steps = scenario.decision_steps(self.local_steps, self.decision_seconds)
+        local_steps = scenario.decision_steps(self.local_steps, self.decision_seconds, self.decide)
         macro_steps = self.macro_steps
         if macro_steps is None:
             macro_steps = scenario.episode_decisions(self.local_steps, local_steps)
@@ -110,9 +115,8 @@ class EnvSettings:
             team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
             macro_steps = default_macro_steps(maps, scenario, team, local_steps)
         groups = {name: group.completed(scenario) for name, group in groups.items()}
-        if self.local_steps is None and groups["lookahead"].local_steps is None:
-            # An imagined decision lasts as long at every pace: of 1 s branches hardly differ.
-            groups["lookahead"] = replace(groups["lookahead"], local_steps=scenario.local_steps)
+        if self.local_steps is None:
+            groups |= keep_seconds(groups, scenario, local_steps)
         steps: dict[str, Any] = {"local_steps": local_steps, "macro_steps": macro_steps, "decision_seconds": None}
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
@@ -125,6 +129,21 @@ class EnvSettings:
     def episode_steps(self) -> int:
         """Local steps of a whole episode."""
         return (self.local_steps or 0) * (self.macro_steps or 0)
+
+
+def keep_seconds(groups: dict[str, Any], scenario: Scenario, steps: int) -> dict[str, Any]:
+    """The groups that count in decisions, so that they mean as many seconds at every pace: an imagined decision of
+    `lookahead` (branches of 1 s hardly differ), and `comm.period`.
+
+    Args:
+        steps: control steps from decision to decision.
+    """
+    lookahead, comm = groups["lookahead"], groups["comm"]
+    if lookahead.local_steps is None:
+        lookahead = replace(lookahead, local_steps=scenario.local_steps)
+    if comm.period != "auto":
+        comm = replace(comm, period=max(1, round(comm.period * scenario.local_steps / steps)))
+    return {"lookahead": lookahead, "comm": comm}
 
 
 GROUPS: dict[str, type[Group]] = {

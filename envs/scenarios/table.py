@@ -43,24 +43,29 @@ class Scenario:
     max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
     summary: str = ""  # a line for `--help`
-    decision_seconds: float | str | None = setting(
-        None, "from decision to decision, or protocol: as the scenario was published", unit="s"
+    decision_seconds: float | str = setting(
+        1.0, "from decision to decision, or protocol: as the scenario was published", unit="s"
     )
 
-    def decision_steps(self, local_steps: int | None = None, seconds: float | str | None = None) -> int:
+    def decision_steps(
+        self, local_steps: int | None = None, seconds: float | str | None = None, decide: str = "together"
+    ) -> int:
         """Control steps from decision to decision.
 
         Args:
             local_steps: what is said of them; else
-            seconds: of `EnvSettings.decision_seconds`; None: the scenario's.
+            seconds: of `EnvSettings.decision_seconds`; None: the scenario's, and the protocol's where robots decide
+                when they arrive, for then it is the longest time.
+            decide: of `EnvSettings`.
 
         Raises:
             ValueError: seconds that are no whole control steps.
         """
         if local_steps is not None:
             return local_steps
-        seconds = self.decision_seconds if seconds is None else seconds
-        if seconds is None or seconds == PROTOCOL:
+        if seconds is None:
+            seconds = self.decision_seconds if decide == "together" else PROTOCOL
+        if seconds == PROTOCOL:
             return self.local_steps
         steps = round(float(seconds) / DT)
         if steps < 1 or abs(steps * DT - seconds) > 1e-6:
@@ -217,6 +222,7 @@ _ROWS = [
         clearance_factor=3.0,
         local_steps=40,
         macro_steps=196,
+        decision_seconds=PROTOCOL,
     ),
 ]
 

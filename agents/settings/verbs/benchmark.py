@@ -23,7 +23,7 @@ class BenchmarkSettings(LearnerSettings):
     seeds: Any = setting(None, "of training, starts and maps")
     episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)", low=1)
     num_robots: int = setting(3, "robots in a team", low=1)
-    total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for", low=1, high=10**12)
+    total_frames: int = setting(80_000, "macro steps of teams to train each algorithm for", low=1, high=10**12)
     iterations: int | None = setting(None, "instead: iterations of one episode of each of the num_envs teams", low=1)
     maps: Any = setting("held_out", "evaluated on held_out, trained, held_out_together (so teams start), or several")
     train_maps: int | None = setting(

@@ -16,7 +16,7 @@ class TrainSettings(LearnerSettings):
     preset: str = MISSING
     action: str = MISSING  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
-    total_frames: int = setting(60_000, "macro steps of teams to train for", low=1, high=10**12)
+    total_frames: int = setting(240_000, "macro steps of teams to train for", low=1, high=10**12)
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none", low=0)
     classical: Any = setting(None, "policies played beside the trained team")
     warm_start: str | None = setting(None, "policy to imitate first: a name, a folder, a run or module:function")
