@@ -16,7 +16,7 @@ from torchrl.modules import ProbabilisticActor
 from maexp.agents.algorithms.registry import TRAININGS, find_algorithm
 from maexp.agents.algorithms.updaters import Updater
 from maexp.agents.config.checks import check_distinct
-from maexp.agents.config.env import env_settings, map_indices
+from maexp.agents.config.env import algorithm_settings, env_settings, map_indices
 from maexp.agents.config.groups import SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
 from maexp.agents.config.overrides import split_paths
 from maexp.agents.config.schema import make_value
@@ -211,7 +211,8 @@ def _check_entry(entry: Any) -> None:
 
 def _with_scenario(cfg: CommonSettings, entry: dict[str, Any]) -> CommonSettings:
     other = copy.deepcopy(cfg)
-    left = ("also", "path", "maps", "validation", "held_out", "held_out_count", *SUPPLIED)
+    supplied = [name for name in SUPPLIED if name != "decision_seconds"]  # one pace for all, where it is set
+    left = ("also", "path", "maps", "validation", "held_out", "held_out_count", *supplied)
     metadata = {field.name: field.metadata for field in fields(ScenarioSettings)}
     try:
         given = {
@@ -249,6 +250,9 @@ class Learner:
 def make_learner(cfg: LearnerSettings, env: ExplorationEnv) -> Learner:
     """Policy, critic and updater of the settings, for the specs of `env`."""
     row = find_algorithm(cfg.algorithm.name, TRAININGS)
-    settings, model = cfg.algorithm, cfg.model
+    settings, model = algorithm_settings(cfg), cfg.model
     policy, critic = make_policy(env, model), row.make_critic(env, model, settings)
-    return Learner(policy, critic, row.make_updater(row.make_loss(policy, critic, settings), settings))
+    loss = row.make_loss(policy, critic, settings)
+    if env.settings.decide == "arrival":
+        loss.decision_steps = env.local_steps
+    return Learner(policy, critic, row.make_updater(loss, settings))

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary
 from torchrl.envs import EnvBase
 
+from maexp.envs.arrivals import Arrivals
 from maexp.envs.comm.strategy import Strategy
 from maexp.envs.config import (
     CELL_BYTES,
@@ -108,6 +110,7 @@ class ExplorationEnv(EnvBase):
             self.set_starts(starts)
         elif starts not in STARTS:
             raise ValueError(f"starts={starts!r} is unknown: choose {', '.join(STARTS)} or poses")
+        self.arrivals = Arrivals(self) if settings.decide == "arrival" else None
         shown = settings.observation.targets
         acts = settings.comm.strategy != "opportunistic"
         self.strategy = Strategy(self) if acts or settings.observes_radios else None
@@ -118,6 +121,9 @@ class ExplorationEnv(EnvBase):
         info, pictures = info_shapes(settings), settings.observation.pictures
         shown, radio = (shown and self.target_view.shown), settings.observes_radios
         self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown, radio)
+        if self.arrivals is not None:
+            deciding = Binary(n, shape=(e, n), dtype=torch.bool, device=self.device)
+            self.observation_spec["agents", "deciding"] = deciding
         self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
@@ -137,6 +143,8 @@ class ExplorationEnv(EnvBase):
         state["episode"] += mask
         self.simulation.reset(mask)
         self._raise_errors()
+        if self.arrivals is not None:
+            self.arrivals.begin(mask)
         if self._hook is not None:
             self._hook[0](self)
         done = self._done()
@@ -165,7 +173,9 @@ class ExplorationEnv(EnvBase):
         running = state["active"].clone()
         self._take_action(tensordict["agents", "action"])
         sim.set_goals()
-        if self._hook is None:
+        if self.arrivals is not None:
+            self.arrivals.play(None if self._hook is None else self._hook[0])
+        elif self._hook is None:
             sim.step(0, self.local_steps)
         else:
             hook, every = self._hook
@@ -191,7 +201,8 @@ class ExplorationEnv(EnvBase):
             state["command"].copy_(torch.nan_to_num(control))
         else:
             goals, tells = self._find_goals(action)
-            state["wanted"].copy_(goals if self.strategy is None else self.strategy.direct(goals, tells))
+            goals = goals if self.strategy is None else self.strategy.direct(goals, tells)
+            state["wanted"].copy_(goals if self.arrivals is None else self.arrivals.take(goals))
 
     def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Goals float32 [E, N, 2] [m] of the action, by targets, in metres, or by regions and offsets as in the paper;
@@ -208,8 +219,17 @@ class ExplorationEnv(EnvBase):
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors
         terminated = (state["terminated"] != 0).unsqueeze(-1)
-        truncated = (state["macro_step"] >= self.macro_steps).unsqueeze(-1) & ~terminated
+        over = state["macro_step"] >= self.macro_steps
+        if self.arrivals is not None:
+            over = state["local_step"] >= self.settings.episode_steps
+        truncated = over.unsqueeze(-1) & ~terminated
         return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+
+    def time_left(self, state) -> torch.Tensor:
+        """Share of the episode that is left, float32 [S], by the state of S envs."""
+        if self.arrivals is not None:
+            return 1.0 - state["local_step"].float() / self.settings.episode_steps
+        return 1.0 - state["macro_step"].float() / self.macro_steps
 
     def observe(self, mask: torch.Tensor | None = None) -> TensorDict:
         """What the teams see now, and info of the step just made.
@@ -224,7 +244,7 @@ class ExplorationEnv(EnvBase):
         grid = torch.empty((e, n, 4, r, r), device=self.device)
         self.simulation.observe(picture, team, pose, grid, mask)
         state = self.simulation.tensors
-        left = 1.0 - state["macro_step"] / self.macro_steps
+        left = self.time_left(state)
         observation = {
             "pose": pose,
             "grid": grid,
@@ -240,6 +260,8 @@ class ExplorationEnv(EnvBase):
             batch_size=[e, n],
             device=self.device,
         )
+        if self.arrivals is not None:
+            agents["deciding"] = self.arrivals.state["deciding"].clone()
         parts = {
             "agents": agents,
             "info": TensorDict(self._info(), batch_size=[e], device=self.device),
@@ -356,7 +378,7 @@ class ExplorationEnv(EnvBase):
 
     def _memories(self) -> dict[str, torch.Tensor]:
         """What those remember that look at the simulation, copied."""
-        parts = (self.strategy, self.target_view)
+        parts = (self.strategy, self.target_view, self.arrivals)
         return {name: value for part in parts if part is not None for name, value in part.state_dict().items()}
 
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
@@ -372,7 +394,7 @@ class ExplorationEnv(EnvBase):
         for name in STATE:
             own[name].copy_(state_dict[name])
         self._fix_starts()
-        for part in (self.strategy, self.target_view):
+        for part in (self.strategy, self.target_view, self.arrivals):
             if part is not None:
                 part.load_state_dict(state_dict)
 

@@ -36,10 +36,12 @@ class CoverageRecorder:
         step = int(state["local_step"].max())
         if step == 0:
             self._batches.append({"step": [], "coverage": []})
+        if env.arrivals is not None:  # teams are at moments of their own
+            step = state["local_step"].cpu().numpy().copy()
         if not self._batches:
             return  # the block began in the middle of an episode: it has no start to count from
         batch = self._batches[-1]
-        if step in batch["step"][-1:]:
+        if np.array_equal(step, batch["step"][-1] if batch["step"] else None):
             return  # every team is done and stands still
         batch["step"].append(step)
         batch["coverage"].append((state["covered"] / totals[state["map_id"].long()]).cpu().numpy())
@@ -61,10 +63,11 @@ class CoverageRecorder:
         """
         self._check()
         times = np.unique(np.concatenate([np.array(batch["step"]) for batch in self._batches]))
-        coverage = [
-            np.stack([np.interp(times, batch["step"], curve) for curve in np.stack(batch["coverage"], axis=1)])
-            for batch in self._batches
-        ]
+        coverage = []
+        for batch in self._batches:
+            curves, steps = np.stack(batch["coverage"], axis=1), np.array(batch["step"])
+            steps = steps.T if steps.ndim > 1 else [steps] * len(curves)
+            coverage.append(np.stack([np.interp(times, *pair) for pair in zip(steps, curves, strict=True)]))
         return times * DT, np.concatenate(coverage)[:episodes]
 
     def contributions(self, episodes: int | None = None) -> np.ndarray:

@@ -55,6 +55,7 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
     check_base(maps, comm)
     check_noise(maps, settings.radar)
     check_done(settings.done, comm)
+    check_decide(settings.decide, settings)
     check_failing(faults, num_robots, settings.episode_steps)
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
     return replace(
@@ -149,6 +150,19 @@ def check_done(done: str, comm: CommConfig) -> None:
     """Raise ValueError unless whose coverage ends an episode is there."""
     if done == "base" and not comm.has_base:
         raise ValueError("done='base' needs a base station: add comm.base_station=true")
+
+
+def check_decide(decide: str, settings: EnvSettings) -> None:
+    """Raise ValueError if robots are to decide when they arrive, and something else counts in decisions of all."""
+    if decide == "together":
+        return
+    if settings.planner.name == "direct":
+        raise ValueError("decide=arrival is about goals, and planner=direct takes controls: choose another planner")
+    if settings.comm.strategy != "opportunistic" or settings.observation.radio:
+        name = "observation.radio=true" if settings.observation.radio else f"comm.strategy={settings.comm.strategy}"
+        raise ValueError(
+            f"decide=arrival and {name}, which counts in decisions of the whole team: leave one of them out"
+        )
 
 
 def check_failing(config: FaultsConfig, num_robots: int, steps: int) -> None:

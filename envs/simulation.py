@@ -218,6 +218,7 @@ def grid_sizes(settings: EnvSettings, bank: MapBank) -> dict[str, int]:
     shapes = [grid_shape(world) for world in bank.maps]
     cells = max(width * height for width, height in shapes)
     return {
+        "env": 1,
         "row": robots if limited else 1,
         "item": robots,
         "place": robots,
@@ -237,7 +238,7 @@ def navigation_bytes(settings: EnvSettings, bank: MapBank) -> int:
     """What a `Navigation` and the targets that it finds keep of one env."""
     sides = zip(bank.maps, bank_block_sides(bank, min(radar.range for radar in settings.radar)).tolist(), strict=True)
     blocks = max(math.prod(-(-cells // side) for cells in grid_shape(world)) for world, side in sides)
-    lengths = grid_sizes(settings, bank) | {"env": 1, "block": blocks, "two": 2}
+    lengths = grid_sizes(settings, bank) | {"block": blocks, "two": 2}
     if settings.device.type == "cpu":
         lengths["place"] = 0  # all search in one place, which no env counts
     in_vain = 4 * settings.num_robots * blocks  # decisions in vain of every robot (`TargetTracker`)

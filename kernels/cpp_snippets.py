@@ -284,6 +284,23 @@ def has_wall(walls: wp.array2d(dtype=wp.int32), row: int, line: int, first: int,
     ...
 
 
+# Many at once.
+COUNT_NONZERO = """
+    const wp::uint8* value = &wp::index(values, row, 0);
+    assert(end <= values.shape[1]);
+    int found = 0;
+    if (lanes == 1) for (int k = 0; k < end; ++k) found += value[k] != 0;
+    else for (int k = start; k < end; k += lanes) found += value[k] != 0;
+    return found;
+"""
+
+
+@wp.func_native(COUNT_NONZERO)
+def count_nonzero(values: wp.array2d(dtype=wp.uint8), row: int, start: int, end: int, lanes: int) -> int:
+    """How many of a row's values from `start` to `end` (not included) are not 0, in steps of `lanes`."""
+    ...
+
+
 # Nearly all points are looked at in vain.
 NEXT_NEWS = """
     const int* flag = &wp::index(flags, e, word, 0);

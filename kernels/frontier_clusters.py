@@ -302,7 +302,6 @@ def _list_blocks(
 
 
 BLOCKS = {
-    "looked": Field(wp.int32, "env", "", "1: bring the env up to date; 0: leave it, what changes counts later", 1),
     "grid_of_row": Field(wp.int32, "row", "", "the map of rows of those envs, else -1; set by `mark`"),
     "renewed": Field(wp.int32, "row", "", "1 where nothing holds that was kept"),
     "changed": Field(wp.int32, "row word", "", "a bit for every cell that has changed since"),
@@ -361,6 +360,7 @@ class FrontierBlocks:
                 "width": known.grids.width,
                 "map_of_row": known.grid_of_row,
                 "known": known.known,
+                "looked": known.looked,
                 "news": known.news,
                 "news_count": known.news_count,
                 "rows_per_env": known.rows_per_env,

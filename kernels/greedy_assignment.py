@@ -201,21 +201,21 @@ def compare_with_mates(
         distance [m] to the nearest plan of another, to the own last target, to the nearest last target of another.
     """
     found = [torch.empty(best.shape, device=point.device) for _ in range(4)]
-
-    def points(values: torch.Tensor) -> wp.array:
-        return wp.from_torch(values.contiguous(), dtype=wp.vec2)
-
+    point, goes, went = (values.contiguous() for values in (point, plans[0], last[0]))
+    best, ways, hears, plans_some, last_some = (
+        values.contiguous() for values in (best, ways, hears, plans[1], last[1])
+    )
     launch_on(point.device)(
         _compare_with_others,
         tuple(best.shape[:2]),
         [
-            points(point),
-            *(wp.from_torch(tensor.contiguous()) for tensor in (best, ways, hears)),
-            points(plans[0]),
-            wp.from_torch(plans[1].contiguous()),
-            points(last[0]),
-            wp.from_torch(last[1].contiguous()),
-            *map(wp.from_torch, found),
+            view(point, wp.vec2),
+            *map(view, (best, ways, hears)),
+            view(goes, wp.vec2),
+            view(plans_some),
+            view(went, wp.vec2),
+            view(last_some),
+            *map(view, found),
         ],
     )
     return found
@@ -252,16 +252,17 @@ def gather_gain(
         reach: [m].
     """
     parts = [torch.empty((*gain.shape, gain.shape[-1]), device=gain.device) for _ in range(2)]
+    point, gain = point.contiguous(), gain.contiguous()
     launch_on(gain.device)(
         _gather_gain,
         tuple(gain.shape),
         [
-            wp.from_torch(point.contiguous(), dtype=wp.vec2),
-            wp.from_torch(gain.contiguous()),
+            view(point, wp.vec2),
+            view(gain),
             reach,
             near,
             around,
-            *map(wp.from_torch, parts),
+            *map(view, parts),
         ],
     )
     return parts[0].sum(-1), parts[1].sum(-1)

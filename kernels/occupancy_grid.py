@@ -18,7 +18,7 @@ import warp as wp
 
 from maexp.kernels.arrays import Field, make_arrays
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.cpp_snippets import next_news
+from maexp.kernels.cpp_snippets import count_nonzero, next_news
 from maexp.kernels.launches import Launch, lanes_on, launch_named
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import ROBOTS_PER_WORD, Maps
@@ -106,6 +106,7 @@ def _paint_points(
     point_begin: wp.array(dtype=wp.int32),  # [map + 1]
     point_cell: wp.array(dtype=wp.int32),  # [points of all maps]
     grid_of_row: wp.array(dtype=wp.int32),  # [row], map of what is painted
+    looked: wp.array(dtype=wp.int32),  # [env], 0: leave what is there as it is
     # Settings:
     again: int,  # 0: every row; 1: rows that were cleared
     rows_per_env: int,
@@ -133,7 +134,7 @@ def _paint_points(
     row, lane = wp.tid()
     e = row / rows_per_env
     m = map_id[e]
-    if m != grid_of_row[row] or (again != 0 and stale[row] == 0):
+    if looked[e] == 0 or m != grid_of_row[row] or (again != 0 and stale[row] == 0):
         return
     first = point_begin[m]
     w = grids.width[m]
@@ -175,6 +176,7 @@ def _find_stale(
     rows_per_env: int,
     capacity: int,
     # In:
+    looked: wp.array(dtype=wp.int32),  # [env], 0: leave what is there as it is
     met: wp.array(dtype=wp.int32),  # [row]
     # In and out:
     total: wp.array(dtype=wp.int32),  # [row]
@@ -185,6 +187,9 @@ def _find_stale(
 ):
     """A row is stale where something painted is not known (any more), or was on another map."""
     row = wp.tid()
+    if looked[row / rows_per_env] == 0:
+        stale[row] = 0
+        return
     m = map_id[row / rows_per_env]
     stale[row] = wp.where(met[row] != total[row] or m != grid_of_row[row], 1, 0)
     if stale[row] != 0:
@@ -215,7 +220,34 @@ def _clear_stale(
             walls[row, word] = 0
 
 
+@wp.kernel
+def _clear_counts(
+    # Out:
+    known_count: wp.array(dtype=wp.int32),  # [row]
+):
+    known_count[wp.tid()] = 0
+
+
+@wp.kernel
+def _count_known(
+    # Map:
+    grids: NavGrids,
+    grid_of_row: wp.array(dtype=wp.int32),  # [row]
+    # Settings:
+    lanes: int,
+    # In:
+    known: wp.array2d(dtype=wp.uint8),  # [row, cell]
+    # In and out:
+    known_count: wp.array(dtype=wp.int32),  # [row], 0 before
+):
+    row, lane = wp.tid()
+    m = grid_of_row[row]
+    if m >= 0:
+        wp.atomic_add(known_count, row, count_nonzero(known, row, lane, grids.width[m] * grids.height[m], lanes))
+
+
 KNOWN = {
+    "looked": Field(wp.int32, "env", "", "1: bring the env up to date; 0: leave it, what changes counts later", 1),
     "known": Field(wp.uint8, "row cell", "", "`UNKNOWN`, `FREE` or `OBSTACLE`"),
     "walls": Field(wp.int32, "row word", "", "a bit for every `OBSTACLE`; rows of cells begin with a word"),
     "painted": Field(wp.uint8, "row point", "", "1 for points that the grid shows"),
@@ -225,6 +257,7 @@ KNOWN = {
     "met": Field(wp.int32, "row", "", "known points"),
     "total": Field(wp.int32, "row", "", "painted points"),
     "stale": Field(wp.int32, "row", "", "1 where the grid is painted anew"),
+    "known_count": Field(wp.int32, "row", "", "cells that are not `UNKNOWN`; set by `count`"),
 }
 """Arrays of `KnownGrids`; a row is an env's where the team shares what it knows, else a robot's."""
 
@@ -264,7 +297,7 @@ class KnownGrids:
         if false_flags is not None:
             points += false_flags.shape[2]
         words, slots = wall_capacity(grids), news_capacity(cells)
-        sizes = {"row": rows, "cell": cells, "word": words, "point": points, "slot": slots}
+        sizes = {"env": map_id.shape[0], "row": rows, "cell": cells, "word": words, "point": points, "slot": slots}
         vars(self).update(make_arrays(KNOWN, sizes, device))
 
     def paint(self, launch: Launch) -> None:
@@ -275,6 +308,11 @@ class KnownGrids:
         launch_named(launch, _find_stale, rows, values)
         launch_named(launch, _clear_stale, (rows, self.lanes), values)
         self._paint_layers(launch, again=1)
+
+    def count(self, launch: Launch) -> None:
+        """Bring `known_count` up to date with `known`."""
+        launch_named(launch, _clear_counts, self.known.shape[0], vars(self))
+        launch_named(launch, _count_known, (self.known.shape[0], self.lanes), vars(self))
 
     def _paint_layers(self, launch: Launch, again: int) -> None:
         """Paint obstacles, then free points, and over them what is taken for walls."""

@@ -110,4 +110,32 @@ def write_advantages(loss, batch: TensorDictBase, chunk: int = 256) -> TensorDic
         following[ends] = values(after.select(*inputs))
     batch.set(key, value)
     batch.set(("next", *key), following)
-    return estimator(batch)
+    return estimator(batch) if loss.decision_steps is None else discount_by_time(loss, batch, value, following, final)
+
+
+def discount_by_time(
+    loss, batch: TensorDictBase, value: torch.Tensor, following: torch.Tensor, final: torch.Tensor
+) -> TensorDictBase:
+    """Write advantages and value targets where decisions differ in length: what comes later counts less by the time
+    that has passed, not by the decisions.
+
+    Args:
+        value, following: before and after each decision, [envs, T, 1], or [envs, T, robots, 1] where robots are valued
+        final: after which nothing counts, bool [envs, T]
+    """
+    reward, done = batch["next", REWARD[0], REWARD[1]], batch["next", "done"].squeeze(-1)
+    robots = reward.shape[-2]
+    reward = reward.sum(-2) if loss.team_value else reward
+    lead = (..., *[None] * (value.ndim - 2))
+    length = (batch["next", "info", "local_steps"] - batch["info", "local_steps"]).squeeze(-1) / loss.decision_steps
+    discount, trace = ((base**length)[lead] for base in (loss.gamma, loss.gamma * loss.lmbda))
+    error = reward + discount * following * ~final[lead] - value
+    trace, advantage = trace * ~done[lead], torch.zeros_like(error)
+    last = advantage[:, -1]
+    for t in reversed(range(error.shape[1])):
+        last = error[:, t] + trace[:, t] * last
+        advantage[:, t] = last
+    batch.set(loss.tensor_keys.value_target, advantage + value)
+    if loss.team_value:
+        advantage = advantage.unsqueeze(-2).expand(*advantage.shape[:-1], robots, 1)
+    return batch.set(loss.tensor_keys.advantage, advantage)

@@ -19,7 +19,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import GAE
 
 from maexp.agents.algorithms.gae import ADVANTAGE, REWARD, TARGET, TEAM_TARGET, estimator_for, write_advantages
-from maexp.agents.models.actor import ALIVE, PARAMS, SEEN
+from maexp.agents.models.actor import ALIVE, DECIDING, PARAMS, SEEN
 from maexp.agents.models.critics import TEAM_VALUE, VALUE
 from maexp.agents.models.distributions import Heads
 
@@ -97,11 +97,13 @@ class TeamLoss(LossModule):
 
     Attributes:
         anchor_coeff: weight of the divergence from the policy of a warm start
+        decision_steps: local steps that `gamma` and `lmbda` are for, where decisions differ in length
     """
 
     out_keys = ["loss_objective", "loss_entropy", "loss_critic", "entropy", "explained_variance"]
     standardises_each_robot = True
     anchor_coeff = 0.0
+    decision_steps: int | None = None
 
     @dataclass
     class _AcceptedKeys:
@@ -212,7 +214,8 @@ class TeamLoss(LossModule):
         alive = batch.get(ALIVE, None) if self.mask_collided else None
         if alive is None:
             alive = torch.ones(batch.get(self.tensor_keys.advantage).shape[:-1], dtype=torch.bool, device=batch.device)
-        return alive
+        deciding = batch.get(DECIDING, None)
+        return alive if deciding is None else alive & deciding
 
     def advantage(self, batch: TensorDictBase, alive: Tensor) -> Tensor:
         """Of the robots that count, [n, 1]."""

@@ -57,14 +57,14 @@ class Algorithm:
 
     def make_loss(self, policy, critic, settings: AlgorithmSettings | None = None):
         """The loss for a policy and critic, with its estimator of advantages."""
-        settings = settings or self.settings
+        settings = (settings or self.settings).at_pace()
         norm = PopArtValueNorm(shape=1, beta=0.99) if settings.value_norm else None
         loss = self.loss(policy, critic, value_norm=norm, **settings.loss_arguments())
         return loss.to(next(policy.parameters()).device)
 
     def make_updater(self, loss, settings: AlgorithmSettings | None = None) -> Updater:
         """The updater that trains the networks behind `loss`."""
-        return self.updater(loss, settings or self.settings)
+        return self.updater(loss, (settings or self.settings).at_pace())
 
 
 ALGORITHMS = {

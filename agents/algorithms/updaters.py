@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from maexp.agents.algorithms.gae import look, write_advantages
 from maexp.agents.algorithms.losses import ANCHOR, check_finite
 from maexp.agents.algorithms.trust_region import TRPO
-from maexp.agents.models.actor import ALIVE, CELLS, COMM, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
+from maexp.agents.models.actor import ALIVE, CELLS, COMM, DECIDING, GRID, MAP, PARAMS, POSE, SEEN, TARGETS
 from maexp.agents.models.encoder import compact, pools_pictures
 
 Task = Callable[[], Any]
@@ -144,7 +145,7 @@ class Updater:
         self._calibrate(batch)
         needed = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
         needed += [keys.advantage, keys.value_target, keys.value, *keys.action]
-        needed += [key for key in (ALIVE, PARAMS, *keys.sample_log_prob) if key in batch.keys(True)]
+        needed += [key for key in (ALIVE, DECIDING, PARAMS, *keys.sample_log_prob) if key in batch.keys(True)]
         return self._add_anchor(batch.select(*needed).flatten())
 
     def set_anchor(self) -> None:
@@ -182,12 +183,16 @@ class Updater:
             critic.calibrate(batch.get(self.loss.tensor_keys.value_target))
             write_advantages(self.loss, batch)
 
-    def minibatches(self, steps: list[TensorDictBase], size: int) -> Iterator[list[TensorDictBase]]:
-        """Random parts of every batch, together about `size` team steps, each step once."""
+    def minibatches(self, steps: list[TensorDictBase], size: int, share: float = 1.0) -> Iterator[list[TensorDictBase]]:
+        """Random parts of every batch, together about `size` team steps; no step twice.
+
+        Args:
+            share: of the steps that are taken, of each batch alike; 1: all
+        """
         total = sum(part.shape[0] for part in steps)
         count = min(max(1, round(total / size)), *(part.shape[0] for part in steps))
         orders = [torch.randperm(part.shape[0]).tensor_split(count) for part in steps]
-        for chosen in zip(*orders, strict=True):
+        for chosen in islice(zip(*orders, strict=True), max(1, round(share * count))):
             yield [part[index] for part, index in zip(steps, chosen, strict=True)]
 
     def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
@@ -221,7 +226,7 @@ class Updater:
 
     def learn_values(self, steps: list[TensorDictBase], meter: Meter) -> None:
         """One pass of the critic alone."""
-        for parts in self.minibatches(steps, self.settings.minibatch_size):
+        for parts in self.minibatches(steps, self.settings.minibatch_size, self.settings.learn_share):
             for part in parts if self.loss.is_shared else ():
                 part.set(SEEN, look(self.loss, part, CHUNK))
             meter.add(self.descend(self.loss.critic_terms, parts, "critic"))
@@ -253,7 +258,7 @@ class GradientUpdater(Updater):
         small = TARGETS in self.loss.actor_network.in_keys and self.policy_params[0].device.type == "cpu"
         with at_once(small and not self.loss.is_shared) as both:
             for _ in range(self.settings.epochs):
-                for parts in self.minibatches(steps, self.settings.minibatch_size):
+                for parts in self.minibatches(steps, self.settings.minibatch_size, self.settings.learn_share):
                     meter.add(self._step(parts, both))
         if getattr(self.loss, "kl_coeff", 0) > 0:
             self.loss.adapt_penalty(meter.means()["kl"])
@@ -276,7 +281,8 @@ class TrustRegionUpdater(Updater):
         return TRPO(self.policy_params, **{name: getattr(self.settings, name) for name in names})
 
     def learn(self, steps: list[TensorDictBase], meter: Meter) -> None:
-        for number, parts in enumerate(self.minibatches(steps, self.settings.policy_minibatch_size)):
+        share = self.settings.learn_share
+        for number, parts in enumerate(self.minibatches(steps, self.settings.policy_minibatch_size, share)):
             if number:
                 self._act_again(parts)
             *closures, terms = self._closures(parts)

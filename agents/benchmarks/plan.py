@@ -10,6 +10,7 @@ from typing import Any
 from maexp.agents.algorithms.registry import TRAININGS
 from maexp.agents.config.checks import as_list, check_distinct, check_names, check_seed
 from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.env import episode_decisions
 from maexp.agents.config.overrides import quote
 from maexp.agents.config.resolved import flatten, plain
 from maexp.agents.config.verbs import BenchmarkSettings, TrainSettings
@@ -254,7 +255,7 @@ def length_of(cfg: BenchmarkSettings, cell: Cell) -> dict[str, Any]:
     """For `iterations`: each collects one whole episode of every team."""
     if cfg.iterations is None:
         return {}
-    steps = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps
+    steps = episode_decisions(cfg.scenario, find_scenario(cell.scenario))
     if steps is None:
         raise UserError(f"iterations={cfg.iterations} are of whole episodes: set scenario.macro_steps too.")
     return {"collector.steps": steps, "total_frames": cfg.iterations * cfg.num_envs * steps}

@@ -11,6 +11,7 @@ from torchrl.envs.utils import step_mdp
 
 from maexp.agents.benchmarks.plan import Cell, as_list, cell_config, length_of
 from maexp.agents.build import load_maps, make_env, make_learner, set_steps
+from maexp.agents.config.env import episode_decisions
 from maexp.agents.config.verbs import BenchmarkSettings
 from maexp.agents.errors import blame_input
 from maexp.agents.policies.classical import POLICIES
@@ -88,7 +89,7 @@ def estimate_cells(cfg: BenchmarkSettings, cells: list[Cell], suites: int, worke
 
 def _frames(cfg: BenchmarkSettings, cell: Cell, suites: int) -> tuple[int, int]:
     """(macro steps of teams trained, at most played)."""
-    length = cfg.scenario.macro_steps or find_scenario(cell.scenario).macro_steps or UNKNOWN_LENGTH
+    length = episode_decisions(cfg.scenario, find_scenario(cell.scenario)) or UNKNOWN_LENGTH
     frames = length_of(cfg, cell).get("total_frames", cfg.total_frames)
     if cfg.together:  # each scenario has its share of the one training
         frames //= len(as_list(cfg.scenarios))

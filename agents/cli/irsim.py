@@ -90,7 +90,7 @@ def make_config(cfg: IrsimSettings, world: PointCloudMap):
         max_accel=scenario.max_accel,
         body_radius=max(clearance - TOLERANCE, 0.5 * clearance) if cfg.body_radius is None else cfg.body_radius,
         clearance=clearance,
-        decide=scenario.local_steps * DT,
+        decide=scenario.decision_steps() * DT,
         beams=cfg.beams,
         cell=cfg.cell,
         range_noise=cfg.range_noise,

@@ -1,24 +1,39 @@
 """Settings of the seven algorithms: types, ranges, defaults and those of the original platform."""
 
+import math
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from maexp.conf import list_choices, read_choice
 from maexp.envs.config.env import Knower
 from maexp.envs.config_fields import check_settings, replaced, setting
+
+BRANCH_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class AlgorithmSettings:
     """Settings that all algorithms share. A team step is one macro step of one team.
 
-    ValueError where one is out of its range (all subclasses). `conf/algorithm/NAME.yaml` holds what an algorithm has
-    other defaults for, `conf/_tuning/reference_NAME.yaml` what the original platform has.
+    Horizons are in seconds, so that they do not depend on how often robots decide; `at_pace` turns them into discounts
+    per decision. ValueError where one is out of its range (all subclasses). `conf/algorithm/NAME.yaml` holds what an
+    algorithm has other defaults for, `conf/_tuning/reference_NAME.yaml` what the original platform has.
     """
 
     name: str = ""
-    gamma: float = setting(0.99, "discount per macro step", low=0, high=1)
-    lmbda: float = setting(0.95, "trace decay of the generalised advantages", low=0, high=1)
+    horizon_seconds: float = setting(200.0, "rewards so much later count 1 / e [s]", above=0)
+    trace_seconds: float = setting(40.0, "generalised advantages trust rewards, not values, about so long [s]", above=0)
+    gamma: float | None = setting(None, "discount per macro step; default: from horizon_seconds", low=0, high=1)
+    lmbda: float | None = setting(
+        None, "trace decay of the generalised advantages per macro step; default: from trace_seconds", low=0, high=1
+    )
+    learn_share: float | None = setting(
+        None,
+        "share of the batch, drawn anew for each pass, that is learned from; default: less where decisions come faster "
+        "than in the scenario's own protocol, so that gradient steps per simulated second stay the same",
+        above=0,
+        high=1,
+    )
     finite_horizon: bool = setting(
         True, "an episode that ran out of time is over: nothing that would come after it counts"
     )
@@ -46,8 +61,23 @@ class AlgorithmSettings:
     def __post_init__(self):
         check_settings(self, "algorithm")
 
+    def at_pace(self, seconds: float = 1.0, protocol_seconds: float | None = None) -> Self:
+        """With discounts and the share that is learned from, where none are set, for one pace.
+
+        Args:
+            seconds: from decision to decision [s]
+            protocol_seconds: the same in the scenario's own protocol [s]; None: as here
+        """
+        share = min(1.0, seconds / (protocol_seconds or seconds))
+        found = {
+            "gamma": math.exp(-seconds / self.horizon_seconds),
+            "lmbda": math.exp(-seconds / self.trace_seconds),
+            "learn_share": share,
+        }
+        return replace(self, **{name: value for name, value in found.items() if getattr(self, name) is None})
+
     def loss_arguments(self) -> dict:
-        """What the loss's constructor takes from these settings."""
+        """What the loss's constructor takes from these settings (`at_pace`)."""
         names = ("gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage")
         names += ("mask_collided",)
         return {name: getattr(self, name) for name in names}
@@ -113,7 +143,13 @@ class ExpertSettings(AlgorithmSettings):
     branch_horizon: int = setting(
         4, "decisions that are played in a branch; `lookahead` says what they are worth", low=1, high=100
     )
-    branch_share: float = setting(0.5, "share of the teams' decisions that are branched at", low=0.01, high=1)
+    branch_share: float | None = setting(
+        None,
+        "share of the teams' decisions that are branched at; default: 0.5 at the pace of the scenario's protocol, less "
+        "where decisions come faster",
+        low=0.01,
+        high=1,
+    )
     learn_from: Knower = setting(
         "union",
         "whose knowledge a branch is worth: the team's, the base station's, or that of the robot that knows least",
@@ -125,9 +161,17 @@ class ExpertSettings(AlgorithmSettings):
         None, "run of expert iteration whose policy and branched decisions this one begins with, on whatever scenarios"
     )
 
+    def at_pace(self, seconds: float = 1.0, protocol_seconds: float | None = None) -> Self:
+        found = super().at_pace(seconds, protocol_seconds)
+        share = BRANCH_SHARE * min(1.0, seconds / (protocol_seconds or seconds))
+        return found if found.branch_share is not None else replace(found, branch_share=max(0.01, share))
+
     unused: ClassVar[tuple[str, ...]] = (
+        "horizon_seconds",
+        "trace_seconds",
         "gamma",
         "lmbda",
+        "learn_share",
         "finite_horizon",
         "critic_lr",
         "entropy_coeff",

@@ -5,11 +5,13 @@ from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
+from maexp.agents.config.algorithms import AlgorithmSettings
 from maexp.agents.config.checks import check_counts
-from maexp.agents.config.groups import SUPPLIED, CommonSettings, ScenarioSettings
+from maexp.agents.config.groups import PACE, SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
 from maexp.agents.errors import UserError
 from maexp.envs.config import GROUPS, EnvSettings, PlannerConfig, RadarConfig, RobotConfig, supplied
-from maexp.envs.scenarios import Scenario, cut_last_fifth, split
+from maexp.envs.scenarios import Scenario, cut_last_fifth, find_scenario, split
+from maexp.kernels.constants import DT
 
 FREE_GROUPS = tuple(name for name, kind in GROUPS.items() if not supplied(kind))
 """Groups of `EnvSettings` in which a scenario supplies nothing."""
@@ -19,6 +21,7 @@ FREE_GROUPS = tuple(name for name, kind in GROUPS.items() if not supplied(kind))
 def follower_names() -> tuple[str, ...]:
     """Settings that may follow the scenario: those that it supplies, and the robots of a team."""
     own = [f"scenario.{name}" for name in ("local_steps", "macro_steps", "maps", "validation", "held_out")]
+    own.append("lookahead.local_steps")
     groups = (f"{group}.{name}" for group, kind in GROUPS.items() for name in supplied(kind))
     return (*own, *groups, "robot.team", "collector.steps")
 
@@ -48,13 +51,30 @@ def env_settings(cfg: CommonSettings, row: Scenario, num_robots: int) -> EnvSett
         robot=[robot.completed(row) for robot in robots],
         radar=[radar.completed(row) for radar in radars],
         planner=planner_config(cfg, row).completed(row),
-        local_steps=cfg.scenario.local_steps,
-        macro_steps=cfg.scenario.macro_steps,
+        **{name: getattr(cfg.scenario, name) for name in PACE},
+        decide=cfg.scenario.decide,
         collision=cfg.scenario.collision,
         success_coverage=cfg.scenario.success_coverage,
         done=cfg.scenario.done,
         **{name: getattr(cfg, name) for name in FREE_GROUPS},
     )
+
+
+def decision_steps(scenario: ScenarioSettings, row: Scenario) -> int:
+    """Control steps from decision to decision."""
+    return row.decision_steps(scenario.local_steps, scenario.decision_seconds, scenario.decide)
+
+
+def episode_decisions(scenario: ScenarioSettings, row: Scenario) -> int | None:
+    """Decisions of an episode; None: that depends on the map."""
+    return scenario.macro_steps or row.episode_decisions(scenario.local_steps, decision_steps(scenario, row))
+
+
+def algorithm_settings(cfg: LearnerSettings) -> AlgorithmSettings:
+    """The settings of the algorithm at the pace of the scenario."""
+    row = find_scenario(cfg.scenario.name)
+    pace = [DT * steps for steps in (decision_steps(cfg.scenario, row), row.local_steps)]
+    return cfg.algorithm.at_pace(*pace)
 
 
 def team_configs(cfg: CommonSettings, num_robots: int) -> tuple[list[RobotConfig], list[RadarConfig]]:

@@ -27,7 +27,9 @@ UNSET = "???"
 MOST_TEAMS = 64  # in one film or on one page
 LAST_SEED = 2**31 - 1  # the kernels' random numbers start from a 32-bit integer
 SUPPLIED = tuple(setting.name for setting in fields(Scenario) if setting.metadata.get("help"))
-"""What a scenario's row supplies."""
+"""What a scenario's row supplies; null: what the map's own scenario says."""
+PACE = ("decision_seconds", "local_steps", "macro_steps")
+"""Of these what is not set follows from what is (`Scenario.decision_steps`)."""
 
 
 def group(kind: type, **references: str) -> Any:
@@ -68,6 +70,8 @@ class ScenarioSettings:
     starts: str = setting(
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
     )
+    decision_seconds: Any = same(EnvSettings, "decision_seconds")
+    decide: str = same(EnvSettings, "decide")
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: str = same(EnvSettings, "done")
     collision: str = same(EnvSettings, "collision")

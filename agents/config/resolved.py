@@ -6,9 +6,20 @@ from typing import Any
 
 import yaml
 
+from maexp.agents.config.algorithms import AlgorithmSettings
 from maexp.agents.config.checks import team_sizes
-from maexp.agents.config.env import FREE_GROUPS, env_settings, map_indices, robot_config, scenario_row, team_configs
-from maexp.agents.config.groups import SUPPLIED, CommonSettings, ScenarioSettings
+from maexp.agents.config.env import (
+    FREE_GROUPS,
+    algorithm_settings,
+    decision_steps,
+    env_settings,
+    episode_decisions,
+    map_indices,
+    robot_config,
+    scenario_row,
+    team_configs,
+)
+from maexp.agents.config.groups import PACE, SUPPLIED, CommonSettings, ScenarioSettings
 from maexp.agents.config.schema import helps, schema, settings_of
 from maexp.envs.config import GROUPS, PlannerConfig
 from maexp.envs.scenarios import Scenario, find_scenario
@@ -39,6 +50,8 @@ def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
         ValueError: a value out of its range.
     """
     settings = plain(cfg)
+    if isinstance(getattr(cfg, "algorithm", None), AlgorithmSettings) and "scenario" in settings:
+        settings["algorithm"] = plain(algorithm_settings(cfg))
     if "planner" in settings:
         settings["planner"] = _own_planner(settings["planner"])
     if "scenarios" in settings:  # a benchmark: its cells have one each, and write what that comes to
@@ -59,11 +72,12 @@ def resolve(cfg: Any, maps: list | None = None) -> dict[str, Any]:
 
 
 def _resolve_scenario(scenario: ScenarioSettings, row: Scenario) -> dict[str, Any]:
-    told = scenario_row(scenario, row)
-    settings: dict[str, Any] = {"local_steps": told.local_steps, "macro_steps": told.macro_steps}
+    row_here = scenario_row(scenario, row)
+    settings: dict[str, Any] = {"local_steps": decision_steps(scenario, row), "decision_seconds": None}  # one says it
+    settings["macro_steps"] = episode_decisions(scenario, row)
     if find_scenario(scenario.name).build is None:
         return settings | {"importing": plain(scenario.importing) | {"robot_radius": None}}
-    settings |= {name: getattr(told, name) for name in SUPPLIED}
+    settings |= {name: getattr(row_here, name) for name in SUPPLIED if name not in PACE}
     settings["maps"], settings["validation"], held_out = map_indices(scenario)
     settings["held_out"] = held_out if scenario.held_out_count is None else None  # one of the two says it
     return settings | {"importing": None}

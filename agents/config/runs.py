@@ -60,7 +60,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         leave_out: settings of the run that do not matter here
     """
     known = default_values(schema(verb))
-    values = flatten(saved["settings"])
+    values = {"algorithm.learn_share": 1.0} | flatten(saved["settings"])  # runs from before that was a setting
     for name in ("preset", "tuning"):
         if choice := find_override(new, name):
             raise UserError(
@@ -72,6 +72,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     if verb != "train" and find_override(saved["overrides"], "episodes") == "0":  # of a training alone: none
         leave_out += ("episodes",)
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
+    left_out += ["scenario.local_steps"] * ("scenario.decision_seconds" in set_names(new))
     left_out += HELD_OUT if {*HELD_OUT} & {*set_names(new)} else ()
     said_anew = [name for name in set_names(new) if name not in GROUPS]  # the command to begin anew says it once
     kept, defaults = without(saved["overrides"], *left_out, *said_anew), []
@@ -86,6 +87,8 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         for name, value in values.items()
         if not gone & {name, name.partition(".")[0]} and not _is_set(name, new)
     }
+    if "scenario.decision_seconds" not in set_names(new) and "scenario" not in chosen:
+        held["scenario.decision_seconds"] = None  # the run's pace is in its local_steps, or in those of the new words
     return Recipe([*kept, *new], defaults, held, str(path))
 
 
@@ -111,6 +114,8 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     gone = [
         follower for follower in followers if SOURCES.get(follower, f"scenario.{follower.partition('.')[2]}") in names
     ]
+    if "scenario.decision_seconds" in names:
+        gone += ["scenario.local_steps", "scenario.macro_steps"]
     gone += [follower for follower in ROUND if follower in followers and "robot.radius" in names]
     gone += ["robot.wheelbase"] * ("robot.wheelbase" in followers and bool({*WHEELBASE} & {*names}))
     if verb != "train" and "scenario.path" in values:  # each map that is played has its own length of an episode

@@ -30,7 +30,7 @@ class TrainSettings(LearnerSettings):
     preset: str = UNSET
     action: str = UNSET  # which file of conf/action
     num_robots: Any = setting(3, "robots in a team; teams of several sizes at once as num_robots=2,3,4")
-    total_frames: int = setting(60_000, "macro steps of teams to train for", low=1, high=10**12)
+    total_frames: int = setting(240_000, "macro steps of teams to train for", low=1, high=10**12)
     episodes: int = setting(256, "episodes of the evaluation after training; 0: none", low=0)
     classical: Any = setting(None, "policies played beside the trained team")
     warm_start: str | None = setting(None, "policy to imitate first: a name, a folder, a run or module:function")
@@ -132,7 +132,7 @@ class BenchmarkSettings(LearnerSettings):
     seeds: Any = setting(None, "of training, starts and maps")
     episodes: int = setting(100, "episodes of each cell (a cell: one policy, scenario and seed)", low=1)
     num_robots: int = setting(3, "robots in a team", low=1)
-    total_frames: int = setting(20_000, "macro steps of teams to train each algorithm for", low=1, high=10**12)
+    total_frames: int = setting(80_000, "macro steps of teams to train each algorithm for", low=1, high=10**12)
     iterations: int | None = setting(None, "instead: iterations of one episode of each of the num_envs teams", low=1)
     maps: Any = setting("held_out", "evaluated on held_out, trained, held_out_together (so teams start), or several")
     train_maps: int | None = setting(

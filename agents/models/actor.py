@@ -45,6 +45,7 @@ TIME_LEFT = ("agents", "observation", "time_left")
 ALIVE = ("agents", "observation", "alive")
 TARGETS = ("agents", "observation", "targets")
 TARGETS_MASK = ("agents", "observation", "targets_mask")
+DECIDING = ("agents", "deciding")  # whose action counts, where robots decide when they arrive
 COVERAGE = ("info", "coverage")
 PARAMS = ("agents", "params")
 SEEN = ("agents", "seen")  # each robot as one vector: what the policy made of its observation, for critics

@@ -13,6 +13,7 @@ from maexp.agents.build import (
 )
 from maexp.agents.config.algorithms import ExpertSettings
 from maexp.agents.config.checks import team_sizes
+from maexp.agents.config.env import algorithm_settings
 from maexp.agents.config.groups import CollectorSettings
 from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError
@@ -70,7 +71,7 @@ def make_both(cfg: TrainSettings, maps: list[PointCloudMap]) -> tuple[Learner, E
 
 def make_actor(cfg: TrainSettings, policy: TensorDictModuleBase, env: ExplorationEnv) -> TensorDictModuleBase:
     """What acts in the training episodes of an env: the policy, with what the algorithm does besides."""
-    settings = cfg.algorithm
+    settings = algorithm_settings(cfg)
     if not isinstance(settings, ExpertSettings):
         return policy
     from maexp.agents.training.branch_rollouts import BranchingActor  # builds on the planners
@@ -84,6 +85,11 @@ def check_expert(cfg: TrainSettings) -> None:
         return
     if cfg.model.action != "targets" or cfg.planner.name == "direct":
         raise UserError("algorithm=expert_iteration learns what targets are worth: it needs action=targets.")
+    if cfg.scenario.decide == "arrival":
+        raise UserError(
+            "scenario.decide=arrival: algorithm=expert_iteration branches at decisions of whole teams. Add "
+            "algorithm=mappo, or leave that out."
+        )
     if cfg.tuning == "reference":
         raise UserError("tuning=reference: the original platform has no algorithm=expert_iteration. Leave tuning out.")
     if cfg.collector.backend != "single":

@@ -15,7 +15,7 @@ from maexp.envs.config.reward import RewardConfig
 from maexp.envs.config.robot import RobotConfig
 from maexp.envs.config.targets import TargetsConfig
 from maexp.envs.config_fields import choices_of, setting
-from maexp.envs.scenarios import Scenario, default_macro_steps
+from maexp.envs.scenarios.table import PROTOCOL, Scenario, default_macro_steps
 
 if TYPE_CHECKING:
     from maexp.envs.maps.point_cloud import PointCloudMap
@@ -50,7 +50,12 @@ class EnvSettings:
     odometry: OdometryConfig = setting(OdometryConfig(), "how far robots are from where they believe to be")
     targets: TargetsConfig = setting(TargetsConfig(), "how robots share targets out")
     lookahead: LookaheadConfig = setting(LookaheadConfig(), "how `policy=lookahead` plans")
-    local_steps: int | None = setting(None, "control steps of 0.1 s in one `env.step`", low=1)
+    local_steps: int | None = setting(
+        None,
+        "control steps of 0.1 s in one `env.step`; instead of decision_seconds, and an episode has as many steps "
+        "of the env as in the scenario's protocol",
+        low=1,
+    )
     macro_steps: int | None = setting(None, "`env.step` calls in an episode before it is truncated", low=1)
     collision: Literal["centre", "footprint"] = setting(
         "centre", "of centres with walls and centres, or footprint: of oriented rectangles"
@@ -65,6 +70,18 @@ class EnvSettings:
         "union", "whose: what the team has seen; or base, everyone: what the station, or every robot, knows"
     )
     num_threads: int | None = setting(None, "CPU threads of the simulation; results do not depend on it")
+    decision_seconds: float | Literal["protocol"] | None = setting(
+        None,
+        "from decision to decision, whole control steps of 0.1 s; protocol: as the scenario was published; an "
+        "episode lasts as long at every pace",
+        unit="s",
+        above=0,
+    )
+    decide: Literal["together", "arrival"] = setting(
+        "together",
+        "when: together, all robots at once; or arrival: each when it has arrived or its target is explored or taken, "
+        "and all after decision_seconds at the latest",
+    )
     first_env: int = setting(
         0, "number of the first env in the random keys, where processes share one batch of envs", low=0
     )
@@ -73,24 +90,34 @@ class EnvSettings:
     def completed(self, scenario: Scenario, maps: "Sequence[PointCloudMap]" = ()) -> Self:
         """With what is None taken from the scenario, each group checked, and a robot and a radar for each robot.
 
-        ``macro_steps`` stays None where the maps tell and none are given.
+        ``macro_steps`` stays None where the maps tell and none are given; ``decision_seconds`` has come to
+        ``local_steps`` and is None.
 
         Raises:
-            ValueError: a value of a group is out of its range (named).
+            ValueError: a value of a group is out of its range (named), or two settings say how often robots decide.
         """
+        if self.local_steps is not None and self.decision_seconds not in (None, PROTOCOL):
+            raise ValueError(
+                f"local_steps={self.local_steps} and decision_seconds={self.decision_seconds} both say how often "
+                "robots decide: give one of them"
+            )
         robots, radars = (
             tuple(config.completed(scenario) for config in per_robot(name, getattr(self, name), kind, self.num_robots))
             for name, kind in (("robot", RobotConfig), ("radar", RadarConfig))
         )
         others = {name: kind for name, kind in GROUPS.items() if name not in ("robot", "radar")}
         groups: dict[str, Any] = {name: one_config(name, getattr(self, name), kind) for name, kind in others.items()}
-        local_steps = scenario.local_steps if self.local_steps is None else self.local_steps
-        macro_steps = scenario.macro_steps if self.macro_steps is None else self.macro_steps
+        local_steps = scenario.decision_steps(self.local_steps, self.decision_seconds, self.decide)
+        macro_steps = self.macro_steps
+        if macro_steps is None:
+            macro_steps = scenario.episode_decisions(self.local_steps, local_steps)
         if not macro_steps and maps:
             team = [(robot.max_speed, radar.range) for robot, radar in zip(robots, radars, strict=True)]
             macro_steps = default_macro_steps(maps, scenario, team, local_steps)
         groups = {name: group.completed(scenario) for name, group in groups.items()}
-        steps: dict[str, Any] = {"local_steps": local_steps, "macro_steps": macro_steps}
+        if self.local_steps is None:
+            groups |= keep_seconds(groups, scenario, local_steps)
+        steps: dict[str, Any] = {"local_steps": local_steps, "macro_steps": macro_steps, "decision_seconds": None}
         return replace(self, robot=robots, radar=radars, **steps, **groups)
 
     @property
@@ -102,6 +129,21 @@ class EnvSettings:
     def episode_steps(self) -> int:
         """Local steps of a whole episode."""
         return (self.local_steps or 0) * (self.macro_steps or 0)
+
+
+def keep_seconds(groups: dict[str, Any], scenario: Scenario, steps: int) -> dict[str, Any]:
+    """The groups that count in decisions, so that they mean as many seconds at every pace: an imagined decision of
+    `lookahead` (branches of 1 s hardly differ), and `comm.period`.
+
+    Args:
+        steps: control steps from decision to decision.
+    """
+    lookahead, comm = groups["lookahead"], groups["comm"]
+    if lookahead.local_steps is None:
+        lookahead = replace(lookahead, local_steps=scenario.local_steps)
+    if comm.period != "auto":
+        comm = replace(comm, period=max(1, round(comm.period * scenario.local_steps / steps)))
+    return {"lookahead": lookahead, "comm": comm}
 
 
 GROUPS: dict[str, type[Group]] = {

@@ -34,7 +34,10 @@ class LookaheadConfig(Group):
     )
     horizon: int = setting(1, "decisions that are played, the first among them", low=1, high=MOST_HORIZON)
     local_steps: int | None = setting(
-        None, "control steps of 0.1 s in a decision that is played; default: as many as the env's own", low=1
+        None,
+        "control steps of 0.1 s in a decision that is played; default: of the scenario's protocol, or as "
+        "scenario.local_steps where that is set",
+        low=1,
     )
     unknown: Literal["free", "nearest", "predicted"] = setting(
         "free", "what is taken to stand where nobody has looked; nearest: what the nearest known cell holds; predicted"

@@ -69,6 +69,7 @@ def branch_env(
     settings = replace(
         env.settings,
         num_envs=count,
+        decide="together",
         comm=comm,
         limited=limited,
         local_steps=local_steps or env.local_steps,

@@ -17,6 +17,8 @@ from maexp.envs.maps.point_cloud import PointCloudMap
 from maexp.kernels.constants import DT
 
 LEAST_MACRO_STEPS = 10
+PROTOCOL = "protocol"
+"""The pace at which a scenario was published: `Scenario.local_steps` and `macro_steps`."""
 SWEEPS = 2.0
 """A team that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -57,11 +59,53 @@ class Scenario:
     body_width: float = setting(1.0, "of a robot", unit="m")
     collision_threshold: float = setting(0.75, "a centre this near to a wall or another centre collides", unit="m")
     clearance_factor: float = setting(help="the paper's: DWA keeps so many thresholds away (preset=paper)")
-    local_steps: int = setting(help="control steps of 0.1 s in one decision")
-    macro_steps: int | None = setting(None, "decisions in one episode, at most; default: from the free area")
+    local_steps: int = setting(help="control steps of 0.1 s in one decision; default: from decision_seconds")
+    macro_steps: int | None = setting(None, "decisions in one episode, at most; default: from its seconds")
     num_steering: int = setting(25, "DWA's candidates of the steering angle")
     max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
+    decision_seconds: float | str = setting(
+        1.0, "from decision to decision, or protocol: as the scenario was published", unit="s"
+    )
+
+    def decision_steps(
+        self, local_steps: int | None = None, seconds: float | str | None = None, decide: str = "together"
+    ) -> int:
+        """Control steps from decision to decision.
+
+        Args:
+            local_steps: what is said of them; else
+            seconds: of `EnvSettings.decision_seconds`; None: the scenario's, and the protocol's where robots decide
+                when they arrive, for then it is the longest time.
+            decide: of `EnvSettings`.
+
+        Raises:
+            ValueError: seconds that are no whole control steps.
+        """
+        if local_steps is not None:
+            return local_steps
+        if seconds is None:
+            seconds = self.decision_seconds if decide == "together" else PROTOCOL
+        if seconds == PROTOCOL:
+            return self.local_steps
+        steps = round(float(seconds) / DT)
+        if steps < 1 or abs(steps * DT - seconds) > 1e-6:
+            raise ValueError(
+                f"decision_seconds={seconds:g} is no whole number of control steps of {DT:g} s: give {DT:g} or a "
+                f"multiple, or {PROTOCOL} for the {DT * self.local_steps:g} s of scenario={self.name}"
+            )
+        return steps
+
+    def episode_decisions(self, local_steps: int | None, steps: int) -> int | None:
+        """Decisions of an episode, which lasts as long whatever the pace; None: that depends on the map.
+
+        Args:
+            local_steps: what is said of them: then an episode has as many decisions as the protocol's.
+            steps: control steps from decision to decision.
+        """
+        if self.macro_steps is None or local_steps is not None:
+            return self.macro_steps
+        return math.ceil(self.macro_steps * self.local_steps / steps - 1e-9)
 
     def with_radius(self, radius: float | None) -> "Scenario":
         """With a round robot of that radius [m], which collides where its body touches a wall; None: as it is."""

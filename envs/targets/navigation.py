@@ -55,6 +55,7 @@ class Navigation:
 
     Attributes:
         known: uint8 [E, R, C], `UNKNOWN`, `FREE` or `OBSTACLE` by cell (iy * width + ix).
+        known_count: int32 [E, R], cells that are not `UNKNOWN`.
         frontier: uint8 [E, R, C], known free cells with an unknown neighbour.
         distance: int32 [E, N, C], way from each robot over known free cells, 10 a cell; `UNREACHED` elsewhere.
         target: int64 [E, R, K], the cell to go to for each block with frontier cells; -1 = none.
@@ -105,13 +106,14 @@ class Navigation:
             wp.to_torch(getattr(self.grids, v)) for v in ("cell", "width", "height")
         )
         self.origin = wp.to_torch(self.grids.origin)
+        self._known_count = wp.to_torch(self.known_grids.known_count).view(e, r)
         self._known, self._frontier = (
             wp.to_torch(array).view(e, r, cells) for array in (self.known_grids.known, blocks.frontier)
         )
         self._distance = wp.to_torch(self.paths.search.distance).view(e, n, cells)
         self._stop = wp.to_torch(self.paths.search.stop).view(e, n)
         self._target, self._size = (wp.to_torch(array).view(e, r, -1) for array in (blocks.target_cell, blocks.size))
-        self._looked, self._count = wp.to_torch(blocks.looked), wp.to_torch(blocks.count)
+        self._looked, self._count = wp.to_torch(self.known_grids.looked), wp.to_torch(blocks.count)
 
     def some(self, envs: torch.Tensor) -> Navigation:
         """The same of some envs, int64 [S], by itself: what is there of the others stays as it is."""
@@ -164,6 +166,7 @@ class Navigation:
     def _update(self, launch: Launch) -> None:
         """The launches of `update` that are always the same."""
         self.known_grids.paint(launch)
+        self.known_grids.count(launch)
         self.passable.paint(launch)
         self.blocks.mark(launch)
         launch_named(launch, targets._locate_robots, self.paths.shape, self.values())
@@ -178,6 +181,10 @@ class Navigation:
     @property
     def known(self) -> torch.Tensor:
         return self.pick(self._known)
+
+    @property
+    def known_count(self) -> torch.Tensor:
+        return self.pick(self._known_count)
 
     @property
     def frontier(self) -> torch.Tensor:

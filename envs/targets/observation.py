@@ -125,8 +125,8 @@ class TargetView:
         near, around = gather_gain(point, torch.where(some, gain, 0.0), reach, NEAR + EDGE, AROUND + EDGE)
         speed, at = tracker.speed(nav), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
-        left = 1.0 - nav.state["macro_step"].float() / env.macro_steps
-        cells = (nav.known != 0).sum(-1).float() * nav.cell_of_env().unsqueeze(-1) ** 2
+        left = env.time_left(nav.state)
+        cells = nav.known_count.float() * nav.cell_of_env().unsqueeze(-1) ** 2
         return FeatureInputs(
             xp=torch,
             reach=reach,
@@ -178,6 +178,8 @@ class TargetView:
         if bool(((index < 0) | (index >= self.shown)).any()):
             raise ValueError(f"action target={int(index.min())}..{int(index.max())}: give 0 to {self.shown - 1}")
         s = self.state
+        if self.env.arrivals is not None:
+            index = self.env.arrivals.hold(index)
         named = torch.arange(self.count, device=index.device) == index.unsqueeze(-1)
         there = s["mask"] & (s["mask"] & named).any(-1, keepdim=True)  # who names what is not there drives anywhere
         if preference is None:

@@ -228,7 +228,11 @@ class TargetTracker:
         Returns:
             float32 [E, N, 2] [m].
         """
-        self.state["chosen"] = chosen.long().unsqueeze(-1).clone()
+        before, self.state["chosen"] = self.state["chosen"], chosen.long().unsqueeze(-1).clone()
+        if (arrivals := self.env.arrivals) is not None:
+            deciding = arrivals.state["deciding"].unsqueeze(-1)
+            self.state["chosen"] = torch.where(deciding, self.state["chosen"], before)
+            arrivals.propose(self.nav.points(cell.long().clamp_min(0)), chosen >= 0)
         return self.goals(chosen, cell, toward, waits)
 
     def goals(

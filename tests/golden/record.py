@@ -38,7 +38,7 @@ def settings(case: str) -> dict:
     clearance = 2.0 if planner == "wavefront" else clearance
     planning = PlannerConfig(name=planner, horizon=3, clearance_factor=clearance, clearance_weight=100.0)
     robot = RobotConfig(kind="ackermann", wheelbase="length")
-    return {"planner": planning, "robot": robot, "reward": REWARD}
+    return {"planner": planning, "robot": robot, "reward": REWARD, "decision_seconds": "protocol"}
 
 
 def play(case: str) -> dict[str, np.ndarray]:

@@ -123,7 +123,8 @@ def actor(word: str, env: ExplorationEnv):
 def digest(name: str, without: list[str]) -> str:
     """SHA-256 of all that a set-up has come to, but for what is left out."""
     word, settings = SETUPS[name]
-    settings = {"num_robots": 3, "scenario": "maze_small", "decisions": 3} | settings
+    pace = {"decision_seconds": "protocol"}
+    settings = {"num_robots": 3, "scenario": "maze_small", "decisions": 3} | pace | settings
     scenario, decisions = settings.pop("scenario"), settings.pop("decisions")
     maps = [make_map(scenario, index) for index in (0, 1)]
     env = ExplorationEnv(maps, 2, seed=SEED, num_threads=1, **settings)
