@@ -7,7 +7,7 @@ import torch
 from maexp.agents import make_critic, make_loss, make_policy
 from maexp.agents.algorithms.gae import write_advantages
 from maexp.agents.algorithms.registry import find_algorithm
-from maexp.agents.settings.model import ModelConfig
+from maexp.agents.config.model import ModelConfig
 from maexp.envs import CommConfig, ExplorationEnv, ObservationConfig, make_map
 from maexp.envs.recorder import CoverageRecorder
 

@@ -7,11 +7,11 @@ import torch
 from tensordict import TensorDict
 
 from maexp.agents.algorithms.updaters import Updater
-from maexp.agents.settings.algorithms import TUNINGS
-from maexp.agents.settings.compose import compose_config
-from maexp.agents.settings.env import decision_steps, episode_decisions
-from maexp.agents.settings.resolved import algorithm_settings, resolve
-from maexp.agents.settings.runs import continue_run
+from maexp.agents.config.algorithms import TUNINGS
+from maexp.agents.config.compose import compose_settings
+from maexp.agents.config.env import algorithm_settings, decision_steps, episode_decisions
+from maexp.agents.config.resolved import resolve
+from maexp.agents.config.runs import continue_run
 from maexp.envs import ExplorationEnv, make_map
 from maexp.envs.scenarios import find_scenario
 
@@ -35,10 +35,10 @@ def test_a_slower_pace_learns_from_all():
 
 def test_the_command_line_turns_seconds_into_discounts():
     words = ["algorithm=mappo", "scenario=indoor_medium", "scenario.local_steps=10", "algorithm.trace_seconds=5"]
-    found = algorithm_settings(compose_config("train", words))
+    found = algorithm_settings(compose_settings("train", words))
     assert (found.gamma, found.lmbda) == (1.0, pytest.approx(math.exp(-1.0 / 5.0)))  # action=targets sets gamma
     assert found.learn_share == 0.25  # its protocol decides every 4 s
-    reference = algorithm_settings(compose_config("train", [*words, "tuning=reference", "action=regions"]))
+    reference = algorithm_settings(compose_settings("train", [*words, "tuning=reference", "action=regions"]))
     assert (reference.gamma, reference.lmbda, reference.learn_share) == (0.99, 1.0, 1.0)
 
 
@@ -103,7 +103,7 @@ IR2 = ["algorithm=mappo", "scenario=ir2", "scenario.path=plan.png"]
 
 
 def compose(*words: str):
-    return compose_config("train", ["algorithm=mappo", "scenario=indoor_medium", *words])
+    return compose_settings("train", ["algorithm=mappo", "scenario=indoor_medium", *words])
 
 
 def test_a_run_stores_its_pace_as_steps():
@@ -129,11 +129,11 @@ def pace(cfg) -> tuple[int, int]:
     ],
 )
 def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):
-    from maexp.agents.settings.compose import compose_recipe
-    from maexp.agents.settings.env import find_followers
+    from maexp.agents.config.compose import compose_recipe
+    from maexp.agents.config.env import find_followers
 
     words = ["algorithm=mappo", "scenario=indoor_medium", *run]
-    cfg = compose_config("train", words)
+    cfg = compose_settings("train", words)
     saved = {"settings": resolve(cfg), "overrides": words, "followers": find_followers(cfg)}
     for verb in ("train", "evaluate"):
         again = compose_recipe(verb, continue_run(tmp_path, saved, new, verb))
@@ -142,6 +142,6 @@ def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):
 
 @pytest.mark.parametrize("verb, words", [("train", ["preset=paper"]), ("bench", ["task=env"]), ("train", IR2)])
 def test_protocols_and_throughput_keep_their_pace(verb, words):
-    cfg = compose_config(verb, words)
+    cfg = compose_settings(verb, words)
     row = find_scenario(cfg.scenario.name)
     assert pace(cfg) == (row.local_steps, row.macro_steps)
