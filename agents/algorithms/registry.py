@@ -8,6 +8,7 @@ from maexp.agents.algorithms.expert_iteration import ExpertUpdater
 from maexp.agents.algorithms.losses import ActorCriticLoss, ClippedLoss, TrustRegionLoss
 from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater, Updater
 from maexp.agents.models.critics import build_critic
+from maexp.agents.models.precision import float32_modules
 from maexp.agents.settings.algorithms import TUNINGS, AlgorithmSettings, Tunings
 from maexp.agents.settings.model import ModelConfig, model_config
 
@@ -55,6 +56,7 @@ class Algorithm:
         mixer = getattr(settings or self.settings, "mixer", "qmix")
         return build_critic(self.critic, env, model, mixer)
 
+    @float32_modules()
     def make_loss(self, policy, critic, settings: AlgorithmSettings | None = None):
         """The loss for a policy and critic, with its estimator of advantages."""
         settings = settings or self.settings

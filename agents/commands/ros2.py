@@ -10,6 +10,7 @@ from maexp.agents.benchmarks.suites.suite import load_suite, suite_names
 from maexp.agents.command_words import as_list
 from maexp.agents.commands.suite import claim_for, play, prepare_again
 from maexp.agents.deploy.planner.drivers import make_driver
+from maexp.agents.deploy.planner.estimate import ESTIMATE
 from maexp.agents.deploy.planner.team_driver import DriverSettings, check_name, read_settings
 from maexp.agents.errors import UserError, blame_input
 from maexp.agents.settings.runs import Recipe
@@ -67,7 +68,7 @@ def driver_settings(cfg: Ros2Settings) -> DriverSettings:
     several = [field.name for field in fields(DriverSettings) if isinstance(field.default, tuple)]
     for name in several:
         values[name] = as_list(values[name])
-        if name in ("offsets", "robot_radius"):
+        if name == "robot_radius" or (name == "offsets" and values[name] != list(ESTIMATE)):
             values[name] = [_number(name, value) for value in values[name]]
     return read_settings(values)
 
