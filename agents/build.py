@@ -64,7 +64,7 @@ def pick_device(name: str, setting: str = "device") -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
-        torch.empty(1, device=device)
+        torch.empty(1, dtype=torch.float32, device=device)
     except (RuntimeError, AssertionError) as error:
         why = str(error).splitlines()[0]
         raise UserError(f"{setting}={name} cannot be used here ({why}): try {setting}=cpu.") from error

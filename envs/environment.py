@@ -32,7 +32,15 @@ from maexp.kernels.observe import picture_shapes
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.reward import MARKS
 from maexp.kernels.state import STATE
-from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_START, ERRORS, REGIONS, ROOM_UNIT
+from maexp.kernels.types import (
+    ERROR_ACTION,
+    ERROR_CAPACITY,
+    ERROR_REGION,
+    ERROR_START,
+    ERRORS,
+    REGIONS,
+    ROOM_UNIT,
+)
 
 PICTURES = (("agents", "observation", "map"), ("team", "map"))
 """Observations that are pictures."""
@@ -76,6 +84,7 @@ class ExplorationEnv(EnvBase):
     targets_config = _setting("targets", "The `TargetsConfig`.")
     lookahead_config = _setting("lookahead", "The `LookaheadConfig`.")
 
+    @torch.inference_mode(False)  # made within it, the env is used outside, too
     def __init__(
         self,
         maps: PointCloudMap | Sequence[PointCloudMap],
@@ -93,6 +102,7 @@ class ExplorationEnv(EnvBase):
             check_room(m, [r.collision_threshold for r in settings.robot])
         self._set_up(settings, build_bank(maps, settings.radar), starts)
 
+    @torch.inference_mode(False)
     def _set_up(self, settings: EnvSettings, bank: MapBank, starts: str | np.ndarray | torch.Tensor = "drawn") -> None:
         """Build everything of an env from its complete settings and its maps."""
         EnvBase.__init__(self, device=settings.device, batch_size=torch.Size([settings.num_envs]))
@@ -135,6 +145,7 @@ class ExplorationEnv(EnvBase):
 
     # Reset and step
 
+    @torch.inference_mode(False)
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDict:
         state = self.simulation.tensors
         mask = torch.ones(self.num_envs, dtype=torch.int32, device=self.device)
@@ -168,6 +179,7 @@ class ExplorationEnv(EnvBase):
             merged[key] = drawn if before is None else before.index_copy(0, rows, drawn[rows])
         return super()._reset_proc_data(tensordict, tensordict_reset).update(merged)
 
+    @torch.inference_mode(False)
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         state, sim = self.simulation.tensors, self.simulation
         running = state["active"].clone()
@@ -211,10 +223,16 @@ class ExplorationEnv(EnvBase):
             if self.target_view is not None:
                 self.target_view.forget()
             given = action.get("goal", None)
-            return from_regions(self.simulation, action["region"], action["offset"]) if given is None else given, None
+            return self._from_regions(action) if given is None else given, None
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
         return self.target_view.take(action["target"], action.get("preference", None)), self.target_view.tells
+
+    def _from_regions(self, action: TensorDictBase) -> torch.Tensor:
+        region = action["region"]
+        odd = ((region < 0) | (region >= REGIONS**2)).flatten(1).any(1)
+        self.simulation.tensors["error"] |= odd.to(torch.int32) * ERROR_REGION
+        return from_regions(self.simulation, region, action["offset"])
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors
@@ -240,8 +258,8 @@ class ExplorationEnv(EnvBase):
         e, n, r = self.num_envs, self.num_robots, REGIONS
         pictures = self.observation_config.pictures
         picture, team = (blank(shape, self.device) if pictures else None for shape in picture_shapes(e, n))
-        pose = torch.empty((e, n, 4), device=self.device)
-        grid = torch.empty((e, n, 4, r, r), device=self.device)
+        pose = torch.empty((e, n, 4), dtype=torch.float32, device=self.device)
+        grid = torch.empty((e, n, 4, r, r), dtype=torch.float32, device=self.device)
         self.simulation.observe(picture, team, pose, grid, mask)
         state = self.simulation.tensors
         left = self.time_left(state)
@@ -276,7 +294,7 @@ class ExplorationEnv(EnvBase):
         length = self.settings.episode_steps
         area = s["covered_sum"] + (length - s["local_step"]) * s["covered"].long()
         info = {
-            "coverage": (s["covered"] / total).unsqueeze(-1),
+            "coverage": (s["covered"].float() / total).unsqueeze(-1),
             "coverage_auc": (area.double() / (length * total)).float().unsqueeze(-1),
             "local_steps": s["local_step"].unsqueeze(-1).clone(),
             "collided": s["collided"] != 0,
@@ -306,16 +324,16 @@ class ExplorationEnv(EnvBase):
         def tell(name: str, weight: torch.Tensor, sums: torch.Tensor) -> dict[str, torch.Tensor]:
             area = sums + (length - steps) * weight.long()
             mean = (area.double() / (length * total)).float()
-            return {name: (weight / total).unsqueeze(-1), f"{name}_auc": mean.unsqueeze(-1)}
+            return {name: (weight.float() / total).unsqueeze(-1), f"{name}_auc": mean.unsqueeze(-1)}
 
         info = tell("worst_coverage", s["known_weight"][:, :robots].amin(1), s["worst_sum"])
         info["told_step_95"] = s["told_step"].unsqueeze(-1).clone()
         info["bytes_sent"] = CELL_BYTES * s["cells_sent"].unsqueeze(-1)
-        info["connected"] = s["connected"] / steps.clamp_min(1).unsqueeze(-1)
+        info["connected"] = s["connected"].float() / steps.clamp_min(1).unsqueeze(-1)
         if self.comm_config.has_base:
             info |= tell("base_coverage", s["known_weight"][:, robots], s["base_sum"])
         if self.settings.done != "union":
-            info["counted_coverage"] = (s["counted"] / total).unsqueeze(-1)
+            info["counted_coverage"] = (s["counted"].float() / total).unsqueeze(-1)
         return info
 
     def _raise_errors(self) -> None:
@@ -336,6 +354,8 @@ class ExplorationEnv(EnvBase):
                 f"starts drawn at random left room for {room} of num_robots={self.num_robots} robots (env {env}): "
                 f"{NO_ROOM}"
             )
+        if code & ERROR_REGION:
+            raise ValueError(f"the action of env {env} names a region that is none: give 0 to {REGIONS**2 - 1}")
         raise ValueError(f"the action of env {env} is NaN or infinite: the policy has diverged or was fed wrongly")
 
     # Seeds, evaluation, state

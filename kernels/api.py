@@ -104,9 +104,9 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     maps = Maps()
     maps.free = wp.from_torch(free, dtype=wp.vec3)
     maps.free_begin, maps.free_cell = ints(0, count), ints(0, count)
-    padded = torch.zeros((blocks, 3), device=device)
+    padded = torch.zeros((blocks, 3), dtype=torch.float32, device=device)
     padded[: occluders.shape[0]] = occluders
-    radii = torch.zeros(blocks, device=device)
+    radii = torch.zeros(blocks, dtype=torch.float32, device=device)
     radii[: occluders.shape[0]] = radius
     maps.occluder, maps.occluder_radius = wp.from_torch(padded, dtype=wp.vec3), wp.from_torch(radii)
     maps.occluder_radius_max = wp.from_torch(radii.amax().reshape(1))
@@ -114,7 +114,7 @@ def _scan_once(free, occluders, radius, reach, alpha1, alpha2, heading, field_of
     maps.cells_x, maps.cells_y, maps.cell_begin = ints(1), ints(1), ints(0)
     maps.cell_origin = wp.from_torch(low.reshape(1, 2).contiguous(), dtype=wp.vec2)
     maps.cell_size = wp.from_torch(size.reshape(1))
-    maps.resolution = maps.outline_radius_max = wp.from_torch(torch.ones(1, device=device))
+    maps.resolution = maps.outline_radius_max = wp.from_torch(torch.ones(1, dtype=torch.float32, device=device))
     robots = Robots()
     robots.radar_range, robots.radar_cos_beam, robots.radar_alpha2 = full(reach), full(1.0 - alpha1), full(alpha2)
     robots.radar_cos_fov = full(math.cos(0.5 * field_of_view) if field_of_view < 2.0 * math.pi else -2.0)
@@ -229,7 +229,7 @@ def received_power(
     for name, (value, kind) in (numbers | {"origin": ((0.0, 0.0), wp.vec2), "cell_begin": (0, wp.int32)}).items():
         setattr(grids, name, wp.array([value], dtype=kind, device=device))
     finish_filling(device)
-    arrived = torch.empty(len(ends[0]), device=free.device)
+    arrived = torch.empty(len(ends[0]), dtype=torch.float32, device=free.device)
     values = {"senders": wp.from_torch(ends[0], dtype=wp.vec2), "receivers": wp.from_torch(ends[1], dtype=wp.vec2)}
     values |= {"grids": grids, "open": wp.from_torch(free.flatten().to(torch.uint8)), "radio": radio}
     values["power"] = wp.from_torch(arrived)

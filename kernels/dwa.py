@@ -350,7 +350,7 @@ def _plan_dwa(
 def list_curvatures(robots: dict[str, torch.Tensor], num_steering: int) -> torch.Tensor:
     """`Robots.curvature` of robots given by one [E, N] tensor per field: float32 [E, N, num_steering]."""
     shape, device = (*robots["kind"].shape, num_steering), robots["kind"].device
-    curvatures = torch.empty(shape, device=device)
+    curvatures = torch.empty(shape, dtype=torch.float32, device=device)
     launch_on(device)(
         _list_curvatures, shape, [robots_struct(robots, 0, shape[0]), num_steering, wp.from_torch(curvatures)]
     )

@@ -118,7 +118,7 @@ def choose_in_turn(
     """
     gain, value, point = (tensor.float().contiguous() for tensor in (gain, value, point))
     hears = hears.bool().contiguous()
-    score, claimed, left = torch.empty((3, *gain.shape), device=gain.device)
+    score, claimed, left = torch.empty((3, *gain.shape), dtype=torch.float32, device=gain.device)
     taken = torch.empty(gain.shape[:2], dtype=torch.int64, device=gain.device)
     waiting, best = torch.empty_like(taken, dtype=torch.bool), torch.empty_like(taken, dtype=torch.float32)
     launch_on(gain.device)(
@@ -200,7 +200,7 @@ def compare_with_mates(
         Four times float32 [E, N, M], infinite where there is nothing to compare with: the least way of another; the
         distance [m] to the nearest plan of another, to the own last target, to the nearest last target of another.
     """
-    found = [torch.empty(best.shape, device=point.device) for _ in range(4)]
+    found = [torch.empty(best.shape, dtype=torch.float32, device=point.device) for _ in range(4)]
     point, goes, went = (values.contiguous() for values in (point, plans[0], last[0]))
     best, ways, hears, plans_some, last_some = (
         values.contiguous() for values in (best, ways, hears, plans[1], last[1])
@@ -251,7 +251,7 @@ def gather_gain(
         gain: float32 [E, N, M].
         reach: [m].
     """
-    parts = [torch.empty((*gain.shape, gain.shape[-1]), device=gain.device) for _ in range(2)]
+    parts = [torch.empty((*gain.shape, gain.shape[-1]), dtype=torch.float32, device=gain.device) for _ in range(2)]
     point, gain = point.contiguous(), gain.contiguous()
     launch_on(gain.device)(
         _gather_gain,

@@ -83,7 +83,7 @@ class Simulation:
         if settings.drifts:
             self.believed = self.tensors | {name: self.tensors[f"{name}_estimate"] for name in ("pose", "center")}
         self.tensors["starts"].fill_(torch.inf)
-        self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, device=self.device)
+        self.map_starts = torch.full((num_maps, sizes["N"], 3), torch.inf, dtype=torch.float32, device=self.device)
         self.tensors["env_id"].copy_(torch.arange(sizes["E"], dtype=torch.int32))
         self.tensors["seed"].fill_(seed & 0x7FFFFFFF)
         self.tensors["episode"].fill_(-1)

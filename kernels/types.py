@@ -61,7 +61,9 @@ ERROR_START = 2
 """Bit of the error word: no free start was found for a robot."""
 ERROR_CAPACITY = 4
 """Bit of the error word: a scratch buffer overflowed."""
-ERRORS = ERROR_ACTION | ERROR_START | ERROR_CAPACITY
+ERROR_REGION = 8
+"""Bit of the error word: an action named a region that is none."""
+ERRORS = ERROR_ACTION | ERROR_START | ERROR_CAPACITY | ERROR_REGION
 ROOM_UNIT = 256
 """The error word of a team without room for all holds so many times the robots that had room before it was crowded."""
 

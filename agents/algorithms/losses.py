@@ -256,8 +256,8 @@ class ClippedLoss(TeamLoss):
 
     def __init__(self, *args, clip_epsilon: float, kl_coeff: float = 0.0, kl_target: float = 0.01, **settings):
         super().__init__(*args, **settings)
-        self.register_buffer("clip_epsilon", torch.tensor(clip_epsilon))
-        self.register_buffer("kl_coeff", torch.tensor(float(kl_coeff)))
+        self.register_buffer("clip_epsilon", torch.tensor(clip_epsilon, dtype=torch.float32))
+        self.register_buffer("kl_coeff", torch.tensor(float(kl_coeff), dtype=torch.float32))
         self.kl_target = kl_target
 
     def policy_terms(self, batch: TensorDictBase, dist: Heads | None = None) -> TensorDict:

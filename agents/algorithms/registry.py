@@ -10,6 +10,7 @@ from maexp.agents.algorithms.updaters import GradientUpdater, TrustRegionUpdater
 from maexp.agents.config.algorithms import TUNINGS, AlgorithmSettings, Tunings
 from maexp.agents.config.model import ModelConfig, model_config
 from maexp.agents.models.critics import build_critic
+from maexp.agents.models.precision import float32_modules
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,7 @@ class Algorithm:
         mixer = getattr(settings or self.settings, "mixer", "qmix")
         return build_critic(self.critic, env, model, mixer)
 
+    @float32_modules()
     def make_loss(self, policy, critic, settings: AlgorithmSettings | None = None):
         """The loss for a policy and critic, with its estimator of advantages."""
         settings = (settings or self.settings).at_pace()

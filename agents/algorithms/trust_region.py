@@ -135,7 +135,7 @@ class TRPO(torch.optim.Optimizer):
             share *= group["backtrack_factor"]
         for p, old in zip(params, before, strict=True):
             p.copy_(old)
-        zero = torch.zeros(())
+        zero = torch.zeros((), dtype=torch.float32)
         return _report(zero, zero, promised, 0.0, zero)
 
     @staticmethod

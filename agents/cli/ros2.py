@@ -13,6 +13,7 @@ from maexp.agents.config.checks import as_list
 from maexp.agents.config.runs import Recipe
 from maexp.agents.config.verbs import Ros2Settings
 from maexp.agents.deploy.planner.drivers import make_driver
+from maexp.agents.deploy.planner.estimate import ESTIMATE
 from maexp.agents.deploy.planner.team_driver import DriverSettings, check_name, read_settings
 from maexp.agents.errors import UserError, blame_input
 
@@ -66,7 +67,7 @@ def driver_settings(cfg: Ros2Settings) -> DriverSettings:
     several = [field.name for field in fields(DriverSettings) if isinstance(field.default, tuple)]
     for name in several:
         values[name] = as_list(values[name])
-        if name in ("offsets", "robot_radius"):
+        if name == "robot_radius" or (name == "offsets" and values[name] != list(ESTIMATE)):
             values[name] = [_number(name, value) for value in values[name]]
     return read_settings(values)
 

@@ -11,6 +11,7 @@ from maexp.agents.config.model import ModelConfig, model_config
 from maexp.agents.errors import UserError
 from maexp.agents.models.distributions import ACTION, Heads, RegionHeads
 from maexp.agents.models.encoder import compact, pools_pictures
+from maexp.agents.models.precision import float32_modules
 from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.models.target_generator import TargetGenerator
 from maexp.envs.targets.features import FEATURES
@@ -150,6 +151,7 @@ def build_network(config: ModelConfig, shape: ObservationShape) -> tuple[nn.Modu
     return TargetGenerator(config, shape.channels, shape.side, shape.regions), heads
 
 
+@float32_modules()
 def make_policy(env, model: "str | ModelConfig" = "small", radio: bool | None = None) -> ProbabilisticActor:
     """The trainable policy of a team, for the action that `env` takes.
 

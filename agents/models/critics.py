@@ -18,6 +18,7 @@ from maexp.agents.models.actor import (
     observation_shape,
 )
 from maexp.agents.models.encoder import CellEncoder, add_state
+from maexp.agents.models.precision import float32_modules
 from maexp.agents.models.target_chooser import SeenReader, TargetReader
 
 
@@ -141,8 +142,8 @@ class Critic(nn.Module):
         nn.init.orthogonal_(self.value[-1].weight, 0.1)
         nn.init.zeros_(self.value[-1].bias)
         self.mixer = make_mixer(mixer, hidden) if kind == "mixed" else None
-        self.register_buffer("offset", torch.zeros(()))
-        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("offset", torch.zeros((), dtype=torch.float32))
+        self.register_buffer("scale", torch.ones((), dtype=torch.float32))
         self.register_buffer("calibrated", torch.zeros((), dtype=torch.bool))
 
     def forward(self, *observation: Tensor):
@@ -170,6 +171,7 @@ class Critic(nn.Module):
         self.calibrated.fill_(True)
 
 
+@float32_modules()
 def build_critic(kind: str, env, model: "str | ModelConfig" = "small", mixer: str = "qmix") -> TensorDictModule:
     """A critic of the given kind for the specs of `env`.
 

@@ -59,9 +59,9 @@ def resampling(centres: Tensor, first: float, step: float, cells: int) -> Tensor
     """
     count = centres.shape[-1]
     pitch = (centres[:, -1:] - centres[:, :1]) / max(count - 1, 1) / SUBCELLS
-    steps = torch.arange(count * SUBCELLS, device=centres.device) - (count * SUBCELLS - 1) / 2
+    steps = torch.arange(count * SUBCELLS, dtype=torch.float32, device=centres.device) - (count * SUBCELLS - 1) / 2
     targets = (centres[:, :1] + centres[:, -1:]) / 2 + steps * pitch
-    source = torch.arange(cells, device=centres.device) * step + first
+    source = torch.arange(cells, dtype=torch.float32, device=centres.device) * step + first
     reach = pitch.abs().clamp_min(step).unsqueeze(1)
     weights = (1 - (targets.unsqueeze(1) - source.unsqueeze(-1)).abs() / reach).clamp_min(0)
     return weights / weights.sum(1, keepdim=True).clamp_min(1e-6)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from maexp.agents.deploy.planner.bundle import WEIGHTS
+from maexp.agents.models.precision import float32_modules
 from maexp.kernels.constants import FREE, OBSTACLE
 
 PATCH = 2  # cells along a side that the network looks at as one place
@@ -33,7 +34,7 @@ class Layer(nn.Module):
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
         nn.init.kaiming_normal_(self.conv.weight)
-        self.bias = nn.Parameter(0.1 * torch.randn(outputs))
+        self.bias = nn.Parameter(0.1 * torch.randn(outputs, dtype=torch.float32))
 
     def forward(self, places: Tensor) -> Tensor:
         """[batch, inputs, h, w] -> [batch, outputs, h / stride, w / stride]."""
@@ -123,9 +124,9 @@ def sample_worlds(chance: Tensor, count: int, seed: int = 0, length: float = 3.0
     draw = torch.Generator().manual_seed(seed)
     reach = math.ceil(3 * length)
     size = [side + 2 * reach for side in chance.shape[1:]]
-    field = torch.randn((count, 1, *size), generator=draw)
+    field = torch.randn((count, 1, *size), generator=draw, dtype=torch.float32)
     if reach:
-        weight = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / length) ** 2)
+        weight = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=torch.float32) / length) ** 2)
         weight = weight / weight.norm()  # keeps the variance 1
         field = F.conv2d(F.conv2d(field, weight.view(1, 1, 1, -1)), weight.view(1, 1, -1, 1))
     level = torch.special.ndtr(field[:, 0]).to(chance.device)  # uniform in [0, 1]
@@ -138,7 +139,7 @@ def predict_by_distance(known: Tensor, predictor: str = "general") -> Tensor:
 
     Cheap and calibrated over all unknown cells, but blind: what a predictor has to be better than.
     """
-    table = torch.tensor(contract_of(predictor)["by_distance"], device=known.device)
+    table = torch.tensor(contract_of(predictor)["by_distance"], dtype=torch.float32, device=known.device)
     chance = table[distance_to_free(known, len(table) - 1).long()]
     chance = torch.where(known == FREE, 1.0, chance)
     return torch.where(known == OBSTACLE, 0.0, chance)
@@ -179,6 +180,7 @@ def contract_of(name: str | Path) -> dict:
 
 
 @cache
+@float32_modules()
 def load_predictor(name: str | Path = "general", device: str = "cpu") -> MapPredictor:
     """A predictor that ships, by its name, or one in a folder of one's own.
 

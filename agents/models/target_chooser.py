@@ -100,7 +100,8 @@ class TargetEncoder(nn.Module):
             comm: who hears whom, bool [batch, robots, robots]
         """
         team, flat = features.shape[:2], some.flatten(0, 1)
-        hidden = torch.zeros(flat.shape, device=flat.device).masked_fill(~flat, -torch.inf).unsqueeze(1)
+        hidden = torch.zeros(flat.shape, dtype=torch.float32, device=flat.device)
+        hidden = hidden.masked_fill(~flat, -torch.inf).unsqueeze(1)
         targets = self.among_targets(self.inputs(features).flatten(0, 1), hidden)
         weight = flat.unsqueeze(-1).to(targets.dtype)
         mean = ((targets * weight).sum(1) / weight.sum(1)).unflatten(0, team)

@@ -150,4 +150,4 @@ class TargetGenerator(nn.Module):
 def contact_bias(comm: Tensor) -> Tensor:
     """0 where robot i hears robot j or is j, -inf elsewhere; shape [batch, robots, robots]."""
     own = torch.eye(comm.shape[-1], dtype=torch.bool, device=comm.device)
-    return torch.zeros(comm.shape, device=comm.device).masked_fill(~(comm | own), -math.inf)
+    return torch.zeros(comm.shape, dtype=torch.float32, device=comm.device).masked_fill(~(comm | own), -math.inf)

@@ -20,6 +20,7 @@ from maexp.agents.deploy.planner.bundle import (
 )
 from maexp.agents.errors import UserError
 from maexp.agents.models.actor import make_policy, mismatched
+from maexp.agents.models.precision import float32_modules
 from maexp.agents.models.target_chooser import TargetChooser
 from maexp.agents.policies.classical import POLICIES
 from maexp.agents.policies.export import find_chooser
@@ -60,6 +61,7 @@ def load_policy_folder(spec: str, env: ExplorationEnv, setting: str = "policy") 
     return policy.to(env.device)
 
 
+@float32_modules()
 def load_chooser(spec: str, setting: str = "policy") -> tuple[TargetChooser, int]:
     """The network of a trained policy, on the CPU, and how many candidates it is shown.
 
@@ -82,6 +84,7 @@ def read_model(spec: str, setting: str = "policy") -> ModelConfig:
     return _read_network(*open_policy(spec, setting))[0]
 
 
+@float32_modules()
 def _read_network(folder: Path, contract: Contract) -> tuple[ModelConfig, dict[str, Tensor]]:
     """Settings and weights of a policy's network; UserError where they do not fit each other."""
     from safetensors import SafetensorError

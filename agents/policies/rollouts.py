@@ -78,7 +78,7 @@ class Rollouts:
         to the next.
         """
         self.branches.look(teams)
-        return torch.full((len(teams),), torch.nan, device=teams.device)
+        return torch.full((len(teams),), torch.nan, dtype=torch.float32, device=teams.device)
 
     def weigh(
         self, robot: int, mine: dict[str, torch.Tensor], chosen: torch.Tensor, wanted: torch.Tensor, kept: torch.Tensor
@@ -142,8 +142,8 @@ class Rollouts:
         gained, played, lost = (state[name] - before[name] for name in ("covered", "local_step", "collided"))
         over_time = state["covered_sum"] - before["covered_sum"] - played * before["covered"].long()
         over_time = over_time + (steps - played) * gained  # of an episode that has ended
-        area = (over_time / steps + self.config.rest * gained) / self.branches.disc()
-        return (area - self.config.loss * lost.sum(-1)).float()
+        area = (over_time.float() / steps + self.config.rest * gained.float()) / self.branches.disc()
+        return area - self.config.loss * lost.sum(-1).float()
 
     def _brief(self, block: torch.Tensor) -> None:
         """Let the rollout policy remember what was given up, and where robots go now."""

@@ -116,7 +116,7 @@ class BranchRollouts:
         there[..., 1:] &= (index[..., 1:] != own.unsqueeze(-1)) & there[..., :1]
         if isinstance(self.rollouts, ToldRollouts) and self.env.strategy is not None:
             there[..., 1:] &= ~self.env.strategy.busy().unsqueeze(-1)  # whatever they choose is not what they do
-        worth = torch.full(index.shape, torch.nan)
+        worth = torch.full(index.shape, torch.nan, dtype=torch.float32)
         teams = active.nonzero().squeeze(-1)
         for some in teams.split(self.rollouts.branches.teams) if len(teams) else ():
             worth[some] = self._weigh(some, {name: array[some] for name, array in (mine | {"wanted": there}).items()})
@@ -140,7 +140,7 @@ class BranchRollouts:
         drawn for every robot, so that near candidates are tried as well as those where there is much to see. To tell
         the base station is always tried."""
         mask = self.view.state["mask"]
-        beta = torch.empty(mask.shape[:2]).uniform_(0.0, 0.3, generator=self.draw).unsqueeze(-1)
+        beta = torch.empty(mask.shape[:2], dtype=torch.float32).uniform_(0.0, 0.3, generator=self.draw).unsqueeze(-1)
         value = features[..., SCORE] - beta * features[..., TRAVEL].expm1()
         if self.view.contacts is None:
             return torch.where(mask, value, -torch.inf)
@@ -179,7 +179,7 @@ class BranchingActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = self.policy(tensordict)
         features = tensordict[TARGETS]
-        among = torch.rand(len(features), device=features.device) < self.share
+        among = torch.rand(len(features), dtype=torch.float32, device=features.device) < self.share
         tried, worth = self.rollouts.try_candidates(features, tensordict[PREFERENCE], among)
         tensordict[TRIED], tensordict[ADVANTAGE] = tried.to(torch.int8), worth
         return tensordict
@@ -199,14 +199,15 @@ def play_round(env: ExplorationEnv, rollouts: BranchRollouts, config: BranchingC
     found, td, draw = [], env.reset(), rollouts.draw
     running = torch.ones(env.num_envs, dtype=torch.bool)
     phase = int(torch.randint(config.every, (1,), generator=draw))
-    share = 2.0 * config.departures * torch.rand(env.num_envs, 1, generator=draw)
+    share = 2.0 * config.departures * torch.rand(env.num_envs, 1, generator=draw, dtype=torch.float32)
     for step in range(env.macro_steps):
         features, mask = td[TARGETS], td[TARGETS_MASK]
         preference = torch.where(mask, features[..., SCORE], NEVER)
         if step % config.every == phase:
             found += [describe(env, step, features, mask, *rollouts.try_candidates(features, preference))]
-        leaves = torch.rand(mask.shape[:2], generator=draw) < share
-        other = rollouts.rank_for_trial(features) + DEPARTURE * torch.rand(mask.shape, generator=draw)
+        leaves = torch.rand(mask.shape[:2], generator=draw, dtype=torch.float32) < share
+        noise = torch.rand(mask.shape, generator=draw, dtype=torch.float32)
+        other = rollouts.rank_for_trial(features) + DEPARTURE * noise
         preference = torch.where(leaves.unsqueeze(-1), other, preference).clamp_min(NEVER)
         td[(*ACTION, "preference")], td[(*ACTION, "target")] = preference, preference.argmax(-1)
         td = env.step(td)

@@ -78,7 +78,7 @@ class ContactView:
             nav.pick(tensor) for tensor in (memory._disc(), *(memory.state[name] for name in ("met", "told", "place")))
         )
         known, linked, step = (nav.pick(tensor) for tensor in (memory.known, memory.linked, memory.step))
-        since = (step.unsqueeze(-1) - met) / steps
+        since = (step.unsqueeze(-1) - met).float() / steps
         untold = (known.unsqueeze(-1) - told) / disc.unsqueeze(-1)
         point = inputs.to + inputs.at.unsqueeze(2)
         others = ~torch.eye(n, dtype=torch.bool, device=point.device).expand(len(point), -1, -1)

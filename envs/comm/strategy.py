@@ -271,7 +271,7 @@ class Strategy:
     def _disc(self) -> torch.Tensor:
         """What a radar's disc of free ground weighs on each env's map, float32 [E, 1]."""
         maps = self.env.simulation.map_tensors
-        area = torch.tensor([world.free_area for world in self.env.maps], device=self.env.device)
+        area = torch.tensor([world.free_area for world in self.env.maps], dtype=torch.float32, device=self.env.device)
         return (maps["total_weight"] / area * torch.pi * self.reach**2)[self.sim["map_id"].long()].view(-1, 1)
 
     def _relay(self) -> tuple[torch.Tensor, torch.Tensor]:

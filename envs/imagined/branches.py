@@ -148,7 +148,7 @@ class Branches:
     def disc(self) -> torch.Tensor:
         """What a radar's disc of free ground weighs in each branch, float32 [T * copies]."""
         tensors = self.env.simulation.map_tensors
-        area = torch.tensor([world.free_area for world in self.env.maps], device=self.env.device)
+        area = torch.tensor([world.free_area for world in self.env.maps], dtype=torch.float32, device=self.env.device)
         reach = max(radar.range for radar in self.env.radar_configs)
         weight = tensors["total_weight"] / area * torch.pi * reach**2
         return weight[self.env.simulation.tensors["map_id"].long()]

@@ -302,7 +302,7 @@ def guess_nearest(known: torch.Tensor) -> torch.Tensor:
     Returns:
         float32 [B, H, W].
     """
-    found = torch.ones(known.shape)
+    found = torch.ones(known.shape, dtype=torch.float32)
     for grid, chance in zip(known.cpu().numpy(), found, strict=True):
         if (grid != UNKNOWN).any():
             nearest = distance_transform_edt(grid == UNKNOWN, return_distances=False, return_indices=True)

@@ -165,10 +165,15 @@ class FeatureInputs:
         """At most `FAR`."""
         return self.xp.clip(ranges, None, FAR)
 
+    def count(self, flags: Array) -> Array:
+        """How many of the last axis are true, [..., 1]."""
+        return self.xp.sum(flags, -1, dtype=self.travel.dtype)[..., None]
+
     def features(self) -> Array:
         """[..., N, M, F], in the order of `feature_names`; 0 where there is no candidate."""
         xp = self.xp
-        columns = [xp.broadcast_to(feature.of(self), self.mask.shape) for feature in self.table.values()]
+        columns = [xp.asarray(feature.of(self), dtype=self.travel.dtype) for feature in self.table.values()]
+        columns = [xp.broadcast_to(column, self.mask.shape) for column in columns]
         return xp.where(self.mask[..., None], xp.stack(columns, -1), 0.0)
 
 
@@ -215,16 +220,14 @@ TABLE: dict[str, Feature] = {
     "own_last": Feature(lambda now: now.near(now.own_last), RANGES, "to the own latest target"),
     "mates_last": Feature(lambda now: now.near(now.mates_last), RANGES, "to the nearest latest target of another"),
     # The robot and its team, the same for all candidates.
-    "count": Feature(
-        lambda now: now.xp.sum(now.frontiers, -1)[..., None] / 10.0, "10 candidates", "how many there are"
-    ),
+    "count": Feature(lambda now: now.count(now.frontiers) / 10.0, "10 candidates", "how many there are"),
     "speed": Feature(lambda now: now.speed / now.max_speed, "of max_speed", "speed"),
     "drive": Feature(lambda now: now.drive / now.reach, RANGES, "way driven until the next decision"),
     "time_left": Feature(lambda now: now.time_left, "share of the whole time", "time left"),
     "known": Feature(
         lambda now: now.xp.log(1.0 + now.area / (math.pi * now.reach**2)), f"log(1 + {DISCS})", "area known"
     ),
-    "mates": Feature(lambda now: now.xp.sum(now.mates, -1)[..., None] / 4.0, "4 robots", "others that move"),
+    "mates": Feature(lambda now: now.count(now.mates) / 4.0, "4 robots", "others that move"),
 }
 FEATURES = tuple(TABLE)
 """Names of the last axis of the features."""

@@ -154,8 +154,9 @@ class Navigation:
         shape, device = (looks, self.num_robots, most), self.device
         self.block = torch.empty((looks, 1, most), dtype=torch.int64, device=device)
         self.cell = torch.empty((looks, self.rows, most), dtype=torch.int64, device=device)
-        self.point, self.way = torch.empty((*shape, 2), device=device), torch.empty(shape, device=device)
-        self.around = torch.empty(shape, device=device)
+        self.point = torch.empty((*shape, 2), dtype=torch.float32, device=device)
+        self.way = torch.empty(shape, dtype=torch.float32, device=device)
+        self.around = torch.empty(shape, dtype=torch.float32, device=device)
         values = (
             self.values()
             | {"point": view(self.point, wp.vec2)}
@@ -217,8 +218,8 @@ class Navigation:
         """
         start = self._spread(self.target if cells is None else cells).flatten(0, 1)
         grid = self.known_grids.known if known is None else wp.from_torch(known.flatten(0, 1).contiguous())
-        area = torch.empty(start.shape, device=self.device)
-        middle = torch.empty((*start.shape, 2), device=self.device)
+        area = torch.empty(start.shape, dtype=torch.float32, device=self.device)
+        middle = torch.empty((*start.shape, 2), dtype=torch.float32, device=self.device)
         self.launch(
             information_gain._look_around,
             tuple(area.shape),
@@ -241,8 +242,8 @@ class Navigation:
 
         What still holds since the last time is not computed again.
         """
-        area = torch.empty(self.cell.shape, device=self.device)
-        middle = torch.empty((*self.cell.shape, 2), device=self.device)
+        area = torch.empty(self.cell.shape, dtype=torch.float32, device=self.device)
+        middle = torch.empty((*self.cell.shape, 2), dtype=torch.float32, device=self.device)
         radius = float(self.radar_range)
         ray_cell, ray_part = self._spread_rays(radius)
         values = self.values() | {
@@ -278,7 +279,7 @@ class Navigation:
         self._need_all("grow_trees")
         found = torch.zeros_like(self._target).flatten(0, 1)
         items = self.num_envs * self.num_robots
-        node = torch.empty((items, samples, 2), device=self.device)
+        node = torch.empty((items, samples, 2), dtype=torch.float32, device=self.device)
         state = [self.arrays[name] for name in ("seed", "env_id", "episode", "macro_step")]
         cells = branch / float(self.cell_size.max())
         self.launch(
@@ -319,7 +320,7 @@ class Navigation:
         m = self.state["map_id"].long()
         shape = (-1,) + (1,) * (cells.dim() - 1)
         width = self.width[m].long().view(shape)
-        index = torch.stack([cells % width, cells // width], dim=-1) + 0.5
+        index = torch.stack([cells % width, cells // width], dim=-1).float() + 0.5
         return self.origin[m].view(*shape, 2) + index * self.cell_size[m].view(*shape, 1)
 
     def points_on_way(self, cells: torch.Tensor, ahead: float) -> torch.Tensor:
@@ -385,7 +386,7 @@ class Navigation:
             bool [E, N].
         """
         self._need_all("leads_through_open_ground")
-        share = torch.linspace(0.0, 1.0, OPEN_SAMPLES, device=self.device).view(1, 1, -1, 1)
+        share = torch.linspace(0.0, 1.0, OPEN_SAMPLES, dtype=torch.float32, device=self.device).view(1, 1, -1, 1)
         at = self.centers().unsqueeze(2)
         m = self.state["map_id"].long().view(-1, 1, 1)
         cell = (at + share * (points.unsqueeze(2) - at) - self.origin[m]) / self.cell_size[m].unsqueeze(-1)

@@ -46,13 +46,15 @@ class TargetView:
         self.features = len(feature_names(self.contacts is not None))
         self.tells = torch.zeros(shape, dtype=torch.bool, device=device)
         self.state = {
-            "last": torch.zeros((*shape, 2), device=device),  # where each robot's latest target was [m]
+            # where each robot's latest target was [m]
+            "last": torch.zeros((*shape, 2), dtype=torch.float32, device=device),
             "has_last": torch.zeros(shape, dtype=torch.bool, device=device),
             "block": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # the candidates' numbers
             "cell": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # and grid cells
-            "point": torch.zeros((*shape, count, 2), device=device),  # and where they are [m]
-            "toward": torch.zeros((*shape, count, 2), device=device),  # middle of the unknown, from there [m]
-            "way": torch.zeros((*shape, count), device=device),  # how far it is to drive there [m]
+            "point": torch.zeros((*shape, count, 2), dtype=torch.float32, device=device),  # and where they are [m]
+            # middle of the unknown, from there [m]
+            "toward": torch.zeros((*shape, count, 2), dtype=torch.float32, device=device),
+            "way": torch.zeros((*shape, count), dtype=torch.float32, device=device),  # how far it is to drive there [m]
             "mask": torch.zeros((*shape, count), dtype=torch.bool, device=device),
         }
 
@@ -68,7 +70,7 @@ class TargetView:
             return self.show(self.tracker.look())[0]
         shape = (*self.state["mask"].shape[:2], self.shown)
         blank = {
-            "features": torch.zeros((*shape, self.features), device=mask.device),
+            "features": torch.zeros((*shape, self.features), dtype=torch.float32, device=mask.device),
             "mask": torch.zeros(shape, dtype=torch.bool, device=mask.device),
         }
         envs = mask.nonzero().squeeze(-1)

@@ -154,10 +154,10 @@ class TargetTracker:
         shape, device = (env.num_envs, env.num_robots), env.device
         self.state = {
             "dwell": torch.zeros((*shape, self.nav.num_blocks), dtype=torch.int32, device=device),
-            "chosen": torch.full((*shape, 1), -1, device=device),
-            "stood": torch.zeros((*shape, 2), device=device),
+            "chosen": torch.full((*shape, 1), -1, dtype=torch.int64, device=device),
+            "stood": torch.zeros((*shape, 2), dtype=torch.float32, device=device),
             "counted": torch.full((env.num_envs,), -1, dtype=torch.int32, device=device),
-            "home": torch.full((*shape, 2), torch.nan, device=device),
+            "home": torch.full((*shape, 2), torch.nan, dtype=torch.float32, device=device),
         }
         robots = env.simulation.robot_tensors
         half = 0.5 * torch.hypot(robots["length"], robots["width"])
@@ -337,7 +337,7 @@ class TargetTracker:
 def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:
     """Numbers in [0, 1), float32 [E, N, count], from (seed, env, episode, macro step) alone (`kernels.goals`)."""
     state = env.simulation.tensors
-    draw = torch.empty((env.num_envs, env.num_robots, count), device=env.device)
+    draw = torch.empty((env.num_envs, env.num_robots, count), dtype=torch.float32, device=env.device)
     keys = [view(state[name]) for name in ("seed", "env_id", "episode", "macro_step")]
     launch_on(env.device)(goals._draw_uniform, tuple(draw.shape), [*keys, view(draw)])
     return draw

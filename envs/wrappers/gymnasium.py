@@ -13,7 +13,16 @@ from tensordict import TensorDict, TensorDictBase
 
 from maexp.envs.environment import ExplorationEnv
 from maexp.envs.specs import OF_TEAM
-from maexp.envs.wrappers.spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
+from maexp.envs.wrappers.spaces import (
+    MASK,
+    action_space,
+    check_seed,
+    named,
+    observation_space,
+    settle,
+    to_action,
+    to_numpy,
+)
 
 
 class TeamVectorEnv(VectorEnv):
@@ -75,8 +84,8 @@ class TeamVectorEnv(VectorEnv):
 
         With a seed they are the seed's first ones, otherwise the next ones.
         """
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
-            raise ValueError(f"seed={seed!r} must be a whole number: all teams' numbers come from it")
+        if seed is not None:
+            check_seed(seed)
         mask = (options or {}).get("reset_mask")
         if mask is not None:
             mask = np.asarray(mask)

@@ -11,7 +11,16 @@ from tensordict import TensorDictBase
 
 from maexp.envs.environment import ExplorationEnv
 from maexp.envs.specs import OF_TEAM
-from maexp.envs.wrappers.spaces import MASK, action_space, named, observation_space, settle, to_action, to_numpy
+from maexp.envs.wrappers.spaces import (
+    MASK,
+    action_space,
+    check_seed,
+    named,
+    observation_space,
+    settle,
+    to_action,
+    to_numpy,
+)
 
 COLLIDED = ("stay", "leave")
 
@@ -76,9 +85,13 @@ class TeamParallelEnv(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        """Start the seed's first episode, or without a seed the next one; there are no options."""
+        """Start the seed's first episode, or without a seed the next one; there are no options.
+
+        Raises:
+            ValueError: the seed is no whole number, 0 or more.
+        """
         if seed is not None:
-            self.env._set_seed(seed)  # set_seed() would seed torch's own generator, too
+            self.env._set_seed(check_seed(seed))  # set_seed() would seed torch's own generator, too
         self._now = self.env.reset()
         self.agents = list(self.possible_agents)
         return self._tell()

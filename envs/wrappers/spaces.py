@@ -123,6 +123,17 @@ def to_action(actions, kind: str, targets: int, env: ExplorationEnv) -> TensorDi
     return TensorDict({"agents": {"action": inner}}, batch_size=shape[:1], device=env.device)
 
 
+def check_seed(seed) -> int:
+    """The seed that `reset` is given.
+
+    Raises:
+        ValueError: it is no whole number, 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"seed={seed!r} must be a whole number, 0 or more: all random numbers come from it")
+    return int(seed)
+
+
 def _in_metres(env: ExplorationEnv, goal: np.ndarray) -> torch.Tensor:
     """Goals [m] in shares of half the extent, from its middle; one outside counts as its border, NaN stays."""
     number = env.simulation.tensors["map_id"].long()

@@ -230,9 +230,12 @@ class RobotDriver(RadioDriver):
     def known(self, notes: list[str]) -> OccupancyGrid | None:
         """As of `RadioDriver`; nothing without a map of its own."""
         own = super()._merge(notes)
-        return None if own is None else self._add_told([own], notes, self.planner.team.radar_range)
+        return None if own is None else self._add_told([own], notes, self._reach())
 
     _merge = known
+
+    def _reach(self) -> float:
+        return self.planner.team.radar_range
 
     def _check_frames(self) -> None:
         """A robot's own map called `map` begins where that robot began, and mates' maps elsewhere."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Hashable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -51,15 +52,39 @@ def read_map(message) -> OccupancyGrid:
     """The grid of a nav_msgs/OccupancyGrid.
 
     Raises:
-        ValueError: it has not as many cells as it says.
+        ValueError: it has not as many cells as it says, or its origin is none.
     """
     info = message.info
-    values = np.asarray(message.data, dtype=np.int8)
+    try:
+        values = np.asarray(message.data, dtype=np.int8)
+    except (OverflowError, TypeError):
+        raise ValueError("its data are not int8, -1 to 100") from None
     if values.size != info.height * info.width:
         raise ValueError(f"a map of {info.width} x {info.height} cells came with {values.size} of them")
-    place = info.origin.position
-    origin = (place.x, place.y, read_yaw(info.origin.orientation))
+    origin = read_pose(info.origin)
     return OccupancyGrid(values.reshape(info.height, info.width), float(f"{info.resolution:.7g}"), origin)
+
+
+def apply_update(message, update):
+    """A nav_msgs/OccupancyGrid with a map_msgs/OccupancyGridUpdate written into it, as a new message.
+
+    Raises:
+        ValueError: the update does not lie within the map, or has not as many cells as it says.
+    """
+    info, cells = message.info, np.asarray(update.data)
+    x, y, width, height = update.x, update.y, update.width, update.height
+    if not (0 <= x <= x + width <= info.width and 0 <= y <= y + height <= info.height):
+        raise ValueError(
+            f"an update of {width} x {height} cells at {x}, {y} lies outside of {info.width} x {info.height}"
+        )
+    if cells.size != width * height:
+        raise ValueError(f"an update of {width} x {height} cells came with {cells.size} of them")
+    values = read_map(message).values.copy()
+    values[y : y + height, x : x + width] = cells.reshape(height, width)
+    made = copy(message)
+    made.header, made.data = copy(message.header), values.ravel()
+    made.header.stamp = update.header.stamp
+    return made
 
 
 def fill_grid(message, frame: str, grid: OccupancyGrid) -> None:
@@ -76,8 +101,11 @@ def read_time(stamp) -> float:
 
 
 def read_pose(pose) -> Pose:
-    """Of a geometry_msgs/Pose."""
-    return pose.position.x, pose.position.y, read_yaw(pose.orientation)
+    """Of a geometry_msgs/Pose; NaN where its numbers are beyond all bounds."""
+    try:
+        return pose.position.x, pose.position.y, read_yaw(pose.orientation)
+    except OverflowError:
+        return math.nan, math.nan, math.nan
 
 
 def fill_pose(pose, x: float, y: float, yaw: float) -> None:
@@ -113,13 +141,22 @@ class Frames:
         """A tf2_msgs/TFMessage; `still`: it is of /tf_static, whose frames stay where they are."""
         for transform in message.transforms:
             move = transform.transform
-            pose = (move.translation.x, move.translation.y, read_yaw(move.rotation))
+            try:
+                pose = (move.translation.x, move.translation.y, read_yaw(move.rotation))
+            except OverflowError:
+                continue
             time = math.inf if still else read_time(transform.header.stamp)
             self.put(transform.child_frame_id, transform.header.frame_id, pose, time)
 
     def put(self, frame: str, parent: str, pose: Pose, time: float) -> None:
-        """Where a frame stands since `time` [s]; names may begin with a slash, as in ROS 1."""
-        self.parents[frame.lstrip("/")] = (parent.lstrip("/"), pose, time)
+        """Where a frame stands since `time` [s]; names may begin with a slash, as in ROS 1. A pose that is not finite
+        changes nothing: the last one counts until it is too old."""
+        if all(map(math.isfinite, pose)):
+            self.parents[frame.lstrip("/")] = (parent.lstrip("/"), pose, time)
+
+    def forget_later(self, time: float) -> None:
+        """Forget the poses of moving frames that claim to be of later than that [s]."""
+        self.parents = {frame: told for frame, told in self.parents.items() if told[2] <= time or math.isinf(told[2])}
 
     def find(self, frame: str, roots: Container[str]) -> tuple[str, Pose, float] | None:
         """The first of `roots` that a frame hangs from, its pose there, and the time of its own message [s]; None: it
@@ -140,14 +177,18 @@ def place_grid(grid: OccupancyGrid, pose: Pose) -> OccupancyGrid:
     return grid if pose == NOWHERE else OccupancyGrid(grid.values, grid.resolution, compose(pose, grid.origin))
 
 
-def check_map(grid: Any) -> OccupancyGrid:
+def check_map(grid: Any, notes: list[str] | None = None, name: str = "grid") -> OccupancyGrid:
     """A map that somebody told, as `merge_grids` takes it: as it came, if that can be, else in plain numbers.
+
+    Args:
+        grid: what came.
+        notes, name: of `check_grid`.
 
     Raises:
         ValueError: it would be refused as a robot's own grid, too.
     """
     try:
-        values, cell, origin = check_grid(grid.values, grid.resolution, grid.origin)
+        values, cell, origin = check_grid(grid.values, grid.resolution, grid.origin, notes, name)
     except AttributeError:
         raise ValueError(f"a {type(grid).__name__} is no OccupancyGrid") from None
     plain = isinstance(grid, OccupancyGrid) and grid.values is values and isinstance(grid.origin, tuple | list)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maexp.envs.grid_values import read_ones
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
 
 MAX_CELLS = 36_000_000
@@ -68,7 +69,8 @@ def read_grid(grid, resolution, origin, occupied: float, notes: list[str]) -> Kn
     """The grid of one call.
 
     Args:
-        grid: [H, W] of numbers, `grid[row = y, column = x]`: -1 unknown, 0 (free) to 100 (occupied).
+        grid: [H, W] of numbers, `grid[row = y, column = x]`: -1 unknown, 0 (free) to 100 (occupied); masked cells of
+            a masked array are unknown. Where no cell holds more than 1, 1 is occupied.
         resolution: edge of a cell [m].
         origin: x, y [m] and, if given, yaw [rad] of the lower left corner.
         occupied: from this value on a cell is an obstacle.
@@ -77,7 +79,7 @@ def read_grid(grid, resolution, origin, occupied: float, notes: list[str]) -> Kn
     Raises:
         ValueError: what was given cannot be an occupancy grid.
     """
-    values, cell, (x, y, yaw) = check_grid(grid, resolution, origin)
+    values, cell, (x, y, yaw) = check_grid(grid, resolution, origin, notes)
     valid = (values >= 0) & (values <= 100)
     odd = int(np.count_nonzero(~valid & (values != (255 if values.dtype.kind == "u" else -1))))
     if odd:
@@ -87,16 +89,19 @@ def read_grid(grid, resolution, origin, occupied: float, notes: list[str]) -> Kn
     return KnownGrid(known, cell, (x, y), yaw)
 
 
-def check_grid(grid, resolution, origin) -> tuple[np.ndarray, float, tuple[float, float, float]]:
+def check_grid(
+    grid, resolution, origin, notes: list[str] | None = None, name: str = "grid"
+) -> tuple[np.ndarray, float, tuple[float, float, float]]:
     """The values of an occupancy grid, the edge of its cells [m], and x, y [m] and yaw [rad] of its lower left corner.
 
     Args:
-        grid, resolution, origin: of `read_grid`.
+        grid, resolution, origin, notes: of `read_grid`.
+        name: what notes call the grid.
 
     Raises:
         ValueError: as `read_grid`.
     """
-    values = _check_values(grid)
+    values = read_ones(_check_values(grid), [] if notes is None else notes, name)
     cell = _number(resolution)
     if not (cell is not None and 1e-4 <= cell <= 1e3):
         raise ValueError(f"resolution={resolution!r} must be the edge of a cell in metres, 0.0001 to 1000")
@@ -117,7 +122,7 @@ def is_planned_on(width: float, height: float, reach: float) -> bool:
 def _check_values(grid) -> np.ndarray:
     advice = "give numbers [rows along y, columns along x], as np.reshape(msg.data, (height, width))"
     try:
-        values = np.asarray(grid)
+        values = fill_masked(grid)
     except ValueError:  # rows of different lengths
         raise ValueError(f"grid has rows of different lengths: {advice}") from None
     if values.dtype.kind not in "iuf":
@@ -126,9 +131,16 @@ def _check_values(grid) -> np.ndarray:
         raise ValueError(f"grid has {values.ndim} axes: {advice}")
     if values.size > MAX_CELLS:
         raise ValueError(f"grid has {values.size:,} cells, and at most {MAX_CELLS:,} are planned on: make cells larger")
-    if values.dtype.kind == "f" and ((values > 0) & (values < 1)).any() and not (values > 1).any():
+    if values.dtype.kind == "f" and ((values > 0) & (values < 1)).any() and not ((values > 1) & (values <= 100)).any():
         raise ValueError("grid holds shares between 0 and 1: multiply them by 100, unknown cells stay -1")
     return values
+
+
+def fill_masked(grid) -> np.ndarray:
+    """An array, with -1 in the masked cells of a masked one."""
+    if not isinstance(grid, np.ma.MaskedArray) or grid.dtype.kind not in "iuf":
+        return np.asarray(grid)
+    return (grid.astype(np.int64) if grid.dtype.kind == "u" else grid).filled(-1)
 
 
 def _check_origin(origin) -> tuple[float, float, float]:

@@ -238,6 +238,7 @@ def grow_trees(grid: KnownGrid, at: np.ndarray, rng: np.random.Generator, sample
 
 MANY_CELLS = 250_000  # a grid of more is planned on in coarser cells
 CELLS_PER_RADIUS = 2.0  # of the smallest robot, at least
+ROUNDING = 1e-6  # 0.3 m are six cells of 0.05 m, though the quotient of these numbers is a little less
 CORNERS = np.ones((3, 3), bool)  # cells that touch at a corner are connected
 
 
@@ -249,7 +250,7 @@ def coarsen(grid: KnownGrid, radius: float, many: int | None = None) -> KnownGri
     where the fine grid is known to be free. Blocks are counted from the map frame's origin: the same ones as the grid
     grows.
     """
-    largest, side, many = radius / (CELLS_PER_RADIUS * grid.cell), 1, many or MANY_CELLS
+    largest, side, many = radius / (CELLS_PER_RADIUS * grid.cell) + ROUNDING, 1, many or MANY_CELLS
     while grid.known.size > many * side**2 and side + 2 <= largest:
         side += 2
     parts = None if side == 1 else _parts(grid, radius)
@@ -281,7 +282,7 @@ def _join(grid: KnownGrid, side: int, parts: np.ndarray) -> tuple[KnownGrid, np.
 
 def _parts(grid: KnownGrid, radius: float) -> np.ndarray:
     """Numbers of the connected parts where a robot fits, int [H, W]; 0 elsewhere."""
-    fits = (grid.known == FREE) & (gap_squares(grid.known) >= (radius / grid.cell + MARGIN_CELLS) ** 2)
+    fits = (grid.known == FREE) & (gap_squares(grid.known) >= (radius / grid.cell + MARGIN_CELLS - ROUNDING) ** 2)
     return label(fits, CORNERS)[0]
 
 

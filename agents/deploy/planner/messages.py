@@ -111,11 +111,14 @@ def check_word(word: Any, names: Iterable[Any], notes: list[str]) -> Word | None
     return replace(word, **odd) if odd else word
 
 
-def check_told(told: Any, last: tuple | None, itself: bool) -> tuple[float, OccupancyGrid] | None:
+def check_told(
+    told: Any, last: tuple | None, itself: bool, notes: list[str] | None = None, name: str = "grid"
+) -> tuple[float, OccupancyGrid] | None:
     """A map that came with its time; None: it is not newer than the `last` one.
 
     Args:
         told, last, itself: of `is_newer`.
+        notes, name: of `check_map`.
 
     Raises:
         ValueError: it is none.
@@ -126,7 +129,7 @@ def check_told(told: Any, last: tuple | None, itself: bool) -> tuple[float, Occu
         raise ValueError(f"{show(told)} must be (time, grid)") from None
     if not _is_time(time):
         raise ValueError(f"its time={show(time)} must be a number of seconds")
-    return (time, check_map(grid)) if is_newer((time,), last, itself) else None
+    return (time, check_map(grid, notes, name)) if is_newer((time,), last, itself) else None
 
 
 def show(value: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Hashable, Mapping
 from dataclasses import replace
 from numbers import Real
@@ -86,14 +87,15 @@ class RobotPlanner:
             if source == self.name:
                 continue
             try:
-                newer = check_told(told, self.grids.get(source), source == word.name)
+                last, name = self.grids.get(source), f"the map of {show(source)}"
+                newer = check_told(told, last, source == word.name, notes, name)
             except ValueError as error:
                 notes.append(f"the word of {show(word.name)}: the map of {show(source)} is left out: {error}")
                 continue
             if newer is not None:
                 self.grids[source] = newer
-        last = self.heard.get(word.name)
-        if last is None or word.time >= last.time:
+        before = self.heard.get(word.name)
+        if before is None or word.time >= before.time:
             self.heard[word.name] = word
             self.beats.hear(word.name, word.time)
             self.beats.hear_of({name: time for name, time in word.hears.items() if name != self.name})
@@ -176,15 +178,47 @@ class RobotPlanner:
 def merge_told(
     grids: list[OccupancyGrid], told: Mapping[Any, OccupancyGrid], notes: list[str], reach: float = 0.0
 ) -> OccupancyGrid | None:
-    """These grids and those that robots have told in one; None: there are none. What would make it larger than is
-    planned on by robots that see so far, `reach` [m], is left out, which is noted."""
-    for name, grid in told.items():
-        cell, _, size = span([*grids, grid])
-        if not is_planned_on(*size.astype(float), reach / cell):
-            notes.append(f"the map of {name} is left out: it lies too far away, or has too small cells")
-        else:
-            grids = [*grids, grid]
+    """These grids and those that robots have told in one; None: there are none.
+
+    What would make it larger than is planned on is left out: as few of the told ones as possible, then those that lie
+    farthest from the origin of the frame.
+
+    Args:
+        grids: that count in any case.
+        told: the others, by the names that notes give them.
+        notes: a sentence is added for each that is left out.
+        reach: how far robots see [m].
+    """
+    everything = [*grids, *told.values()]
+    if not everything or _is_planned_on(everything, reach):
+        return merge_grids(everything) if everything else None
+    fits = {name: grid for name, grid in told.items() if _is_planned_on([*grids, grid], reach)}
+    order = sorted(fits, key=lambda name: math.hypot(*fits[name].origin[:2]))
+    groups = [_add_fitting(grids, fits, [name, *(other for other in order if other != name)], reach) for name in order]
+    taken = max(groups, key=len, default=[])
+    notes += [
+        f"the map of {name} is left out: it lies too far away, or has too small cells"
+        for name in told
+        if name not in taken
+    ]
+    grids = [*grids, *(grid for name, grid in told.items() if name in taken)]
     return merge_grids(grids) if grids else None
+
+
+def _add_fitting(
+    grids: list[OccupancyGrid], told: Mapping[Any, OccupancyGrid], order: list[Any], reach: float
+) -> list[Any]:
+    """Names of those that, added in this order, still make a grid that is planned on."""
+    taken: list[Any] = []
+    for name in order:
+        if _is_planned_on([*grids, *(told[other] for other in taken), told[name]], reach):
+            taken.append(name)
+    return taken
+
+
+def _is_planned_on(grids: list[OccupancyGrid], reach: float) -> bool:
+    cell, _, size = span(grids)
+    return is_planned_on(*size.astype(float), reach / cell)
 
 
 def _row(plan: Plan, row: int) -> Plan:

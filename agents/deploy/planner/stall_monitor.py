@@ -21,9 +21,11 @@ FOR_GOOD = 3  # times that a target is given up until it is for good
 PARKED = 3  # targets that a robot has to give up without moving until it no longer stands in others' way
 SLOW = 3.0  # a robot that moves may take so many times the patience to come nearer
 PERIODS = (2, 3, 4)  # targets in turn, twice the same round: back and forth
+ROUNDING = 1e-6  # steps of 0.1 s add up to a little less than whole seconds
 STEP = 0.5  # a robot has moved, or come nearer, by so many of its radii
 
 Block = tuple[int, int]
+GONE: Block = (1 << 40, 1 << 40)  # a target whose block is not known any more
 
 
 @dataclass
@@ -31,9 +33,12 @@ class Track:
     """What is remembered of a robot.
 
     Attributes:
-        at, since: where it last stood still, and since when; times at which its pose was not known do not count.
+        at, since: where it last stood still, and since when; times at which its pose was not known, or it had no target
+            to drive to, do not count. The clock is the robot's: targets may come and go meanwhile.
         seen: when its pose was last known.
+        idle: for how long it has had nowhere to drive to [s].
         block: the target it has; None = none.
+        arrived: whether it stood beside that when it got it.
         best, best_since: the shortest way left to it so far [m], and since when.
         past: the targets before, and where the robot was when it got them.
         hold: the target to go on with after it was caught going back and forth.
@@ -43,7 +48,9 @@ class Track:
     at: np.ndarray
     since: float
     seen: float
+    idle: float = 0.0
     block: Block | None = None
+    arrived: bool = False
     best: float = math.inf
     best_since: float = 0.0
     past: list[tuple[Block, np.ndarray]] = field(default_factory=list)
@@ -72,8 +79,16 @@ class Watch:
         """Forget the past."""
         self.tracks: dict[Hashable, Track] = {}
         self.given: dict[tuple[Hashable, Block], tuple[float, int]] = {}  # (robot or None = all) -> until, times
-        self.beside: dict[Block, float] = {}
+        self.beside: dict[Block, tuple[float, float]] = {}  # -> how long robots stood beside it, when last [s]
+        self.near = np.zeros((0, 0), bool)  # of the last call: which robots stand beside which targets
         self.now = -math.inf
+
+    def forget_targets(self) -> None:
+        """Forget what is remembered by blocks, which are others now; since when robots stand still remains."""
+        self.given, self.beside = {}, {}
+        for track in self.tracks.values():
+            track.block, track.past, track.hold = None if track.block is None else GONE, [], None
+            track.best, track.best_since = math.inf, self.now
 
     def look(self, team: Team, robots: np.ndarray, targets: Targets, travel: np.ndarray, near, now: float) -> list[str]:
         """Bring everything up to date with where robots and targets are; returns what was given up.
@@ -86,33 +101,50 @@ class Watch:
         """
         if now < self.now:
             self.forget()
-        before, self.now = self.now, now
+        before, self.now, self.near = self.now, now, near
         blocks = targets.keys()
-        notes = self._look_beside(blocks, near.any(0))
+        notes = self._look_beside(blocks, near.any(0), before)
         number = {block: k for k, block in enumerate(blocks)}
         for row, robot in enumerate(robots):
             track = self._follow(team, robot, before)
             k = number.get(track.block)
-            if k is not None and np.isfinite(travel[row, k]) and not near[row, k]:
-                notes += self._check(team, robot, track, float(travel[row, k]))
+            if track.block is None or (track.arrived if k is None else near[row, k]):
+                self._rest(track, before)
             else:
-                track.since = track.best_since = now
+                track.idle = 0.0
+                left = math.inf if k is None else float(travel[row, k])
+                notes += self._check(team, robot, track, left)
             if track.hold not in number:
                 track.hold = None
         self.tracks = {name: kept for name, kept in self.tracks.items() if now - kept.seen <= self.pause}
         return notes
 
-    def _look_beside(self, blocks: list[Block], beside: np.ndarray) -> list[str]:
-        """Give up targets that robots stood beside for long: what is unknown there cannot be seen from there."""
-        here = {block for block, is_beside in zip(blocks, beside, strict=True) if is_beside}
-        self.beside = {block: self.beside.get(block, self.now) for block in here}
+    def _look_beside(self, blocks: list[Block], beside: np.ndarray, before: float) -> list[str]:
+        """Give up targets that robots stood beside for long: what is unknown there cannot be seen from there. One that
+        is gone for a moment is not begun anew; `before` is the time of the last call."""
+        self.beside = {
+            block: (total, last)
+            for block, (total, last) in self.beside.items()
+            if self.now - last <= self.patience or last >= before
+        }
         notes = []
-        for block, since in self.beside.items():
-            if self.now - since >= self.patience and not self._is_given(None, block):
+        for block in [block for block, is_beside in zip(blocks, beside, strict=True) if is_beside]:
+            known = self.beside.get(block)
+            total = 0.0 if known is None else known[0] + self.now - before
+            if total >= self.patience - ROUNDING and not self._is_given(None, block):
                 self._give_up(None, block)
-                self.beside[block] = self.now
+                total = 0.0
                 notes.append(f"a target was given up: {self.patience:g} s beside it showed nothing new")
+            self.beside[block] = total, self.now
         return notes
+
+    def _rest(self, track: Track, before: float) -> None:
+        """The clocks of a robot that had nowhere to drive to stand still; after the pause they begin anew."""
+        gone = min(self.now - before, self.now - track.since)
+        track.idle += gone
+        track.since, track.best_since = track.since + gone, min(track.best_since + gone, self.now)
+        if track.idle >= self.pause - ROUNDING:
+            track.since = track.best_since = self.now
 
     def _follow(self, team: Team, robot: int, before: float) -> Track:
         """A robot's track, its place brought up to date; `before` is the time of the last call."""
@@ -127,12 +159,14 @@ class Watch:
         return track
 
     def _check(self, team: Team, robot: int, track: Track, left: float) -> list[str]:
-        """Give a robot's target up if it stands still or has come no nearer for long."""
+        """Give a robot's target up if it stands still or has come no nearer for long; `left` is infinite where it is
+        gone or cut off for now [m]."""
         step = STEP * team.radius[robot]
-        if left < track.best - step or left > 2.0 * track.best + step:  # nearer, or another way around
+        other = 2.0 * track.best + step < left < math.inf  # another way around
+        if left < track.best - step or other:
             track.best, track.best_since = left, self.now
-        still = self.now - track.since >= self.patience
-        if track.parked or not (still or self.now - track.best_since >= SLOW * self.patience):
+        still = self.now - track.since >= self.patience - ROUNDING
+        if track.parked or not (still or self.now - track.best_since >= SLOW * self.patience - ROUNDING):
             return []
         self._give_up(team.names[robot], track.block)
         track.failed += still
@@ -194,10 +228,11 @@ class Watch:
                 self._give_up(team.names[robot], track.block if track.hold == block else block)
                 block = track.hold
                 notes.append(f"{team.title(robot)} went back and forth between targets: it goes on to the nearest")
-            if block != track.block:
+            if block is not None and block != (track.past[-1][0] if track.past else None):
                 track.best, track.best_since = math.inf, self.now
+            if block != track.block:
                 track.past = [*track.past[2 - 2 * PERIODS[-1] :], (block, team.at[robot])] if block else track.past
-            track.block = block
+            track.block, track.arrived = block, block is not None and bool(self.near[row, number[block]])
         return notes
 
     @staticmethod

@@ -91,7 +91,10 @@ def check_pose(name, value) -> np.ndarray:
 
 
 def _numbers(value) -> np.ndarray | None:
+    """float64, NaN where a masked array is masked; None: they are no numbers."""
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            value = value.astype(np.float64).filled(np.nan)
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None

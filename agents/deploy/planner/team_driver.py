@@ -5,6 +5,7 @@ Needs neither ROS nor DDS: whoever uses it hands over the messages, and sends th
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, fields
 from typing import Any
@@ -12,25 +13,29 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.deploy.planner.arena_policy import extend_goals, planner_options
+from maexp.agents.deploy.planner.estimate import ESTIMATE, MapEstimate
 from maexp.agents.deploy.planner.frames import (
     NOWHERE,
     Frames,
     OccupancyGrid,
     Pose,
+    apply_update,
+    check_map,
     compose,
     heading_of,
     invert,
-    merge_grids,
     place_grid,
     read_map,
     read_pose,
     read_time,
 )
 from maexp.agents.deploy.planner.radio_features import BASE
+from maexp.agents.deploy.planner.robot_planner import merge_told
 from maexp.agents.deploy.planner.team_planner import Plan, TeamPlanner
 from maexp.envs.config.comm import CommConfig
 from maexp.envs.config_fields import check_settings, setting
 
+UPDATES = "_updates"  # after the topic of a map: where parts of it are told that have changed
 ODOMETRY = "odometry of "
 SERVED_AGE = 0.05  # seconds; an arena tells everything of one moment
 NAME = re.compile(r"[a-zA-Z_]\w*(/[a-zA-Z_]\w*)*", re.ASCII)
@@ -50,7 +55,9 @@ class DriverSettings:
     map_topics: tuple[str, ...] = setting((), "the team's map, or one of each robot; default: /NAME/map of each")
     global_frame: str = setting("map", "all maps and poses are brought into this frame")
     base_frame: str = setting("base_link", "of a robot: NAME/base_link in /tf, base_link in /NAME/tf")
-    offsets: tuple[float, ...] = setting((), "x, y, yaw of each robot's map in the team's frame; zeros: they are one")
+    offsets: tuple[Any, ...] = setting(
+        (), "x, y, yaw of each robot's map in the team's frame; zeros: they are one; estimate: from the maps"
+    )
     period: float = setting(2.0, "between two decisions", unit="s", above=0)
     radar_range: float | None = setting(None, "how far the robots see [m]; default: as the policy was trained, or 5")
     robot_radius: tuple[float, ...] = setting((), "of all, or of each [m]; default: as the policy was trained, or 0.3")
@@ -129,8 +136,13 @@ class TeamDriver:
         self.topics = settings.map_topics or tuple(f"/{name}/map" for name in robots)
         if len(self.topics) not in (1, count):
             raise ValueError(f"map_topics={','.join(self.topics)} must be one for the team, or one for each robot")
+        self.estimate = MapEstimate(self.topics) if settings.offsets == ESTIMATE else None
+        if self.estimate is not None and (settings.only or len(self.topics) < 2):
+            raise ValueError(
+                "offsets=estimate is for one process that drives all robots, with a map of each: give numbers"
+            )
         for name, sizes in (("offsets", (0, 3 * len(self.topics))), ("robot_radius", (0, 1, count))):
-            if len(getattr(settings, name)) not in sizes:
+            if len(getattr(settings, name)) not in sizes and not (name == "offsets" and self.estimate is not None):
                 wanted = " or ".join(map(str, sizes[1:]))
                 raise ValueError(f"{name} holds {len(getattr(settings, name))} numbers: give {wanted}")
         self.driven: tuple[str, ...] = tuple(name for name in robots if settings.only in ("", name))
@@ -150,11 +162,14 @@ class TeamDriver:
         self.robots = tuple(name for name in self.driven if episode is None or name in episode["robots"])
         self.planner: Any = self._make_planner()
         self.maps: dict[str, Any] = {}
+        if self.estimate is not None:
+            self.estimate.forget()
         self.speeds: dict[str, float] = {}
         self.goals: dict[str, np.ndarray] = {}  # that robots drive to
         self.sent: dict[str, float] = {}  # when [s]
         self.places: dict[str, np.ndarray] = {}  # where robots were seen last
         self.begun = now
+        self.decided = -math.inf  # time of the last decision [s]
 
     def _make_planner(self) -> Any:
         return TeamPlanner(self.settings.policy, **self._options())
@@ -173,6 +188,17 @@ class TeamDriver:
     def take_map(self, topic: str, message) -> None:
         """A nav_msgs/OccupancyGrid."""
         self.maps[topic] = message
+
+    def take_update(self, topic: str, message) -> None:
+        """A map_msgs/OccupancyGridUpdate of `UPDATES` of a map's topic: a part of that map that has changed. One that
+        is older than the map, or came before it, changes nothing.
+
+        Raises:
+            ValueError: it does not fit the map.
+        """
+        last = self.maps.get(topic)
+        if last is not None and read_time(message.header.stamp) >= read_time(last.header.stamp):
+            self.maps[topic] = apply_update(last, message)
 
     def take_frames(self, message, robot: str | None = None, still: bool = False) -> None:
         """A tf2_msgs/TFMessage of /tf, or of `robot`'s own /NAME/tf; `still`: of tf_static."""
@@ -198,10 +224,13 @@ class TeamDriver:
         Args:
             now: time of ROS [s].
 
+        A map that is none, or lies so far from the others that all together are too large, is left out, which is noted.
+
         Raises:
-            ValueError: several maps claim one frame and their offsets are not known, or a map is none.
+            ValueError: several maps claim one frame and their offsets are not known.
         """
         self.begun = now if self.begun is None else min(self.begun, now)
+        self._look_back(now)
         notes: list[str] = []
         grid = self._merge(notes)
         if grid is None:
@@ -212,6 +241,16 @@ class TeamDriver:
         plan = self._plan(what, poses, self._time_left(now), now)
         goals = plan.goals if self.episode is None else self._extend(plan, what, poses)
         return Decision(self._give_orders(plan, goals, now), plan, [*notes, *plan.notes])
+
+    def _look_back(self, now: float) -> None:
+        """Where the clock has jumped back, a simulation began anew: poses of later are none, and robots have lost their
+        goals, which are sent again."""
+        if now < self.decided:
+            self.goals.clear()
+            self.sent.clear()
+            for frames in (self.shared, *self.own.values()):
+                frames.forget_later(now + self.settings.pose_age)
+        self.decided = now
 
     def _plan(self, grid: tuple, poses: dict[str, Pose | None], time_left: float, now: float) -> Plan:
         """Of the robots that take part, at `now` [s]."""
@@ -238,14 +277,40 @@ class TeamDriver:
     def _merge(self, notes: list[str]) -> OccupancyGrid | None:
         """The team's map in its frame; None until there is one."""
         self._check_frames()
-        placed = []
+        placed: dict[str, OccupancyGrid] = {}
+        if self.estimate is not None:
+            return self._merge_estimated(notes)
         for topic, message in self.maps.items():
             pose = self._place(message.header.frame_id.lstrip("/"), topic)
             if pose is None:
                 notes.append(f"{topic}: tf does not say where {message.header.frame_id} is in {self._root}")
-            else:
-                placed.append(place_grid(read_map(message), pose))
-        return merge_grids(placed) if placed else None
+            elif (grid := self._read_map(topic, message, notes)) is not None:
+                placed[topic] = place_grid(grid, pose)
+        return merge_told([], placed, notes, self._reach())
+
+    def _merge_estimated(self, notes: list[str]) -> OccupancyGrid | None:
+        """The maps whose places are known from what they share."""
+        read = {topic: self._read_map(topic, message, notes) for topic, message in self.maps.items()}
+        grids = {topic: grid for topic, grid in read.items() if grid is not None}
+        notes += self.estimate.look(grids, self.decided)
+        places = self.estimate.places
+        placed = {topic: place_grid(grid, places[topic]) for topic, grid in grids.items() if topic in places}
+        return merge_told([], placed, notes, self._reach())
+
+    def _read_map(self, topic: str, message, notes: list[str]) -> OccupancyGrid | None:
+        """A map that can be planned on; None: it is none, which is noted."""
+        try:
+            grid = check_map(read_map(message), notes, topic)
+            if grid.resolution > self._reach() + 1e-6:
+                raise ValueError(f"its cells of {grid.resolution:g} m are larger than radar_range={self._reach():g} m")
+        except ValueError as error:
+            notes.append(f"the map of {topic} is left out: {error}")
+            return None
+        return grid if grid.values.size else None
+
+    def _reach(self) -> float:
+        """How far robots see [m]."""
+        return self.planner.radar_range
 
     @property
     def _root(self) -> str:
@@ -263,6 +328,8 @@ class TeamDriver:
 
     def _place(self, frame: str, topic: str) -> Pose | None:
         """Where the frame of a map stands in the team's; None: unknown."""
+        if self.estimate is not None:
+            return self.estimate.places.get(topic)
         if self.settings.offsets:
             row = 3 * self.topics.index(topic)
             return tuple(self.settings.offsets[row : row + 3])
@@ -315,7 +382,8 @@ class TeamDriver:
         if not self.settings.offsets or topic not in self.maps:
             return Order(name, goal, self._root, pose, stop)
         own = self.maps[topic].header.frame_id
-        return Order(name, goal, own, compose(invert(self._place(own, topic)), pose), stop)
+        place = self._place(own, topic)
+        return Order(name, goal, own, pose if place is None else compose(invert(place), pose), stop)
 
     def topic_of(self, name: str) -> str:
         """Of the map that a robot is on."""
@@ -325,7 +393,7 @@ class TeamDriver:
         last, resend = self.goals.get(name), self.settings.resend
         if last is None or self.episode is not None or np.linalg.norm(last - goal) >= self.settings.goal_change:
             return True
-        return resend is not None and now - self.sent[name] >= resend
+        return resend is not None and now - self.sent[name] >= resend - 1e-6
 
 
 def check_name(setting: str, name: str) -> None:

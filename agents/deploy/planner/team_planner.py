@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.deploy.planner.assignment import DistinctTargets
+from maexp.agents.deploy.planner.bodies import BodyTrails
 from maexp.agents.deploy.planner.bundle import Contract, LearnedChoice, find_policy
 from maexp.agents.deploy.planner.features import Motion, list_candidates
 from maexp.agents.deploy.planner.grid import KnownGrid, is_planned_on, read_grid
@@ -27,6 +28,7 @@ from maexp.envs.config.robot import ROBOT_KINDS, RobotKind
 from maexp.envs.config.targets import SPARE, Spare
 from maexp.kernels.constants import FREE, UNREACHED
 
+SAME_TURN = 0.02  # a grid that turns by less is the same one: localisation corrects a little all the time [rad]
 LOG = logging.getLogger("maexp.runtime")
 DEFAULTS = Contract("", 1, radar_range=5.0, robot_radius=0.3, motion=Motion(1.0, 1.0, 1.0))
 
@@ -85,6 +87,7 @@ class TeamPlanner:
         comm: for policies trained with ``observation.radio=true``: how far radios reach, and where the base station is
             in the map's frame [m], a `maexp.envs.CommConfig` or a mapping of its fields by name.
         time_limit: for the whole exploration [s]; such policies need it.
+        clear_mates: cells where a robot of a team stands or has stood are no walls: SLAM draws mates as obstacles.
     """
 
     def __init__(
@@ -110,6 +113,7 @@ class TeamPlanner:
         deadline: float | None = None,
         comm: Any = None,
         time_limit: float | None = None,
+        clear_mates: bool = True,
     ):
         for name, word, words in (("spare", spare, SPARE), ("drive", drive, ROBOT_KINDS)):
             if word not in words:
@@ -145,11 +149,14 @@ class TeamPlanner:
         if self.search is not None:
             limit = math.inf if deadline is None else _positive("deadline", deadline)
             self.foresight = load_foresight()(self.search, drive, self.clearance_factor, distinct, bounded, limit)
+        self.bodies = BodyTrails() if clear_mates else None
         self.reset()
 
     def reset(self) -> None:
         """Forget the past: what was given up, where robots were."""
         self.watch.forget()
+        if self.bodies is not None:
+            self.bodies.forget()
         self.rng = np.random.default_rng(self.seed)
         self.anchor: KnownGrid | None = None  # blocks of targets are counted from its corner
         self.last: dict[Hashable, np.ndarray] = {}  # where each robot's latest target was in the map's frame
@@ -198,6 +205,9 @@ class TeamPlanner:
         team = read_team(poses, velocities, self.robot_radius if robot_radius is None else robot_radius, notes)
         reach = self.reach(radar_range)
         _check_reach(reach, known)
+        if self.bodies is not None:
+            self.bodies.look(team)
+            known = self.bodies.clear(known)
         time_left = self._time_left(time_left, now)
         if self.book is not None:
             notes += self.book.look(team, known, 1.0 - time_left, read_links(connected, team), now)
@@ -234,9 +244,9 @@ class TeamPlanner:
     def _shift(self, grid: KnownGrid, notes: list[str]) -> tuple[int, int]:
         """How far the grid's corner has moved since the first call, in cells."""
         old = self.anchor
-        if old is not None and (abs(old.cell / grid.cell - 1.0) > 1e-3 or abs(old.yaw - grid.yaw) > 1e-6):
+        if old is not None and (abs(old.cell / grid.cell - 1.0) > 1e-3 or abs(old.yaw - grid.yaw) > SAME_TURN):
             notes.append("the grid has another resolution or turn than before: what was given up is forgotten")
-            self.watch.forget()
+            self.watch.forget_targets()
             old = None
         if old is None:
             self.anchor = old = replace(grid, known=grid.known[:0])
@@ -398,7 +408,7 @@ def finite(name: str, value) -> float:
 def _check_reach(radar_range: float, grid: KnownGrid) -> None:
     """Robots look over the grid and so far around it: farther than a cell, and no farther than the memory reaches."""
     cells = radar_range / grid.cell
-    if cells < 1.0:
+    if cells < 1.0 - 1e-6:
         raise ValueError(f"radar_range={radar_range:g} m is less than a cell of {grid.cell:g} m: give both in metres")
     if not is_planned_on(grid.width, grid.height, cells):
         raise ValueError(

@@ -64,6 +64,9 @@ TOPICS = {
         1,
         latched=True,
     ),
+    "map_updates": Kind(
+        "map_msgs/msg/OccupancyGridUpdate", "c4095b0be2e4363f8978a1570e0293ee093436f1e1c61d99b48502ac317025e8"
+    ),
     "known": Kind(
         "nav_msgs/msg/OccupancyGrid",
         "8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",

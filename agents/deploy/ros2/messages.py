@@ -36,6 +36,8 @@ TABLE = {
     "nav_msgs/msg/MapMetaData": "builtin_interfaces/Time map_load_time, float32 resolution, uint32 width, "
     "uint32 height, geometry_msgs/Pose origin",
     "nav_msgs/msg/OccupancyGrid": "std_msgs/Header header, nav_msgs/MapMetaData info, int8[] data",
+    "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header, int32 x, int32 y, uint32 width, uint32 height, "
+    "int8[] data",
     "nav_msgs/msg/Odometry": "std_msgs/Header header, string child_frame_id, geometry_msgs/PoseWithCovariance pose, "
     "geometry_msgs/TwistWithCovariance twist",
     "sensor_msgs/msg/LaserScan": "std_msgs/Header header, float32 angle_min, float32 angle_max, "

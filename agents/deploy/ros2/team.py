@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.agents.deploy.planner.team_driver import Decision, TeamDriver
+from maexp.agents.deploy.planner.team_driver import UPDATES, Decision, TeamDriver
 from maexp.agents.deploy.ros2.dds import EPISODE, Wire
 from maexp.agents.deploy.ros2.goals import SENDERS
 from maexp.agents.deploy.ros2.messages import SECOND, read_nanoseconds
@@ -60,6 +60,7 @@ class Ros2Team:
         self.driver, self.wire, self.answer, self.tell = driver, wire, answer, tell
         robots = driver.driven
         self.maps = {topic: wire.reader(topic, "map") for topic in driver.listened}
+        self.updates = {topic: wire.reader(f"{topic}{UPDATES}", "map_updates") for topic in driver.listened}
         self.frames = {
             (place, still): wire.reader(f"{'' if place is None else f'/{place}'}/{'tf_static' if still else 'tf'}")
             for place in (None, *robots)
@@ -72,6 +73,7 @@ class Ros2Team:
         self.time: int | None = None  # that /clock showed last [ns]
         self.planned: float | None = None  # time of the last decision [s]
         self.said: set[str] = set()
+        self.refused: set[str] = set()  # updates of maps that do not fit
         self.strangers: set[str] = set()  # robots of arenas that are not this team's
         self.heard = time.monotonic()
         self.course = Outing()
@@ -103,7 +105,7 @@ class Ros2Team:
         self._heed()
         for topic, message in maps.items():
             self.driver.take_map(topic, message)
-        self.heard = time.monotonic() if maps else self.heard
+        self.heard = time.monotonic() if self._take_updates() or maps else self.heard
         now = self._due()
         if now is not None:
             self._decide(now)
@@ -130,6 +132,23 @@ class Ros2Team:
             for message in reader.take():
                 found[topic] = message
         return found
+
+    def _take_updates(self) -> bool:
+        """Write the parts of maps that have changed into these; whether any came."""
+        came = False
+        for topic, reader in self.updates.items():
+            for message in reader.take():
+                came = True
+                try:
+                    self.driver.take_update(topic, message)
+                except ValueError as error:
+                    self._tell_once(f"{topic}{UPDATES}: {error}")
+        return came
+
+    def _tell_once(self, sentence: str) -> None:
+        if sentence not in self.refused:
+            self.refused.add(sentence)
+            self.tell(sentence)
 
     def _take_others(self) -> None:
         for (robot, still), reader in self.frames.items():
@@ -195,7 +214,7 @@ class Ros2Team:
         if self.time is None and self.clock.matched:
             return None
         now = time.time() if self.time is None else self.time / SECOND
-        early = self.planned is not None and 0.0 <= now - self.planned < self.driver.settings.period
+        early = self.planned is not None and 0.0 <= now - self.planned < self.driver.settings.period - 1e-6
         return None if early else now
 
     def _stamp(self, topic: str) -> int | None:

@@ -80,3 +80,13 @@ def test_small_grids_and_small_robots_keep_their_cells(monkeypatch):
     assert coarsen(small, 0.35) is small
     monkeypatch.setattr(module, "MANY_CELLS", 1_000)
     assert coarsen(small, 0.35).cell == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize(
+    "radius, cell, times",
+    [(0.3, 0.05, 3), (0.35, 0.05, 3), (0.6, 0.1, 3), (0.5, 0.05, 5), (0.7, 0.1, 3), (0.29, 0.05, 1)],
+)
+def test_cells_are_as_large_as_the_radius_allows_to_the_last_bit(radius, cell, times):
+    """0.3 / (2 * 0.05) is 2.9999999999999996."""
+    plain = KnownGrid(np.full((60, 60), FREE, np.uint8), cell, (0.0, 0.0))
+    assert coarsen(plain, radius, many=100).cell == pytest.approx(times * cell)

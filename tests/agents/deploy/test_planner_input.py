@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt, label
 
+from maexp.agents.deploy.planner.frames import OccupancyGrid
 from maexp.agents.deploy.planner.grid import KnownGrid
 from maexp.agents.deploy.planner.grid_search import flood, trace, trace_from
-from maexp.agents.runtime import CHOICES, TeamPlanner
+from maexp.agents.runtime import CHOICES, RobotPlanner, TeamPlanner, Word
 from maexp.kernels.constants import BLOCKED, OPEN, UNREACHED
 
 POSES = {"a": (1.0, 1.0, 0.0), "b": (1.5, 1.0, 0.0)}
@@ -245,6 +246,7 @@ def test_no_goal_in_a_wall_on_random_grids(seed):
         bounded=bool(rng.random() < 0.3),
         least_area=rng.choice([None, 0.0]),
         patience=1.5,
+        clear_mates=False,
     )
     for now in range(3):
         plan = planner.plan(grid, cell, origin, poses, now=now)
@@ -253,3 +255,49 @@ def test_no_goal_in_a_wall_on_random_grids(seed):
         shift = rng.integers(0, 5, 2)
         grid = np.pad(grid, ((shift[1], 1), (shift[0], 0)), constant_values=-1)
         origin = origin - shift * cell
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int64, np.uint8, np.float32])
+def test_a_grid_of_ones_has_walls_of_ones(kind):
+    """As the comment in nav_msgs/OccupancyGrid is read; a grid that holds more has percentages."""
+    plain, call = half_seen(), {"resolution": 0.1, "origin": (0, 0), "poses": POSES, "now": 0.0}
+    wanted = TeamPlanner(radar_range=2.0).plan(plain, **call)
+    ones = np.where(plain == 100, 1, plain).astype(kind)
+    plan = TeamPlanner(radar_range=2.0).plan(ones, **call)
+    assert np.array_equal(plan.goals, wanted.goals) and plan.active.all()
+    assert [note for note in plan.notes if "1 was taken as occupied; give 0 to 100" in note]
+    ones[5, 5] = 2
+    percent = TeamPlanner(radar_range=2.0).plan(ones, **call)
+    assert not np.array_equal(percent.goals, wanted.goals) and not percent.notes
+    shared = RobotPlanner("a", radar_range=2.0)
+    shared.hear(Word("b", POSES["b"], 0.0, 0.0, {"b": (0.0, OccupancyGrid(plain, 0.1, (0.0, 0.0, 0.0)))}))
+    ones[5, 5] = 0
+    plan = shared.plan(ones, 0.1, (0, 0), POSES["a"], now=0.0, share=True)
+    assert np.array_equal(plan.goals[0], wanted.goals[0]), "beside the grid of a mate that holds 100"
+    assert (shared.word().grids["a"][1].values == 100).any()
+    told = RobotPlanner("a", radar_range=2.0)
+    told.hear(Word("b", POSES["b"], 0.0, 0.0, {"b": (0.0, OccupancyGrid(ones, 0.1, (0.0, 0.0, 0.0)))}))
+    plan = told.plan(np.where(plain == 100, -1, plain), 0.1, (0, 0), POSES["a"], now=0.0, share=True)
+    assert np.array_equal(plan.goals[0], wanted.goals[0]), "of a mate"
+    assert any(note.startswith("the map of 'b': ") for note in plan.notes)
+
+
+def test_shares_are_refused_where_the_unknown_is_255():
+    grid = np.where(half_seen() < 0, 255.0, np.where(half_seen() > 0, 0.9, 0.0))
+    with pytest.raises(ValueError, match="multiply them by 100"):
+        TeamPlanner().plan(grid, 0.1, (0, 0), POSES, now=0.0)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, float])
+def test_what_is_masked_is_unknown(kind):
+    plain, call = half_seen(), {"resolution": 0.1, "origin": (0, 0), "poses": POSES, "now": 0.0}
+    wanted = TeamPlanner(radar_range=2.0).plan(plain, **call)
+    masked = np.ma.masked_array(np.maximum(plain, 0).astype(kind), plain < 0)
+    plan = TeamPlanner(radar_range=2.0).plan(masked, **call)
+    assert np.array_equal(plan.goals, wanted.goals) and plan.active.all() and not plan.notes
+    alone = RobotPlanner("a", radar_range=2.0)
+    alone.plan(masked, 0.1, (0, 0), POSES["a"], now=0.0, share=True)
+    assert np.array_equal(alone.word().grids["a"][1].values, plain)
+    lost = np.ma.masked_array(np.array(list(POSES.values())), [[False] * 3, [True] * 3])
+    plan = TeamPlanner(radar_range=2.0).plan(plain, **call | {"poses": lost})
+    assert plan.active.tolist() == [True, False] and "robot 1 has no pose and was left out" in plan.notes

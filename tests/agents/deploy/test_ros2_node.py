@@ -254,6 +254,7 @@ class StandIn:
             "tf2_msgs.msg": module(TFMessage=STORE.types[TF]),
             "geometry_msgs.msg": module(Point=made("geometry_msgs/msg/Point")),
             "std_msgs.msg": module(String=made("std_msgs/msg/String")),
+            "map_msgs.msg": module(OccupancyGridUpdate=type("OccupancyGridUpdate", (), {})),
             "nav_msgs.msg": module(OccupancyGrid=made(GRID), Odometry=made("nav_msgs/msg/Odometry")),
             "nav2_msgs.action": module(NavigateToPose=goal),
             "visualization_msgs.msg": module(

@@ -27,6 +27,13 @@ ACTIONS = {
 """NavigateToPose.action by releases of nav2: goal, result, feedback, without comments and constants."""
 
 
+UPDATE = {
+    "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\n"
+    "uint32 width\nuint32 height\nint8[] data"
+}
+"""Of map_msgs, the same since Foxy."""
+
+
 def services(action: tuple[str, str, str]) -> dict[str, str]:
     """What ROS makes of an action, and the one service that all actions share (action_msgs/srv/CancelGoal.srv)."""
     goal, result, feedback = action
@@ -48,7 +55,7 @@ def services(action: tuple[str, str, str]) -> dict[str, str]:
 def store_of(release: Stores, action: str):
     """The definitions of a release; requests and responses with the header that `rmw_cyclonedds` puts before them."""
     store = get_typestore(release)
-    for name, text in services(ACTIONS[action]).items():
+    for name, text in {**services(ACTIONS[action]), **UPDATE}.items():
         before = "uint64 guid\nint64 seq\n" if name.endswith(("_Request", "_Response")) else ""
         (definition,) = get_types_from_msg(before + text, name).values()
         store.register({name: definition})

@@ -229,3 +229,111 @@ def test_reset_and_a_clock_that_starts_again_forget_the_past():
     world.now = 0.0
     world.call(planner)
     assert not planner.watch.given
+
+
+def stuck(grids, seconds: int = 60, patience: float = 10.0, at=(1.0, 0.75)) -> dict[str, list[int]]:
+    """A robot that never moves on grids that change; when which sentence came first and again [s].
+
+    Args:
+        grids: function of the second: the grid and its origin.
+    """
+    planner, said = TeamPlanner("nearest_frontier", **SETTINGS | {"robot_radius": 0.1, "patience": patience}), {}
+    for now in range(seconds):
+        grid, origin = grids(now)
+        for note in planner.plan(grid, CELL, origin, [at], now=now).notes:
+            said.setdefault(note, []).append(now)
+    return said
+
+
+def corridor(length: int = 40) -> np.ndarray:
+    """Known on the left, unknown on the right."""
+    grid = np.full((5, length), 100)
+    grid[2:4, 1:15], grid[2:4, 15 : length - 1] = 0, -1
+    return grid
+
+
+GAVE_UP = "robot 0 gave its target up: it did not move for 10 s"
+PARKED = "robot 0 stands still whatever its target: the team plans without it"
+
+
+@pytest.mark.parametrize(
+    "flicker, slack",
+    [
+        (lambda now: now % 9 == 5, 1.2),
+        (lambda now: now % 9 in (3, 4, 5), 1.6),
+        (lambda now: now % 2 == 1, 2.1),
+    ],
+    ids=["one call in nine", "three in nine", "every other call"],
+)
+@pytest.mark.parametrize("how", ["seen", "cut off"])
+def test_a_robot_that_stands_still_gives_up_a_target_that_comes_and_goes(flicker, slack, how):
+    """The clock is the robot's. It does not run while there is nowhere to drive to."""
+
+    def grids(now):
+        grid = corridor()
+        if flicker(now):
+            grid[2:4, 15 if how == "seen" else 10] = 100
+        return grid, (0.0, 0.0)
+
+    said = stuck(grids, seconds=80)
+    assert [10 * k <= now <= 10 * k * slack for k, now in enumerate(said[GAVE_UP], 1)] == [True] * 3
+    assert PARKED in said
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.9])
+def test_a_robot_that_stands_still_gives_its_target_up_on_a_grid_that_moves_by_parts_of_a_cell(share):
+    """As SLAM that grows its map by odd lengths publishes it."""
+    rng = np.random.default_rng(3)
+    grid = corridor()
+
+    def grids(now):
+        return grid, tuple(share * CELL * rng.uniform(-1.0, 1.0, 2))
+
+    said = stuck(grids)
+    assert said[GAVE_UP][:2] == [10, 20] and PARKED in said
+
+
+@pytest.mark.parametrize("turn", [0.01, 0.1])
+def test_a_robot_that_stands_still_is_parked_on_a_grid_that_turns_to_and_fro(turn):
+    grid, said = corridor(), {}
+    planner = TeamPlanner("nearest_frontier", **SETTINGS | {"robot_radius": 0.1, "patience": 10.0})
+    for now in range(60):
+        for note in planner.plan(grid, CELL, (0.0, 0.0, turn * (now % 2)), [(1.0, 0.75)], now=now).notes:
+            said.setdefault(note, []).append(now)
+    assert said[GAVE_UP][:3] == [10, 20, 30] and PARKED in said
+
+
+def test_a_target_beside_a_robot_that_comes_and_goes_is_given_up():
+    def grids(now):
+        grid = corridor()
+        grid[2:4, 15] = 100 if now % 9 == 5 else -1
+        return grid, (0.0, 0.0)
+
+    said = stuck(grids, at=(3.6, 0.75))
+    assert 10 <= said["a target was given up: 10 s beside it showed nothing new"][0] <= 12
+
+
+def test_a_robot_that_passes_a_target_now_and_then_gives_nothing_up():
+    planner, grid = TeamPlanner("nearest_frontier", **SETTINGS | {"robot_radius": 0.1, "patience": 10.0}), corridor()
+    for now in range(60):
+        at = (3.6, 0.75) if now % 8 == 0 else (0.5 + 0.3 * (now % 8), 0.75)
+        assert not planner.plan(grid, CELL, (0.0, 0.0), [at], now=now).notes
+
+
+def test_the_clock_of_standing_still_begins_anew_after_a_long_rest():
+    def grids(now):
+        grid = corridor()
+        if 8 < now < 60:
+            grid[2:4, 15] = 100
+        return grid, (0.0, 0.0)
+
+    assert stuck(grids, seconds=100)[GAVE_UP][0] == 70, "it has had 10 s again: the pause was 20 s"
+
+
+def test_patience_is_over_in_time_where_steps_of_a_tenth_add_up_to_less():
+    planner, now = TeamPlanner("nearest_frontier", **SETTINGS | {"robot_radius": 0.1, "patience": 0.8}), 0.0
+    for _ in range(8):
+        assert not planner.plan(corridor(), CELL, (0.0, 0.0), [(1.0, 0.75)], now=now).notes
+        now += 0.1
+    assert now < 0.8
+    assert planner.plan(corridor(), CELL, (0.0, 0.0), [(1.0, 0.75)], now=now).notes

@@ -7,6 +7,7 @@ from functools import partial
 
 import rclpy
 from geometry_msgs.msg import Point
+from map_msgs.msg import OccupancyGridUpdate
 from nav2_msgs.action import NavigateToPose
 from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.action import ActionClient
@@ -18,7 +19,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from maexp.agents.deploy.planner.drivers import RadioDriver, make_driver
 from maexp.agents.deploy.planner.frames import fill_pose
 from maexp.agents.deploy.planner.radio_features import USED
-from maexp.agents.deploy.planner.team_driver import DriverSettings, Order, read_settings
+from maexp.agents.deploy.planner.team_driver import UPDATES, DriverSettings, Order, read_settings
 from maexp.docs.ros2.maexp_ros.maexp_ros import conversion
 from maexp.docs.ros2.maexp_ros.maexp_ros.mates import Mates
 from maexp.envs.config.comm import CommConfig
@@ -51,6 +52,8 @@ class TeamNode(Node):
         self.frame = driver.settings.global_frame
         for topic in driver.listened:
             self.create_subscription(OccupancyGrid, topic, partial(driver.take_map, topic), latched(1))
+            update = partial(self._take_update, topic)
+            self.create_subscription(OccupancyGridUpdate, f"{topic}{UPDATES}", update, QoSProfile(depth=10))
         for robot in (None, *driver.driven):
             place = "" if robot is None else f"/{robot}"
             moving, still = (partial(driver.take_frames, robot=robot, still=fixed) for fixed in (False, True))
@@ -65,6 +68,13 @@ class TeamNode(Node):
         self.markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self.finished = False
         self.create_timer(driver.settings.period, self.decide)
+
+    def _take_update(self, topic: str, message) -> None:
+        """A part of a map that has changed."""
+        try:
+            self.driver.take_update(topic, message)
+        except ValueError as error:
+            self.get_logger().warning(f"{topic}{UPDATES}: {error}", throttle_duration_sec=10.0)
 
     def decide(self) -> None:
         """Plan and send each robot its goal, where that has changed."""
