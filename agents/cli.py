@@ -206,6 +206,7 @@ def run_verb(name: str, words: list[str]) -> int:
         return 0
     multirun = bool({"-m", "--multirun"} & set(flags))
     _check_action(name, verb, rest)
+    _check_working_folder()
     overrides = make_overrides(name, rest, verb.positional, multirun)
     (check_sweep if multirun else check_words)(name, overrides)
     home = importlib.import_module(f"maexp.agents.commands.{name}")
@@ -231,6 +232,14 @@ def run_verb(name: str, words: list[str]) -> int:
     except UserError:
         remove_if_empty(folder)
         raise
+
+
+def _check_working_folder() -> None:
+    """Raise UserError where the folder that the command was started in is no more: runs and paths go by it."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise UserError("the working folder was removed or cannot be entered: change to one that is there.") from error
 
 
 def print_settings(cfg: "DictConfig", verb: str) -> None:
@@ -263,3 +272,7 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
     """Our own warnings as a sentence; those of libraries are for their authors."""
     if f"{os.sep}agents{os.sep}" in filename or f"{os.sep}envs{os.sep}" in filename:
         print(f"maexp: warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
