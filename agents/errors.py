@@ -24,6 +24,8 @@ def blame_input() -> Iterator[None]:
     except UserError:
         raise
     except OSError as error:
+        if error.errno != errno.EIO and (told := describe_disk_error(error)) is not None:
+            raise UserError(told) from error
         where = f" ({error.filename})" if error.filename else ""
         raise UserError(f"{error.strerror or error}{where}.") from error
     except (ValueError, ImportError) as error:

@@ -22,8 +22,10 @@ def whole_file(path: Path) -> Iterator[str]:
         os.chmod(part, 0o666 & ~mask)
         _sync(Path(part))
         os.replace(part, path)
-    except BaseException:
+    except BaseException as error:
         os.unlink(part)
+        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say which file it was
+            error.filename = str(path)
         raise
     _sync(path.parent)  # the new name, too, is on the disk
 

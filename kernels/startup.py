@@ -1,6 +1,8 @@
 """Importing this starts Warp, quietly: on a machine without a GPU its native code warns on every start of that."""
 
 import os
+import sys
+import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,10 +42,41 @@ def start_warp() -> None:
     wp.config.enable_tiles_in_stack_memory = False
     wp.config.log_level = wp.LOG_WARNING
     if torch.cuda.is_available():
+        note = _start_with_cache()
+    else:
+        with _silent_stderr():
+            note = _start_with_cache()
+    if note:
+        print(note, file=sys.stderr)
+
+
+def _start_with_cache() -> str:
+    """Initialise Warp; where its cache cannot be written (no home, as in many containers), with one that can.
+
+    Returns a note for the user, empty where all is as usual.
+    """
+    try:
         wp.init()
-        return
-    with _silent_stderr():
-        wp.init()
+        found = str(wp.config.kernel_cache_dir)
+        if os.access(found, os.W_OK):
+            return ""
+    except OSError as error:
+        found = str(wp.config.kernel_cache_dir or error.filename)
+    wp.config.kernel_cache_dir = _temporary_cache()  # Warp reads it whenever it compiles
+    wp.init()
+    told = f"{found} cannot be written, so compiled kernels are kept in {wp.config.kernel_cache_dir}"
+    return f"maexp: note: {told}; WARP_CACHE_PATH names another folder"
+
+
+def _temporary_cache() -> str:
+    """A folder of this user alone, the same in every process."""
+    folder = os.path.join(tempfile.gettempdir(), f"maexp-warp-{getattr(os, 'getuid', int)()}")
+    try:
+        os.makedirs(folder, mode=0o700, exist_ok=True)
+        ours = not hasattr(os, "getuid") or os.stat(folder).st_uid == os.getuid()
+    except OSError:
+        ours = False
+    return folder if ours and os.access(folder, os.W_OK) else tempfile.mkdtemp(prefix="maexp-warp-")
 
 
 @contextmanager

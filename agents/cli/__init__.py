@@ -216,6 +216,7 @@ def run_verb(name: str, words: list[str]) -> int:
         return 0
     multirun = bool({"-m", "--multirun"} & set(flags))
     _check_action(name, verb, rest)
+    _check_working_folder()
     overrides = make_overrides(name, rest, verb.positional, multirun)
     if multirun:
         check_sweep(name, overrides)
@@ -242,6 +243,14 @@ def run_verb(name: str, words: list[str]) -> int:
     except UserError:
         remove_if_empty(folder)
         raise
+
+
+def _check_working_folder() -> None:
+    """Raise UserError where the folder that the command was started in is no more: runs and paths go by it."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise UserError("the working folder was removed or cannot be entered: change to one that is there.") from error
 
 
 def print_settings(cfg: Any, verb: str) -> None:
@@ -274,3 +283,7 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
     """Our own warnings as a sentence; those of libraries are for their authors."""
     if f"{os.sep}agents{os.sep}" in filename or f"{os.sep}envs{os.sep}" in filename:
         print(f"maexp: warning: {message}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

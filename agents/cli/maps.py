@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from maexp.agents.cli import Command, maps_fetch
-from maexp.agents.cli.maps_folder import find_files
+from maexp.agents.cli.maps_folder import describe_import, find_files
 from maexp.agents.cli.maps_folder import run as run_folder
 from maexp.agents.config.overrides import find_override
 from maexp.agents.config.verbs import MapsSettings
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import command, write_text
+from maexp.agents.files import command, write_json, write_text
 from maexp.agents.map_sets import set_names
 from maexp.envs.io import ImportReport, draw_import, export_ros_map, import_map_with_report
 from maexp.envs.io.bags import is_bag
@@ -22,7 +22,7 @@ from maexp.envs.maps.point_cloud import PointCloudMap
 from maexp.envs.scenarios import GENERATED, SCENARIOS, make_map
 
 UNUSABLE = 1
-FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .glb .bt .npz .npy .mcap .db3 (rosbag2)"
+FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .stl .glb .bt .npz .npy .mcap .db3 (rosbag2)"
 
 
 def folder(overrides: list[str], claim: Callable[[], Path]) -> Path | None:
@@ -93,6 +93,8 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
         print(told)
         written = write_files(cfg, where, world, imported)
     write_text(where / "report.txt", told + "\n")
+    if imported is not None:
+        write_json(where / "report.json", describe_import(imported, report))
     print(f"Written: {', '.join(str(path) for path in written)}")
     if report.ok and cfg.task in ("make", "import"):
         size = [] if cfg.robot.radius is None else [f"robot.radius={cfg.robot.radius:g}"]

@@ -4,19 +4,20 @@ import csv
 import io
 import os
 import time
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from maexp.agents.errors import UserError, blame_input
-from maexp.agents.files import short, write_text
+from maexp.agents.files import short, write_json, write_text
 from maexp.agents.tables import markdown_table
 from maexp.envs.io import draw_import, import_map_with_report
 from maexp.envs.io.bags import BAGS, is_bag
 from maexp.envs.io.clouds import CLOUDS
 from maexp.envs.io.formats import GRIDS, POINTS
 from maexp.envs.io.occupancy import find_image
-from maexp.envs.maps.checker import check_map
+from maexp.envs.io.report import ImportReport, printable
+from maexp.envs.maps.checker import MapReport, check_map
 
 YAMLS = (".yaml", ".yml")
 IMAGES = tuple(suffix for suffix in GRIDS if suffix not in YAMLS)
@@ -102,30 +103,37 @@ def run(folder: Path, where: Path, options: dict[str, Any]) -> int:
         _write_markdown(rows, where / "report.md")
     refused = sum(row.result == "refused" for row in rows)
     print(f"{len(rows) - refused} of {len(rows)} files became maps, {refused} were refused.")
-    print(f"Written: {short(where)}/: report.csv, report.md, and of each map FILE.npz, FILE.png and FILE.txt")
+    print(f"Written: {short(where)}/: report.csv, report.md, and of each map FILE.npz, .png, .txt and .json")
     return int(refused > 0)
 
 
 def _import(file: Path, folder: Path, where: Path, options: dict[str, Any]) -> Row:
     """Import one file and write its map, picture and report under its own name, the folder's sub-folders kept."""
-    begin, name = time.perf_counter(), str(file.relative_to(folder))
+    begin, inside = time.perf_counter(), file.relative_to(folder)
+    name = printable(str(inside))
     try:
         with blame_input():
             world, report = import_map_with_report(file, **options)
     except UserError as error:
         reason = str(error).replace(str(file), file.name)
-        return Row(name, "refused", seconds=_since(begin), reason=reason)
+        return Row(name, "refused", seconds=_since(begin), reason=printable(reason))
     seconds = _since(begin)
     verdict = check_map(world, num_robots=options["num_robots"], threshold=options.get("robot_radius"))
-    target = where / name
+    target = where / inside
     target.parent.mkdir(parents=True, exist_ok=True)
     world.save(target.with_name(f"{file.name}.npz"))
     write_text(target.with_name(f"{file.name}.txt"), f"{report.table()}\n{verdict.table()}\n")
+    write_json(target.with_name(f"{file.name}.json"), describe_import(report, verdict))
     draw_import(world, report, target.with_name(f"{file.name}.png"))
     area, seen = round(world.free_area, 1), f"{verdict.visible_share:.1%}"
     warnings = "; ".join(report.warnings)
     shown = (world.scenario, round(world.resolution, 4), len(world.free), area, verdict.room, seen, seconds, warnings)
     return Row(name, verdict.verdict, *shown)
+
+
+def describe_import(report: ImportReport, verdict: MapReport) -> dict[str, Any]:
+    """What an import did, and the check of its map, as plain values for a JSON file."""
+    return {"verdict": verdict.verdict, "import": report.as_dict(), "map": asdict(verdict)}
 
 
 def _since(begin: float) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maexp.envs.io.cloud_files import Cloud
+from maexp.envs.io.cloud_files import Cloud, float32_step
 from maexp.envs.io.grid import FREE, OBSTACLE, Grid
 from maexp.envs.io.levelling import thin
 from maexp.envs.io.options import ImportOptions
@@ -20,6 +20,8 @@ from maexp.envs.io.ros_messages import TfTree, to_grid, to_points
 from maexp.envs.maps.point_cloud import MAX_POINTS, MapError, check_file
 
 BAGS = (".mcap", ".db3")
+UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
 GRID, CLOUD, TF = "nav_msgs/msg/OccupancyGrid", "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 VOXEL = 0.02  # [m]; scans are thinned to this as they come, or a minute of a lidar would fill the memory
 GREY = np.array([205, 254, 0], dtype=np.uint8)  # of unknown, free and obstacle in map_server's images
@@ -60,12 +62,15 @@ def _opened(path: Path) -> Iterator[Any]:
     """rosbags' reader; whatever it raises on damaged files becomes a sentence."""
     try:
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         command = 'pip install "maexp[rosbag]"'
         raise MapError(f"{path} needs the package rosbags, which is not installed; {command}") from error
     try:  # bags before ROS 2 Iron do not hold the definitions of their messages
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+            sent = any(connection.msgtype == UPDATE for connection in bag.connections)
+            if sent and UPDATE not in bag.typestore.fielddefs:  # neither in bags before Iron nor in the store
+                bag.typestore.register(get_types_from_msg(UPDATE_TEXT, UPDATE))
             yield bag
     except MapError:
         raise
@@ -112,10 +117,12 @@ def _messages(bag, connections: list) -> Iterator[Any]:
 
 
 def _last_grid(path: Path, bag, chosen, options: ImportOptions, report: ImportReport) -> Grid:
-    last = deque((raw for _, _, raw in bag.messages(connections=[chosen])), maxlen=1)
+    last = deque(((time, raw) for _, time, raw in bag.messages(connections=[chosen])), maxlen=1)
     if not last:
         raise MapError(f"{path} promises messages on {chosen.topic} and holds none; record it again")
-    grid = to_grid(path, bag.deserialize(last[0], chosen.msgtype), options)
+    time, raw = last[0]
+    message = _updated(bag, bag.deserialize(raw, chosen.msgtype), time, chosen.topic, report)
+    grid = to_grid(path, message, options, report)
     report.before = ScannedImage(GREY[grid.labels].T[::-1], grid.cell, grid.origin)
     report.add(
         "read",
@@ -126,13 +133,46 @@ def _last_grid(path: Path, bag, chosen, options: ImportOptions, report: ImportRe
     return grid
 
 
+def _updated(bag, message, since: int, topic: str, report: ImportReport):
+    """The last grid with the parts that were sent after it at `since` [ns] (``map_msgs/OccupancyGridUpdate``)."""
+    offered = [connection for connection in bag.connections if connection.msgtype == UPDATE and connection.msgcount]
+    wanted = [connection for connection in offered if connection.topic == f"{topic}_updates"]
+    grids = {connection.topic for connection in bag.connections if connection.msgtype == GRID}
+    if not wanted and len(grids) == 1 and len({connection.topic for connection in offered}) == 1:
+        wanted = offered  # under another name, yet nothing else can be meant
+    if not wanted:
+        if offered:
+            told = ", ".join(sorted({connection.topic for connection in offered}))
+            report.warn(f"updates of grids on {told} were not applied: those of {topic} come on {topic}_updates")
+        return message
+    width, height = int(message.info.width), int(message.info.height)
+    if width * height != len(message.data):
+        return message  # which is refused
+    cells = np.array(message.data, dtype=np.int8).reshape(height, width)
+    applied = outside = 0
+    for _, _, raw in bag.messages(connections=wanted, start=since):
+        part = bag.deserialize(raw, UPDATE)
+        x, y, wide, high = int(part.x), int(part.y), int(part.width), int(part.height)
+        if x < 0 or y < 0 or x + wide > width or y + high > height or wide * high != len(part.data):
+            outside += 1
+            continue
+        cells[y : y + high, x : x + wide] = np.asarray(part.data, dtype=np.int8).reshape(high, wide)
+        applied += 1
+    if outside:
+        report.warn(f"{outside} updates on {wanted[0].topic} do not fit the last grid and were left out")
+    if applied:
+        report.add("updates", f"{applied} parts sent on {wanted[0].topic} after the last grid", after=applied)
+    message.data = cells.ravel()
+    return message
+
+
 def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportReport) -> Cloud:
     """Every cloud of a topic, in the frame that tf calls fixed, one point a voxel."""
     tree = TfTree()
     for message in _messages(bag, [connection for connection in bag.connections if connection.msgtype == TF]):
         tree.add(message)
     voxel = min(options.voxel or VOXEL, VOXEL)
-    kept, added, count, lost, frame = np.empty((0, 3)), [], 0, 0, ""
+    kept, added, count, lost, frame, step = np.empty((0, 3)), [], 0, 0, "", 0.0
     for message in _messages(bag, [chosen]):
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         placed = tree.find(message.header.frame_id, stamp)
@@ -142,6 +182,7 @@ def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportR
             continue
         frame, rotation, translation = placed
         points = to_points(path, message)
+        step = max(step, float32_step(points))
         points = points[np.isfinite(points).all(axis=1)] @ rotation.T + translation
         if len(points):
             added.append(points[thin(points, voxel)])
@@ -159,7 +200,7 @@ def _all_clouds(path: Path, bag, chosen, options: ImportOptions, report: ImportR
         report.warn(f"no transform in the bag moves {frame}: the {count} clouds were laid over each other as they are")
     told = f"{count - lost} clouds of {chosen.topic} in the frame {frame}, {voxel:g} m voxels"
     report.add("register", told, after=len(kept))
-    return Cloud(kept, metres_per_unit=1.0, up="z")
+    return Cloud(kept, metres_per_unit=1.0, up="z", step=step)
 
 
 def _joined(path: Path, kept: np.ndarray, added: list[np.ndarray], voxel: float) -> np.ndarray:

@@ -1,8 +1,7 @@
-"""Clouds from files that need an optional package: .las and .laz, meshes, octrees."""
+"""Clouds from files that need an optional package: .las and .laz, octrees."""
 
 from __future__ import annotations
 
-import importlib
 import logging
 import re
 import struct
@@ -11,17 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from maexp.envs.io.cloud_files import Cloud, check_rest
+from maexp.envs.io.las_units import find_units
+from maexp.envs.io.mesh_files import need
 from maexp.envs.maps.point_cloud import MAX_POINTS, MapError
 
-GEO_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # EPSG codes of linear units, in metres
-PROJECTED_UNIT_KEY = 3076  # ProjLinearUnitsGeoKey
 NOISE = (7, 18)  # LAS classes of low and high noise
-MAX_SAMPLES = 3_000_000
 
 
-def read_las(path: Path) -> Cloud:
-    """Points of a .las or .laz file without those classed as noise; units from its geo keys or WKT."""
-    laspy = _need("laspy", "las", path)
+def read_las(path: Path, units_set: bool = False) -> Cloud:
+    """Points of a .las or .laz file without noise and what is flagged as withheld; units from its geo keys or WKT.
+
+    Args:
+        units_set: somebody else says what the units are.
+    """
+    laspy = need("laspy", "las", path)
     logging.getLogger("laspy").setLevel(logging.CRITICAL)
     _check_las(path)
     try:
@@ -38,8 +40,8 @@ def read_las(path: Path) -> Cloud:
                 check_rest(path, file.header.offset_to_point_data + promised * stride, stride)
             data = file.read()
         points = np.stack([np.asarray(data.x), np.asarray(data.y), np.asarray(data.z)], axis=1).astype(np.float64)
-        noise = np.isin(np.asarray(data.classification), NOISE)
-        unit = _las_unit(data.header)
+        left_out = np.isin(np.asarray(data.classification), NOISE) | np.asarray(data.withheld).astype(bool)
+        plane, height = (None, None) if units_set else find_units(path, data.header)
     except MapError:
         raise
     except BaseException as error:  # the decompressor panics, which is no Exception, on damaged files
@@ -48,7 +50,10 @@ def read_las(path: Path) -> Cloud:
         raise MapError(f"{path} cannot be read ({type(error).__name__}: {error}); it may be truncated") from error
     if len(points) != promised or promised == 0:
         raise MapError(f"{path} promises {promised} points, {len(points)} could be read; save it again")
-    return Cloud(points[~noise], metres_per_unit=unit, up="z", outdoor=True)
+    points = points[~left_out]
+    if not len(points):
+        raise MapError(f"{path}: all its {promised} points are classed as noise or flagged as withheld")
+    return Cloud(points, metres_per_unit=plane, metres_per_height=height, up="z", outdoor=True)
 
 
 def _check_las(path: Path) -> None:
@@ -82,48 +87,9 @@ def _check_chunks(path: Path, points: int, size: int) -> None:
     raise MapError(f"{path} is damaged: it holds no table of its compressed points; save it again")
 
 
-def _las_unit(header) -> float | None:
-    """Metres per unit by geo key 3076, else by the last UNIT of a WKT projection; None: the file does not say."""
-    for record in [*header.vlrs, *(header.evlrs or [])]:
-        for key in getattr(record, "geo_keys", []):
-            if key.id == PROJECTED_UNIT_KEY and key.value_offset in GEO_UNITS:
-                return GEO_UNITS[key.value_offset]
-        text = getattr(record, "string", "")
-        if isinstance(text, str) and "PROJCS" in text:
-            plane = text.split("VERT_CS")[0]
-            factors = re.findall(r'UNIT\["[^"]*",\s*([0-9.eE+-]+)', plane)
-            if factors:
-                return float(factors[-1])
-    return None
-
-
-def read_mesh(path: Path, spacing: float) -> Cloud:
-    """Points spread evenly over a mesh, one for every `spacing` squared of its surface [file units]; seeded."""
-    trimesh = _need("trimesh", "mesh", path)
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
-        area = float(mesh.area)
-        if not (np.isfinite(area) and area > 0):
-            raise MapError(f"{path} has {len(mesh.vertices)} vertices and no surface of finite area; check the mesh")
-        count = round(area / spacing**2)
-        if not 1 <= count <= MAX_SAMPLES:
-            raise MapError(
-                f"{path} has {area:g} square units of surface: {count} points at sample_spacing={spacing:g} are not "
-                f"between 1 and {MAX_SAMPLES}; check units, or set sample_spacing"
-            )
-        points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
-    except MapError:
-        raise
-    except Exception as error:  # trimesh raises whatever its loaders raise on damaged files
-        raise MapError(f"{path} is not a readable mesh ({type(error).__name__}: {error}); save it again") from error
-    up = "y" if path.suffix.lower() in (".glb", ".gltf") else "auto"  # glTF is Y-up and in metres by its standard
-    return Cloud(np.asarray(points, dtype=np.float64), up=up)
-
-
 def read_octree(path: Path) -> Cloud:
     """Centres of the occupied and of the free voxels of an OctoMap .bt file."""
-    pyoctomap = _need("pyoctomap", "octree", path)
+    pyoctomap = need("pyoctomap", "octree", path)
     resolution, promised = _check_octree(path)
     try:
         tree = pyoctomap.OcTree(str(path).encode())
@@ -169,11 +135,3 @@ def _split_voxels(centres: np.ndarray, sizes: np.ndarray, resolution: float) -> 
     inside, side = np.arange(total) - start, np.repeat(ratio, counts)
     index = np.stack([inside % side, inside // side % side, inside // side**2], axis=1)
     return np.repeat(centres, counts, axis=0) + (index + 0.5 - side[:, None] / 2) * resolution
-
-
-def _need(package: str, extra: str, path: Path):
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        command = f'pip install "maexp[{extra}]"'
-        raise MapError(f"{path} needs the package {package}, which is not installed; {command}") from error

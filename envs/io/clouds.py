@@ -8,22 +8,26 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maexp.envs.io.cloud_extras import read_las, read_mesh, read_octree
-from maexp.envs.io.cloud_files import Cloud, read_pcd, read_ply, read_xyz
+from maexp.envs.io.cloud_extras import read_las, read_octree
+from maexp.envs.io.cloud_files import Cloud, Faces, read_xyz
 from maexp.envs.io.levelling import find_floor, find_strays, guess_up, thin, turn_up
+from maexp.envs.io.mesh_files import read_mesh, read_ply_cloud
 from maexp.envs.io.options import ImportOptions
+from maexp.envs.io.pcd_files import read_pcd
 from maexp.envs.io.report import ImportReport, ScannedPoints
 from maexp.envs.io.sources import FloorSource, Source
 from maexp.envs.io.terrain import TerrainSource
 from maexp.envs.maps.point_cloud import MapError
 from maexp.envs.scenarios import Scenario
 
-MESHES = (".obj", ".glb")
+MESHES = (".obj", ".stl", ".glb")
 CLOUDS = (".pcd", ".ply", ".xyz", ".las", ".laz", ".bt", *MESHES)
 LEAST_POINTS = 20
 FLAT = 1e-3  # a cloud this thin for its width is a floor plan already
 OUTDOOR_SIZE, OUTDOOR_DENSITY = 100.0, 10.0  # larger [m] and sparser [points / m^2] than this was scanned from the air
 INDOOR_DENSITY = 200.0  # [points / m^2]; a .las denser than this was scanned on the ground
+ROUGH = 0.02  # [m]; coordinates in coarser steps than this are warned of
+ROUGHEST = 1.0  # [m]; in coarser steps than this they are of no use even outdoors
 FLOOR_SHARE = 0.7  # of what the walls enclose; where less of the floor was scanned, the rest is inferred
 
 
@@ -39,6 +43,7 @@ def make_source(path: Path, cloud: Cloud, options: ImportOptions, report: Import
     outdoor = _is_outdoor(points, cloud, options)
     fallback = "outdoor" if outdoor else "pointcloud"
     scenario = options.find_scenario(fallback)
+    _check_step(path, cloud, scenario, outdoor, options, report)
     before = len(points)
     voxel = options.voxel or (0.0 if outdoor else scenario.resolution / 5)
     if voxel:
@@ -51,17 +56,13 @@ def make_source(path: Path, cloud: Cloud, options: ImportOptions, report: Import
 
 def _read(path: Path, options: ImportOptions) -> Cloud:
     suffix = path.suffix.lower()
-    cloud = None
-    readers = {".pcd": read_pcd, ".ply": read_ply, ".xyz": read_xyz, ".las": read_las, ".laz": read_las}
+    if suffix in (".las", ".laz"):
+        return read_las(path, options.units != "auto")
+    readers = {".pcd": read_pcd, ".xyz": read_xyz, ".bt": read_octree}
     if suffix in readers:
-        cloud = readers[suffix](path)
-    elif suffix == ".bt":
-        cloud = read_octree(path)
-    if cloud is None:  # a mesh; its units are known before its points are
-        scenario = options.find_scenario()
-        spacing = options.sample_spacing or scenario.resolution / 5
-        cloud = read_mesh(path, spacing / (options.metres_per_unit or 1.0))
-    return cloud
+        return readers[suffix](path)
+    spacing = options.sample_spacing or options.find_scenario().resolution / 5  # units are known before points are
+    return (read_ply_cloud if suffix == ".ply" else read_mesh)(path, spacing / (options.metres_per_unit or 1.0))
 
 
 def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportReport) -> np.ndarray:
@@ -85,13 +86,32 @@ def _to_metres(path: Path, cloud: Cloud, options: ImportOptions, report: ImportR
     scale, why = options.metres_per_unit, "as set"
     if scale is None:
         scale, why = (cloud.metres_per_unit, "by the file") if cloud.metres_per_unit else (1.0, "assumed")
-    points = points * scale
+    if why == "assumed":
+        report.assume("its unit is not known and was taken to be metres", "set importing.units=m, or what it is")
+    for told, cure in cloud.assumed:
+        report.assume(told, cure)
+    points, heights = points * scale, cloud.metres_per_height
+    if options.metres_per_unit is None and heights is not None and heights != scale:
+        points[:, 2] *= heights / scale
+        why += f"; heights {heights:g} m"
     if not np.abs(points).max() < 1e9:
         raise MapError(f"{path} has coordinates up to {np.abs(points).max():g} m; check units")
     report.before = ScannedPoints.some_of(points)
     size = " x ".join(f"{span:.1f}" for span in np.ptp(points, axis=0))
     report.add("read", f"{path.name}: {size} m, {scale:g} m a unit ({why})", len(cloud.points), len(points))
     return points
+
+
+def _check_step(path, cloud: Cloud, scenario, outdoor: bool, options: ImportOptions, report: ImportReport) -> None:
+    """Far from the origin float32 rounds coordinates: walls fall apart into points as far from each other."""
+    step = cloud.step * (options.metres_per_unit or cloud.metres_per_unit or 1.0)
+    if step <= ROUGH:
+        return
+    told = f"its coordinates are float32 numbers so large that they come in steps of {step:g} m"
+    cure = "subtract an offset before it is saved, or save it with 8-byte numbers (double)"
+    if step >= (ROUGHEST if outdoor else scenario.collision_threshold / 3):
+        raise MapError(f"{path}: {told}, too coarse for walls: {cure}")
+    report.warn(f"{told}: {cure}")
 
 
 def _repeats(points: np.ndarray) -> np.ndarray:
@@ -106,6 +126,7 @@ def _set_upright(points, cloud: Cloud, options: ImportOptions, report: ImportRep
     up = options.up if options.up != "auto" else cloud.up
     if up == "auto":
         up = guess_up(points)
+        report.assume(f"the axis up was taken to be {up}", f"set importing.up={up}, or which it is")
     if up != "z":
         points = turn_up(points, up)
         report.add("up", f"{up} of the file points up")
@@ -129,7 +150,9 @@ def _read_floor(points, cloud: Cloud, up: str, scenario, options: ImportOptions,
     size = np.ptp(points, axis=0)
     if size[2] <= FLAT * max(size[0], size[1]):
         return _read_plan(points, scenario, options, report)
-    floor = find_floor(points, options.level)
+    floor = find_floor(points, options.level, _turned(cloud.faces, up, cloud, options), cloud.spacing is None)
+    if floor.double:
+        report.warn(floor.double)
     height = floor.height if options.floor is None else options.floor
     report.add("floor", floor.story if options.floor is None else f"at {height:g} m, as set")
     points = points @ floor.rotation.T - [0.0, 0.0, height]
@@ -159,6 +182,14 @@ def _read_floor(points, cloud: Cloud, up: str, scenario, options: ImportOptions,
     report.add("slices", f"floor up to {low:.2f} m, obstacles up to {high:.2f} m", len(points), kept)
     _decide_inference(source, floor.scanned, scenario, options, report)
     return source
+
+
+def _turned(faces: Faces | None, up: str, cloud: Cloud, options: ImportOptions) -> Faces | None:
+    """The faces of a mesh in metres, upright."""
+    if faces is None:
+        return None
+    scale = options.metres_per_unit or cloud.metres_per_unit or 1.0
+    return Faces(turn_up(faces.centres * scale, up), turn_up(faces.normals, up), faces.areas * scale**2)
 
 
 def _decide_inference(source: FloorSource, scanned: bool, scenario, options, report: ImportReport) -> None:

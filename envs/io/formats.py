@@ -13,7 +13,7 @@ from maexp.envs.io.occupancy import read_occupancy
 from maexp.envs.io.options import ImportOptions, make_options
 from maexp.envs.io.point_files import read_npy_triple, read_npz_map
 from maexp.envs.io.postprocess import crop_grid, finish_map
-from maexp.envs.io.report import ImportReport
+from maexp.envs.io.report import ImportReport, printable
 from maexp.envs.io.sources import GridSource
 from maexp.envs.maps.checker import check_map, repair_map
 from maexp.envs.maps.point_cloud import MapError, PointCloudMap, check_file
@@ -26,7 +26,7 @@ def import_map(path: str | os.PathLike, options: ImportOptions | None = None, **
     """Reads a file and makes it a map a team can explore; see `ImportOptions` for what can be set by hand.
 
     Args:
-        path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .glb, .bt, or a
+        path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .stl, .glb, .bt, or a
             bag of ROS: .mcap, .db3 or the folder of a rosbag2.
         options: settings; None: everything automatic.
         overrides: single settings by name, over `options`.
@@ -44,7 +44,7 @@ def import_map_with_report(
     begin = time.perf_counter()
     path = Path(path)
     options = make_options(options, overrides)
-    report = ImportReport(str(path))
+    report = ImportReport(str(path), strict=options.strict)
     if not is_bag(path):
         check_file(path)
     world = _read(path, options, report)
@@ -55,10 +55,10 @@ def import_map_with_report(
 
 def _read(path: Path, options: ImportOptions, report: ImportReport) -> PointCloudMap:
     suffix = path.suffix.lower()
-    name = options.name or path.stem
+    name = options.name or printable(path.stem)
     if is_bag(path):
         found = read_bag(path, options, report)
-        name = options.name or bag_name(path)
+        name = options.name or printable(bag_name(path))
         if isinstance(found, Grid):
             return _finish_grid(found, name, options, report)
         source, scenario = make_source(path, found, options, report)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from maexp.envs.io.cloud_files import Faces
 from maexp.envs.maps.point_cloud import MapError
 
 MAX_TILT = np.deg2rad(15)
@@ -16,6 +17,9 @@ HYPOTHESES = 4000
 PLANE_THICKNESS = 0.05  # [m]; points nearer than this lie in the plane
 SLAB = 0.05  # [m]; height of the layers a floor is looked for in
 HEADROOM = 0.5  # [m]; a slab with next to nothing higher than this above it is a ceiling
+DOUBLE = 0.7  # of a floor lie under another one closer than HEADROOM: a slab, or two scans of one floor
+DOUBLE_CELL = 0.25  # [m]
+LIKE = np.deg2rad(2)  # faces of a mesh that are tilted alike
 STRAY = 4.0  # a point is stray where its neighbours are this many times farther than usual
 
 
@@ -63,33 +67,94 @@ class Floor:
     tilt: float  # [rad] that was taken out
     scanned: bool  # the floor itself was seen; else `height` is where the lowest points are
     story: str
+    double: str = ""  # a warning: there are two floors, one just above the other
 
 
-def find_floor(points: np.ndarray, level: bool | None) -> Floor:
-    """The lowest large plane within 15 degrees of level, by seeded RANSAC on a thinned cloud [m].
+def find_floor(points: np.ndarray, level: bool | None, faces: Faces | None = None, climb: bool = True) -> Floor:
+    """The lowest large plane within 15 degrees of level.
 
+    Of a mesh it is the lowest large one that looks up; of points [m] one found by seeded RANSAC on a thinned cloud.
     Any such plane levels the cloud, a ceiling too. Where the lowest slab has nothing above it, it is the ceiling:
-    no floor was scanned, and the lowest percentile of the points stands in for it.
+    no floor was scanned, and the lowest percentile of the points stands in for it. A floor just under another one of
+    its size is the underside of a slab (`climb`).
     """
     some = points[thin(points, 0.1)]
     rotation, tilt = np.eye(3), 0.0
+    normal = None if faces is None else _face_normal(faces)
+    faces = None if normal is None else faces
     if level is not False:
-        normal = _best_normal(some)
+        if normal is None:
+            normal = _best_normal(some)
         if normal is not None:
             tilt = float(np.arccos(min(1.0, normal[2])))
             rotation = _rotation_up(normal)
     heights = some @ rotation[2]
-    slabs = _slabs(heights)
-    usual = f"levelled by {np.rad2deg(tilt):.1f} degrees, " if tilt else ""
-    if len(slabs):
-        low = slabs[0]
-        around = heights[np.abs(heights - low) < 1.5 * SLAB]
-        if (heights > low + HEADROOM).mean() > 0.05:
-            floor = float(np.median(around))
+    usual = f"levelled by {np.rad2deg(tilt):.1f} degrees, " if np.rad2deg(tilt) > 0.01 else ""
+    floor = _facing_floor(faces, rotation) if faces is not None else None
+    facing = floor is not None
+    if not facing and len(slabs := _slabs(heights)) and (heights > slabs[0] + HEADROOM).mean() > 0.05:
+        floor = float(np.median(heights[np.abs(heights - slabs[0]) < 1.5 * SLAB]))
+    if floor is not None:
+        upper = _floor_above(points @ rotation.T, floor) if climb else None
+        if upper is None:
             return Floor(floor, rotation, tilt, True, f"{usual}floor found at {floor:.2f} m")
+        told = f"{usual}floor found at {upper:.2f} m, {upper - floor:.2f} m above another"
+        double = f"two floors lie {upper - floor:.2f} m above each other, and the upper one was taken: if the scan has "
+        double += "drifted, register it again, or set importing.floor"
+        return Floor(upper, rotation, tilt, True, told, "" if facing else double)
     floor = float(np.percentile(heights, 1))
     story = f"{usual}no floor was scanned: taken below the lowest points, {floor:.2f} m"
     return Floor(floor, rotation, tilt, False, story)
+
+
+def _face_normal(faces: Faces) -> np.ndarray | None:
+    """Upward normal of most of the area that is nearly level; None where the faces are as uneven as a scan's."""
+    up = faces.normals * np.where(faces.normals[:, 2:] < 0, -1.0, 1.0)
+    flat = up[:, 2] > np.cos(MAX_TILT)
+    up, areas = up[flat], faces.areas[flat]
+    if not len(up):
+        return None
+    tried = up[np.argsort(-areas, kind="stable")[:200]]
+    best = tried[int(np.argmax([areas[up @ normal > np.cos(LIKE)].sum() for normal in tried]))]
+    for _ in range(3):
+        alike = up @ best > np.cos(LIKE)
+        best = (up[alike] * areas[alike, None]).sum(axis=0)
+        best = best / np.linalg.norm(best)
+    return best if areas[up @ best > np.cos(LIKE)].sum() > 0.5 * areas.sum() else None
+
+
+def _facing_floor(faces: Faces, rotation: np.ndarray) -> float | None:
+    """Height of the lowest large area of a mesh that looks up and has something above it; None: there is none."""
+    heights, up = faces.centres @ rotation[2], faces.normals @ rotation[2] > np.cos(MAX_TILT)
+    if not up.any():
+        return None
+    order = np.argsort(heights[up], kind="stable")
+    levels, areas = heights[up][order], faces.areas[up][order]
+    total = np.concatenate([[0.0], np.cumsum(areas)])
+    near = total[np.searchsorted(levels, levels + SLAB, side="right")] - total[np.arange(len(levels))]
+    for low in levels[near > 0.3 * near.max()]:
+        if faces.areas[heights > low + HEADROOM].sum() > 0.05 * faces.areas.sum():
+            inside = (levels >= low) & (levels <= low + SLAB)
+            return float(np.average(levels[inside], weights=areas[inside]))
+    return None
+
+
+def _floor_above(points: np.ndarray, floor: float) -> float | None:
+    """Height of a floor that covers most of the one at `floor`, too near above for a robot between; None: none does."""
+    low, above = points[:, 2] - floor, points[:, 2]
+    cells = np.floor(points[:, :2] / DOUBLE_CELL).astype(np.int64)
+    cells -= cells.min(axis=0)
+    code = cells[:, 0] * (int(cells[:, 1].max()) + 1) + cells[:, 1]
+    lower = np.unique(code[np.abs(low) < SLAB])
+    near = (low > 2 * SLAB) & (low < HEADROOM)
+    bins = np.bincount((low[near] / SLAB).astype(int), minlength=int(HEADROOM / SLAB))
+    count = (np.abs(low) < SLAB / 2).sum()
+    for at in np.flatnonzero(bins > 0.4 * count)[::-1]:
+        height = floor + (at + 0.5) * SLAB
+        layer = np.abs(above - height) < SLAB
+        if np.isin(lower, code[layer]).mean() > DOUBLE:
+            return float(np.median(above[layer]))
+    return None
 
 
 def _slabs(heights: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from maexp.envs.atomic_write import whole_file
 from maexp.envs.io.grid import MAX_CELLS
 from maexp.envs.maps.point_cloud import MapError, PointCloudMap
 
@@ -40,10 +41,12 @@ def export_ros_map(world: PointCloudMap, path: str | os.PathLike) -> Path:
                     index = np.floor((some + shift - low) / cell + 1e-4).astype(int).clip(0, shape - 1)
                     image[index[:, 0], index[:, 1]] = value
     picture = path.with_suffix(".pgm")
-    Image.fromarray(np.ascontiguousarray(image.T[::-1])).save(picture)
-    path.write_text(
+    with whole_file(picture) as part:
+        Image.fromarray(np.ascontiguousarray(image.T[::-1])).save(part, format="PPM")
+    text = (
         f"image: {picture.name}\nresolution: {cell:.6g}\norigin: [{low[0]:.6f}, {low[1]:.6f}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
-        encoding="utf-8",
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
+    with whole_file(path) as part:
+        Path(part).write_text(text, encoding="utf-8")
     return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,8 @@ from maexp.envs.io.report import ImportReport, ScannedImage
 from maexp.envs.maps.point_cloud import MapError, check_file
 
 MAX_YAML_BYTES = 64 * 1024
+SAVED_UNKNOWN = 205  # the grey of unknown space in the images of map_server's and nav2's map savers
+PLAIN_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _BRIEF = Repr()
 _BRIEF.maxlevel = 1
 FORMATS = ("PPM", "PNG", "BMP", "TIFF", "JPEG")
@@ -34,6 +37,7 @@ class Sheet:
     occupied: float
     free: float
     mode: str
+    assumed: tuple[str, ...] = ()  # what the yaml does not say
 
 
 def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> Grid:
@@ -48,6 +52,9 @@ def read_occupancy(path: Path, options: ImportOptions, report: ImportReport) -> 
             sheet = _make_sheet(path, {"image": path.name}, options)
         else:
             raise MapError(f"{path} is an image without {beside.name} beside it; give its yaml, or pixel_size [m]")
+    if sheet.assumed:
+        told = f"map_server's {', '.join(sheet.assumed)} taken, for the yaml does not say"
+        report.assume(told, "write it into the yaml, or set importing.free_threshold and importing.occupied_threshold")
     values, opaque = _read_image(sheet.image)
     report.before = ScannedImage(values.clip(0, 255).astype(np.uint8), sheet.pixel, sheet.origin[:2])
     labels = _label(values, opaque, sheet, options, report)
@@ -108,6 +115,7 @@ def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
     if max(map(abs, origin)) > MAX_ORIGIN:
         raise MapError(f"{path}: origin={origin} lies farther than {MAX_ORIGIN:g} m away; correct it")
     mode = content.get("mode", "trinary")
+    mode = mode.lower() if isinstance(mode, str) else mode
     if mode not in ("trinary", "scale", "raw"):
         raise MapError(f"{path}: mode={_show(mode)} must be trinary, scale or raw")
     given = {
@@ -116,6 +124,11 @@ def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
         "free_thresh": _first(options.free_threshold, content.get("free_thresh"), 0.196),
         "negate": content.get("negate", 0),
     }
+    set_here = {"free_thresh": options.free_threshold, "occupied_thresh": options.occupied_threshold, "negate": None}
+
+    def _missing(name: str) -> bool:
+        return content.get(name) is None and set_here[name] is None
+
     if isinstance(given["negate"], bool):
         given["negate"] = int(given["negate"])
     numbers = {name: _number(path, name, value) for name, value in given.items()}
@@ -134,6 +147,7 @@ def _make_sheet(path: Path, content: dict, options: ImportOptions) -> Sheet:
         numbers["occupied_thresh"],
         numbers["free_thresh"],
         mode,
+        tuple(f"{name}={numbers[name]:g}" for name in ("free_thresh", "occupied_thresh", "negate") if _missing(name)),
     )
 
 
@@ -150,6 +164,8 @@ def _show(value) -> str:
 
 
 def _number(path: Path, name: str, value) -> float:
+    if isinstance(value, str) and PLAIN_NUMBER.fullmatch(value.strip()):
+        value = float(value)  # yaml 1.1, which PyYAML reads, takes 1e-05 for a text; that of ROS does not
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not number or not abs(value) < 1e300:  # an integer of yaml may be too long for a float
         raise MapError(f"{path}: {name}={_show(value)} must be a number")
@@ -166,7 +182,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
                 if image.width * image.height > MAX_CELLS:
                     raise MapError(f"{path} has {image.width} x {image.height} pixels; at most {MAX_CELLS} are read")
                 _check_rows(path, image)
-                alpha = np.asarray(image.convert("RGBA"))[..., 3] if "A" in image.getbands() else None
+                opaque = _find_opaque(path, image)
                 deep = image.mode.startswith("I") or image.mode == "F"
                 values = np.asarray(image if deep else image.convert("L"), dtype=np.float32)
     except MapError:
@@ -175,7 +191,28 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         raise MapError(f"{path} is not a readable pgm or png image ({error}); it may be truncated") from error
     if deep:
         values = values * (255 / 65535)
-    return values, None if alpha is None else alpha > 0
+    return values, opaque
+
+
+def _find_opaque(path: Path, image: Image.Image) -> np.ndarray | None:
+    """Which pixels are not wholly transparent, bool [height, width]; None: all.
+
+    A png has an alpha channel, alphas of its palette's colours, or one grey or colour that is transparent.
+    """
+    clear = image.info.get("transparency")
+    if "A" in image.getbands() or "a" in image.getbands() or (image.mode == "P" and clear is not None):
+        return np.asarray(image.convert("RGBA"))[..., 3] > 0
+    if clear is None or image.format != "PNG":
+        return None
+    with path.open("rb") as file:
+        depth = file.read(25)[24]  # bits of a sample: Pillow makes all of them 8, but for grey ones of 16
+    pixels = np.asarray(image)
+    if image.mode == "RGB":
+        colour = [int(value) >> max(0, depth - 8) for value in clear]
+        return (pixels != np.array(colour)).any(axis=-1)
+    if image.mode == "1":
+        return pixels != bool(clear)
+    return pixels != (int(clear) * 255 // (2**depth - 1) if depth < 8 else int(clear))
 
 
 def _check_rows(path: Path, image: Image.Image) -> None:
@@ -202,19 +239,28 @@ def _label(values: np.ndarray, opaque, sheet: Sheet, options: ImportOptions, rep
         labels[values > 100] = UNKNOWN
     if opaque is not None:
         labels[~opaque] = UNKNOWN
-    grey = _find_grey_margin(values, labels)
+    shades = 255 - values if sheet.negate and sheet.mode != "raw" else values  # white is free
+    grey, why = _find_grey_margin(shades, labels), "fills the image's margin"
+    if grey is None and sheet.mode == "trinary":
+        grey, why = _find_saved_unknown(shades, labels), "is what map savers write for unknown space"
     if grey is not None:
-        labels[values == grey] = UNKNOWN
-        report.warn(
-            f"grey {grey:g} fills the image's margin yet counts as free with free_thresh {sheet.free:g}: it was "
-            "taken as unknown (set free_threshold below it in the yaml)"
+        labels[shades == grey] = UNKNOWN
+        shown = 255 - grey if shades is not values else grey
+        report.assume(
+            f"grey {shown:g} {why} yet counts as free with free_thresh {sheet.free:g}: it was taken as unknown",
+            "set free_thresh in the yaml, or importing.free_threshold, to 0.196 or less",
+            warn=True,
         )
-    dark = _find_dark_unknown(values, labels)
+    if sheet.mode == "raw":
+        label_ones(values, labels, report)
+    dark = _find_dark_unknown(shades, labels)
     wanted = options.grey_walls
     if wanted is None:  # where walls are black, the greys beside them are only blur
         wanted = sheet.mode != "raw" and int(dark.sum()) > int((labels == OBSTACLE).sum())
     if wanted and dark.any():
         labels[dark] = OBSTACLE
+        if options.grey_walls is None:
+            report.assume("greys between the thresholds were taken for walls", "set importing.grey_walls=true or false")
         report.add("grey walls", "pixels darker than the grey of unknown space became obstacles", after=int(dark.sum()))
     return labels
 
@@ -231,6 +277,32 @@ def _find_grey_margin(values: np.ndarray, labels: np.ndarray) -> float | None:
     mid = 150 < grey < 225 and counts.max() > 0.5 * len(margin)
     free = bool((labels[values == grey] == FREE).all())
     return grey if mid and free and whiter.sum() > 0.01 * values.size else None
+
+
+def _find_saved_unknown(shades: np.ndarray, labels: np.ndarray) -> float | None:
+    """Map savers' grey of unknown space, where it passes as free beside a whiter free and black walls.
+
+    nav2 saves `free_thresh: 0.25`, which is above it. Among many greys it is a shade like others.
+    """
+    grey = np.rint(shades) == SAVED_UNKNOWN
+    if not grey.any() or (labels[grey] != FREE).any():
+        return None
+    whiter = (labels == FREE) & (shades >= 250)
+    black = (labels == OBSTACLE) & (shades <= 5)
+    between = (shades > 5) & (shades < 250)
+    usual = whiter.any() and black.any() and grey.sum() > 0.5 * between.sum()
+    return float(shades[grey][0]) if usual else None
+
+
+def label_ones(values: np.ndarray, labels: np.ndarray, report: ImportReport) -> None:
+    """In grids of -1, 0 and 1, of which the text of OccupancyGrid speaks, 1 is occupied, not a chance of 1 percent."""
+    if (values[(values >= 0) & (values <= 100)].max(initial=0)) == 1:
+        labels[values == 1] = OBSTACLE
+        report.assume(
+            "the grid holds 0 and 1 and nothing above: 1 was taken as occupied, not as a chance of 1 %",
+            "write 100 for occupied cells",
+            warn=True,
+        )
 
 
 def _find_dark_unknown(values: np.ndarray, labels: np.ndarray) -> np.ndarray:

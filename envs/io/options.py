@@ -37,6 +37,9 @@ class ImportOptions:
         "pixels between the thresholds but darker than the grey of unknown space are obstacles; default: where they "
         "outnumber the black ones",
     )
+    strict: bool = setting(
+        False, "refuse a file that leaves its unit, axis up, thresholds or the like to be assumed, instead of a note"
+    )
     topic: str | None = setting(
         None, "OccupancyGrid or PointCloud2 of a bag to read; default: the only grid, or else the only cloud"
     )

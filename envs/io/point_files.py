@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maexp.envs.io.options import ImportOptions
-from maexp.envs.io.report import ImportReport
+from maexp.envs.io.report import ImportReport, printable
 from maexp.envs.maps.point_cloud import MapError, PointCloudMap, check_file, read_npz
 from maexp.envs.scenarios import find_scenario
 
@@ -32,7 +32,7 @@ def read_npz_map(path: Path, options: ImportOptions, report: ImportReport) -> Po
         return world
     found = {kind: next((n for n in names if n in arrays), None) for kind, names in KINDS.items()}
     clouds = {kind: arrays[name] for kind, name in found.items() if name}
-    return _make_map(path, path.stem, clouds, options, report)
+    return _make_map(path, printable(path.stem), clouds, options, report)
 
 
 def read_npy_triple(path: Path, options: ImportOptions, report: ImportReport) -> PointCloudMap:
@@ -52,7 +52,7 @@ def read_npy_triple(path: Path, options: ImportOptions, report: ImportReport) ->
             clouds[kind] = _read_npy(present)
         elif kind != "boundary":
             raise MapError(f"{files[0]} does not exist; it belongs beside {path.name}")
-    return _make_map(path, stem, clouds, options, report)
+    return _make_map(path, printable(stem), clouds, options, report)
 
 
 def _read_npy(path: Path) -> np.ndarray:

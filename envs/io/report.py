@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from maexp.envs.atomic_write import whole_file
 from maexp.envs.maps.plot import draw_map, paint_map
-from maexp.envs.maps.point_cloud import PointCloudMap
+from maexp.envs.maps.point_cloud import MapError, PointCloudMap
 
 SHOWN_POINTS = 300_000  # of a cloud, for its picture
 
@@ -50,11 +51,16 @@ class ImportStep:
 
 @dataclass
 class ImportReport:
-    """The steps of one import in order, and warnings a person should read."""
+    """The steps of one import in order, what was assumed on the way, and warnings a person should read.
+
+    Where `strict`, an assumption is a MapError.
+    """
 
     path: str
     steps: list[ImportStep] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    assumptions: list[str] = field(default_factory=list)
+    strict: bool = False
     seconds: float = 0.0
     before: ScannedImage | ScannedPoints | None = None  # None: the file holds a map's points already
 
@@ -64,6 +70,26 @@ class ImportReport:
     def warn(self, text: str) -> None:
         self.warnings.append(text)
 
+    def assume(self, text: str, cure: str, warn: bool = False) -> None:
+        """Note what the file does not say and was guessed; `cure` says how to settle it, `warn` that it may be wrong.
+
+        Raises:
+            MapError: the import is strict.
+        """
+        if self.strict:
+            raise MapError(f"{self.path}: {text}, which importing.strict=true refuses; {cure}")
+        (self.warnings if warn else self.assumptions).append(f"{text}; {cure}")
+
+    def as_dict(self) -> dict[str, object]:
+        """The report as plain values: path, seconds, steps (name, detail, before, after), assumptions, warnings."""
+        steps = [asdict(step) | {"detail": printable(step.detail)} for step in self.steps]
+        told = {"path": printable(self.path), "seconds": round(self.seconds, 3), "steps": steps}
+        return told | {"assumptions": self.assumptions, "warnings": self.warnings}
+
+    def to_json(self) -> str:
+        """`as_dict` as JSON."""
+        return json.dumps(self.as_dict(), indent=2) + "\n"
+
     def table(self) -> str:
         """The report as text: one line a step."""
         head = ("step", "before", "after", "what was done")
@@ -72,9 +98,16 @@ class ImportReport:
         lines = [
             f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]:>{widths[2]}}  {row[3]}" for row in [head, *rows]
         ]
-        lines.insert(0, f"import of {self.path} ({self.seconds:.1f} s)")
+        lines = [printable(line) for line in lines]
+        lines.insert(0, f"import of {printable(self.path)} ({self.seconds:.1f} s)")
+        lines += [f"assumed: {text}" for text in self.assumptions]
         lines += [f"warning: {text}" for text in self.warnings]
         return "\n".join(lines)
+
+
+def printable(name: str) -> str:
+    """A file's name as text: bytes that are no UTF-8, which print and save as nothing, as \\xNN."""
+    return name.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
 def _count(value: int | None) -> str:
@@ -103,7 +136,7 @@ def draw_import(world: PointCloudMap, report: ImportReport, path: str | os.PathL
         _paint_image(before.add_subplot(), report.before)
     else:
         _paint_cloud(before, report.before)
-    before.suptitle(f"before: {Path(report.path).name}", fontsize=11)
+    before.suptitle(f"before: {printable(Path(report.path).name)}", fontsize=11)
     paint_map(after.add_subplot(), world, PANEL)
     after.suptitle("after", fontsize=11)
     with whole_file(Path(path)) as part:

@@ -9,7 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from maexp.envs.io.grid import FREE, MAX_CELLS, MAX_ORIGIN, OBSTACLE, UNKNOWN, Grid
+from maexp.envs.io.occupancy import label_ones
 from maexp.envs.io.options import ImportOptions
+from maexp.envs.io.report import ImportReport
 from maexp.envs.maps.point_cloud import MapError
 
 
@@ -27,7 +29,7 @@ OCCUPIED, FREE_BELOW = 0.65, 0.25  # shares of 100, as nav2's map saver has them
 REALS = {7: "f4", 8: "f8"}  # PointField's codes of float32 and float64
 
 
-def to_grid(path: Path, message, options: ImportOptions) -> Grid:
+def to_grid(path: Path, message, options: ImportOptions, report: ImportReport) -> Grid:
     """The grid of a ``nav_msgs/OccupancyGrid``: -1 is unknown, 0 to 100 the chance of an obstacle in percent."""
     info = message.info
     values = np.asarray(message.data, dtype=np.int8)
@@ -50,6 +52,11 @@ def to_grid(path: Path, message, options: ImportOptions) -> Grid:
     labels = np.full(share.shape, UNKNOWN, dtype=np.uint8)
     labels[(share >= 0) & (share <= free)] = FREE
     labels[share >= occupied] = OBSTACLE
+    label_ones(values.reshape(height, width).T, labels, report)
+    if ((values > 1) & (values < 100)).any():
+        for name, value in (("free_threshold", free), ("occupied_threshold", occupied)):
+            if getattr(options, name) is None:
+                report.assume(f"the {name} of the grid's values was taken to be {value:g}", f"set importing.{name}")
     if not (labels == FREE).any():
         span = f"{values.min()} to {values.max()}"
         raise MapError(f"{path}: no cell of the grid is free (values {span}); set free_threshold")

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+UPDATE = "map_msgs/msg/OccupancyGridUpdate"
+UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
+STORE.register(get_types_from_msg(UPDATE_TEXT, UPDATE))
 GRID, CLOUD, TF = "nav_msgs/msg/OccupancyGrid", "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 
 
@@ -36,6 +39,18 @@ def grid(values: np.ndarray, cell: float, corner=(0.0, 0.0), yaw: float = 0.0, t
         origin=origin,
     )
     return kind(GRID)(header=header("map", time), info=info, data=values.astype(np.int8).ravel())
+
+
+def update(values: np.ndarray, x: int, y: int, time: float = 0.0):
+    """An OccupancyGridUpdate of `values` [rows y, columns x] at column x and row y."""
+    return kind(UPDATE)(
+        header=header("map", time),
+        x=x,
+        y=y,
+        width=values.shape[1],
+        height=values.shape[0],
+        data=values.astype(np.int8).ravel(),
+    )
 
 
 def cloud(points: np.ndarray, frame: str, time: float, real: str = "<f4"):
