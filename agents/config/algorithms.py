@@ -48,8 +48,15 @@ class AlgorithmSettings:
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings."""
-        names = ("gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage")
-        names += ("mask_collided",)
+        names = (
+            "gamma",
+            "lmbda",
+            "finite_horizon",
+            "entropy_coeff",
+            "critic_coeff",
+            "normalize_advantage",
+            "mask_collided",
+        )
         return {name: getattr(self, name) for name in names}
 
 
@@ -161,7 +168,7 @@ class Tunings:
         """
         if tuning not in ("default", "reference"):
             raise ValueError(f"tuning={tuning!r} is unknown; choose default or reference.")
-        known = [field.name for field in fields(self.default)]
+        known = [field.name for field in fields(self.default) if field.name != "name"]
         unknown = [name for name in overrides if name not in known]
         if unknown:
             raise ValueError(f"{self.name} has no setting {unknown[0]!r}; choose one of {', '.join(known)}.")
