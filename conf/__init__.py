@@ -46,8 +46,8 @@ def read_choice(group: str, name: str) -> dict[str, Any]:
 
 
 def merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Two mappings as one, as Hydra merges them: the second wins, value by value."""
-    both = {key: merge(below[key], above[key]) for key in above if isinstance(below.get(key), dict)}
+    """Two mappings as one, and so those that both hold; the second wins."""
+    both = {key: below[key] | above[key] for key in above if isinstance(below.get(key), dict)}
     return below | above | both
 
 

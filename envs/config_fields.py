@@ -1,7 +1,7 @@
 """Settings as fields of dataclasses: type, default, range, unit and one line of help, each said once.
 
 From these come the check of a value and its message (`check_settings`), the comments of a run's `config.yaml`, the
-types and defaults of the command line (`maexp.agents.config.storable`), and the manual's table of settings. Imports
+types and defaults of the command line (`maexp.agents.config.schema`), and the manual's table of settings. Imports
 neither torch nor Warp: whoever asks for help does not wait for them.
 """
 
@@ -98,7 +98,7 @@ def check_settings(settings: Any, group: str = "", error: type[ValueError] = Val
             check_value(name, getattr(settings, setting.name), allowed[setting.name], setting.metadata, error)
 
 
-def check_value(name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[ValueError] = ValueError) -> None:
+def check_value(name: str, value: Any, allowed: tuple, metadata: Mapping, error: type[Exception] = ValueError) -> None:
     """Raise ``error`` unless the value is of one of the types and in the range of a setting.
 
     Ranges without an end reach to `WHOLE_LIMIT` or `NUMBER_LIMIT`, which are told only to who leaves them.

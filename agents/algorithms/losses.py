@@ -87,7 +87,7 @@ class TeamLoss(LossModule):
     Args:
         actor: the policy, from make_policy
         critic: from make_critic
-        gamma, lmbda, finite_horizon: of the advantages (`settings/algorithms.py`)
+        gamma, lmbda, finite_horizon: of the advantages (`config/algorithms.py`)
         entropy_coeff: weight of the entropy of a robot's whole action
         critic_coeff: weight of the critic's error, a smooth L1
         clip_value: bound on the change of a value; None: none

@@ -1,4 +1,4 @@
-"""The algorithms: for each its loss, critic and updater; their settings stand in `settings/algorithms.py`."""
+"""The algorithms: for each its loss, critic and updater; their settings stand in `config/algorithms.py`."""
 
 from dataclasses import dataclass, replace
 

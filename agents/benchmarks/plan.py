@@ -13,6 +13,7 @@ from maexp.agents.config.compose import compose_settings
 from maexp.agents.config.env import episode_decisions
 from maexp.agents.config.overrides import quote
 from maexp.agents.config.resolved import flatten, plain
+from maexp.agents.config.runs import SUPPLIERS
 from maexp.agents.config.verbs import BenchmarkSettings, TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.files import write_json
@@ -323,7 +324,9 @@ def read_plan(place: str | Path) -> dict:
 def shared_settings(cfg: BenchmarkSettings) -> dict[str, Any]:
     """What must stay as it is for cells to be comparable; None: left open, see `write_plan`."""
     whole = {"policy_per_map": json.dumps(plain(cfg)["policy_per_map"])}  # not taken apart
-    shared = {name: value for name, value in flatten(plain(cfg) | whole).items() if not _is_free(name)}
+    values = flatten(plain(cfg) | whole)
+    values |= {name: values[source] for name, source in SUPPLIERS.items() if values[name] is None}
+    shared = {name: value for name, value in values.items() if not _is_free(name)}
     return {name: "inf" if value == math.inf else value for name, value in shared.items()}  # JSON has no infinity
 
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 from maexp.agents import build
 from maexp.agents.cli.evaluate import find_teams
-from maexp.agents.config.checks import check_counts, team_sizes
+from maexp.agents.config.checks import team_sizes
 from maexp.agents.config.compose import compose_settings
 from maexp.agents.config.overrides import find_override, make_overrides
 from maexp.agents.config.runs import Recipe, continue_run
@@ -41,7 +41,6 @@ def make_env(
     place = find_override(overrides, RUNS[verb])
     recipe = Recipe(overrides) if place is None else continue_run(*find_checkpoint(place), overrides, verb)
     cfg = compose_settings(verb, recipe)
-    check_counts(cfg, "num_envs")
     sizes = team_sizes(cfg.num_robots)
     if len(sizes) > 1 or cfg.scenario.also:
         several = f"num_robots={cfg.num_robots}" if len(sizes) > 1 else f"scenario.also={list(cfg.scenario.also)}"

@@ -5,21 +5,22 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from maexp.agents.config.compose import compose_values
-from maexp.agents.config.schema import describe, schema
+from maexp.agents.config.schema import describe
+from maexp.agents.config.verbs import SCHEMAS
 from maexp.conf import groups, list_choices
 
 
 def verb_help(name: str, summary: str, examples: tuple[str, ...]) -> str:
     """The help of a verb: its settings and choices with what is taken without a word; the choices are the files of
     `conf/` with the comment on their first line."""
-    kind, defaults = schema(name), compose_values(name, [])
+    kind, defaults = SCHEMAS[name], compose_values(name, [])
     lines = [f"maexp {name}: {summary}", ""]
     lines += [f"  {example}" for example in examples]
     lines += ["", "Settings (name=value)"]
     for setting, text in describe(kind):
         lines += _row(_assign(setting, OmegaConf.select(defaults, setting)), text)
     for group in groups():
-        if group in kind.__dataclass_fields__:
+        if group in defaults:
             one_value = f", and {group}.NAME=VALUE for one value of it" * OmegaConf.is_dict(defaults[group])
             lines += ["", f"{group}=CHOICE{one_value}"]
             chosen = defaults.hydra.runtime.choices.get(group)

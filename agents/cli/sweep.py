@@ -80,8 +80,10 @@ def _run_jobs(verb: str, words: list[str]) -> None:
     register_schema(verb)
     GlobalHydra.instance().clear()
     with initialize_config_module("maexp.conf", version_base="1.3"), keeping_episodes():
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None  # of the line above
         try:
-            GlobalHydra.instance().hydra.multirun(verb, _run_job, words)
+            hydra.multirun(verb, _run_job, words)
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(explain(error, verb)) from error
 

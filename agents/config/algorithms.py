@@ -205,7 +205,7 @@ class Tunings:
         """
         if tuning not in ("default", "reference"):
             raise ValueError(f"tuning={tuning!r} is unknown; choose default or reference.")
-        known = [field.name for field in fields(self.default)]
+        known = [field.name for field in fields(self.default) if field.name != "name"]
         unknown = [name for name in overrides if name not in known]
         if unknown:
             raise ValueError(f"{self.name} has no setting {unknown[0]!r}; choose one of {', '.join(known)}.")

@@ -11,14 +11,6 @@ from maexp.envs.config_fields import WHOLE_LIMIT, shown
 from maexp.envs.scenarios import SCENARIOS
 
 
-def check_counts(settings: Any, *names: str, least: int = 1, prefix: str = "") -> None:
-    """Raise UserError unless each setting is a whole number of at least `least`."""
-    for name in names:
-        value = getattr(settings, name)
-        if type(value) is not int or value < least:
-            raise UserError(f"{prefix}{name}={value} must be a whole number, {least} or more.")
-
-
 def check_seed(value: Any, name: str = "seed") -> None:
     """Raise UserError unless random numbers can start from it: other numbers would share those of a smaller one."""
     if type(value) is not int or not 0 <= value <= LAST_SEED:
@@ -35,9 +27,7 @@ def check_distinct(name: str, values: Sequence) -> None:
 
 def choices_of(value: Any) -> list[str]:
     """The words of a setting that names one policy or several."""
-    if value is None:
-        return []
-    return [value] if isinstance(value, str) else [str(item) for item in value]
+    return [str(item) for item in as_list(value)]
 
 
 def team_sizes(value: Any) -> list[int]:

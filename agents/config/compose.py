@@ -14,7 +14,8 @@ from omegaconf.errors import OmegaConfBaseException
 from maexp.agents.config.env import follower_names
 from maexp.agents.config.overrides import parse, set_names
 from maexp.agents.config.runs import Recipe
-from maexp.agents.config.schema import check_name, default_values, make_settings, schema
+from maexp.agents.config.schema import check_name, default_values, make_settings
+from maexp.agents.config.verbs import SCHEMAS
 from maexp.agents.errors import UserError
 from maexp.conf import groups, list_choices
 
@@ -74,13 +75,13 @@ def register_schema(verb: str) -> None:
     """Make the settings and their defaults known to Hydra as `<verb>_schema`, the first entry of the verb's primary
     config; and `algorithm: each`, which sets nothing, for a benchmark."""
     store = ConfigStore.instance().store
-    store(name=f"{verb}_schema", node=default_values(schema(verb)))
+    store(name=f"{verb}_schema", node=default_values(SCHEMAS[verb]))
     store(group="algorithm", name="each", node={})
 
 
 def make_object(verb: str, cfg: DictConfig, recipe: Recipe) -> Any:
     """The object of composed settings, with the values of a run in place of those that the words come to."""
-    cfg = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
+    cfg = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
     OmegaConf.set_struct(cfg, False)
     followers: list[str] = []
     if "scenario" in cfg:
@@ -91,7 +92,7 @@ def make_object(verb: str, cfg: DictConfig, recipe: Recipe) -> Any:
         values = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
         raise UserError(explain(error, verb)) from error
-    settings = make_settings(schema(verb), values)  # type: ignore[arg-type]
+    settings = make_settings(SCHEMAS[verb], values)  # type: ignore[arg-type]
     return replace(settings, followers=tuple(followers)) if followers else settings
 
 
@@ -123,7 +124,8 @@ def _put_values(cfg: DictConfig, recipe: Recipe) -> None:
 
 def check_overrides(verb: str, words: list[str]) -> None:
     """Raise UserError for a word that names no setting and no choice, or gives a single value several."""
-    choices = groups()
+    choices, settings = groups(), default_values(SCHEMAS[verb])
+    own_folders = "hydra.searchpath" in set_names(words)  # of choices: Hydra says what is not there
     for word in words:
         override = parse(word)
         name, value = override.key_or_group, override.value()
@@ -131,8 +133,8 @@ def check_overrides(verb: str, words: list[str]) -> None:
             continue
         if override.is_sweep_override():
             raise UserError(_describe_several(word, verb))
-        if name in choices and name in schema(verb).__dataclass_fields__ and isinstance(value, str):
-            if value not in list_choices(name):
+        if name in choices and name in settings and isinstance(value, str):
+            if value not in list_choices(name) and not own_folders:
                 raise UserError(f"{name}={value} is unknown: choose one of {', '.join(list_choices(name))}.")
         else:
             check_name(name, verb)

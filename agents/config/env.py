@@ -6,7 +6,6 @@ from functools import cache
 from typing import Any
 
 from maexp.agents.config.algorithms import AlgorithmSettings
-from maexp.agents.config.checks import check_counts
 from maexp.agents.config.groups import PACE, SUPPLIED, CommonSettings, LearnerSettings, ScenarioSettings
 from maexp.agents.errors import UserError
 from maexp.envs.config import GROUPS, EnvSettings, PlannerConfig, RadarConfig, RobotConfig, supplied
@@ -84,15 +83,21 @@ def team_configs(cfg: CommonSettings, num_robots: int) -> tuple[list[RobotConfig
     the list repeats it.
     """
     entries = cfg.robot.team or [{}]
-    allowed = [field.name for field in fields(RobotConfig)] + ["radar"]
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise UserError("robot.team must be a list of settings, as [{kind: ackermann}, {kind: differential}].")
-    for name in (name for entry in entries for name in entry):
-        if name not in allowed:
-            raise UserError(f"robot.team has no setting {name}: choose one of {', '.join(allowed)}.")
+    for entry in entries:
+        _check_names("", entry, RobotConfig, "radar")
+        _check_names("radar.", entry.get("radar", {}), RadarConfig)
     entries = [entries[i % len(entries)] for i in range(num_robots)]
     radars = [replace(cfg.radar, **entry.get("radar", {})) for entry in entries]
     return [robot_config(cfg, entry) for entry in entries], radars
+
+
+def _check_names(prefix: str, entry: dict[str, Any], kind: type, *others: str) -> None:
+    allowed = [*(field.name for field in fields(kind)), *others]
+    for name in entry:
+        if name not in allowed:
+            raise UserError(f"robot.team has no setting {prefix}{name}: choose one of {', '.join(allowed)}.")
 
 
 def robot_config(cfg: CommonSettings, entry: dict[str, Any] | None = None) -> RobotConfig:
@@ -117,7 +122,6 @@ def map_indices(scenario: ScenarioSettings) -> tuple[list[int], list[int], list[
     if scenario.held_out is not None and scenario.held_out_count is not None:
         raise UserError("scenario.held_out and scenario.held_out_count were both given: give one of them.")
     if scenario.held_out_count is not None:
-        check_counts(scenario, "held_out_count", prefix="scenario.")
         held_out = range(held_out.start, held_out.start + scenario.held_out_count)
     others = _indices("scenario.held_out", scenario.held_out, held_out)
     none = scenario.validation == []

@@ -1,7 +1,7 @@
 """The groups of settings that verbs share."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Literal
 
 from maexp.agents.config.algorithms import AlgorithmSettings
 from maexp.agents.config.model import ModelConfig
@@ -18,6 +18,7 @@ from maexp.envs.config import (
     RobotConfig,
     TargetsConfig,
 )
+from maexp.envs.config.env import Knower
 from maexp.envs.config_fields import replaced, same, setting
 from maexp.envs.io.options import ImportOptions
 from maexp.envs.scenarios import Scenario
@@ -65,7 +66,7 @@ class ScenarioSettings:
     )
     held_out: Any = setting(None, "indices evaluated; default: the last fifth of the table's count")
     held_out_count: int | None = setting(
-        None, "instead: so many, from the first held-out one on, beyond the table's count too"
+        None, "instead: so many, from the first held-out one on, beyond the table's count too", low=1
     )
     starts: str = setting(
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
@@ -73,8 +74,8 @@ class ScenarioSettings:
     decision_seconds: Any = same(EnvSettings, "decision_seconds")
     decide: str = same(EnvSettings, "decide")
     success_coverage: float = same(EnvSettings, "success_coverage")
-    done: str = same(EnvSettings, "done")
-    collision: str = same(EnvSettings, "collision")
+    done: Knower = same(EnvSettings, "done")
+    collision: Literal["centre", "footprint"] = same(EnvSettings, "collision")
     importing: ImportOptions = group(ImportOptions, robot_radius="${robot.radius}")
 
 

@@ -62,7 +62,7 @@ class ModelConfig:
     def policy(self) -> dict[str, object]:
         """What a policy's network is made from: two policies that agree in this can take each other's weights."""
         if self.action == "targets":
-            names = ("action", "target_width", "target_heads", "starts_from", "score_weight")
+            names: tuple[str, ...] = ("action", "target_width", "target_heads", "starts_from", "score_weight")
         else:
             critics = ("target_width", "target_heads", "starts_from", "score_weight", "critic_hidden", "critic_encoder")
             names = tuple(field.name for field in fields(self) if field.name not in critics)

@@ -9,7 +9,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, OverrideParseException
 
-from maexp.agents.config.schema import schema
+from maexp.agents.config.schema import default_values
+from maexp.agents.config.verbs import SCHEMAS
 from maexp.agents.errors import UserError
 from maexp.envs.config import STARTS
 
@@ -51,15 +52,14 @@ def parse(word: str) -> Override:
 
 def split_flags(words: list[str]) -> tuple[list[str], list[str]]:
     """(flags that start with a dash, with the value of --cfg and the like, and the rest)."""
-    flags, rest = [], []
-    words = iter(words)
-    for word in words:
+    flags, rest, left = [], [], iter(words)
+    for word in left:
         if not word.startswith("-") or "=" in word.split("-")[0]:
             rest.append(word)
             continue
         flags.append(word)
         if word in ("--cfg", "-c", "--package", "-p"):
-            flags.append(next(words, ""))
+            flags.append(next(left, ""))
     return flags, rest
 
 
@@ -76,7 +76,7 @@ def make_overrides(verb: str, words: list[str], positional: tuple[str, ...] = ()
         UserError: a bare word too many, one that is no override even when quoted, or policies given twice.
     """
     names = list(positional)
-    known = {*schema(verb).__dataclass_fields__, "hydra"}
+    known = {*default_values(SCHEMAS[verb]), "hydra"}
     result, several = [], []
     for word in words:
         name, sign, value = word.partition("=")

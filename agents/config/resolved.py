@@ -20,7 +20,8 @@ from maexp.agents.config.env import (
     team_configs,
 )
 from maexp.agents.config.groups import PACE, SUPPLIED, CommonSettings, ScenarioSettings
-from maexp.agents.config.schema import helps, schema, settings_of
+from maexp.agents.config.schema import helps, settings_of
+from maexp.agents.config.verbs import SCHEMAS
 from maexp.envs.config import GROUPS, PlannerConfig
 from maexp.envs.scenarios import Scenario, find_scenario
 
@@ -133,7 +134,7 @@ def _listed(value: Any) -> Any:
 
 def flatten(node: dict, prefix: str = "") -> dict[str, Any]:
     """{"radar": {"range": 8}} as {"radar.range": 8}."""
-    flat = {}
+    flat: dict[str, Any] = {}
     for name, value in node.items():
         if isinstance(value, dict) and value:
             flat |= flatten(value, f"{prefix}{name}.")
@@ -154,7 +155,7 @@ _Dumper.add_representer(
 def to_yaml(settings: dict, verb: str) -> str:
     """Resolved settings of a verb as the text of a config.yaml, with units and meanings as comments."""
     text = yaml.dump(settings, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
-    return with_comments(text, helps(schema(verb), settings))
+    return with_comments(text, helps(SCHEMAS[verb], settings))
 
 
 LINE = re.compile(r"( *)(\w+):( \S.*)?")
@@ -163,7 +164,8 @@ SPANNING = ("[", "{", "'", '"', "|", ">")  # what may go on in the next line
 
 def with_comments(text: str, comments: dict[str, str]) -> str:
     """The YAML of settings with a comment behind every value that has one under its full name."""
-    lines, path = text.splitlines(), []
+    lines = text.splitlines()
+    path: list[str] = []
     for k, line in enumerate(lines):
         found = LINE.fullmatch(line)
         if not found:

@@ -11,7 +11,8 @@ from typing import Any
 
 from maexp.agents.config.overrides import find_override, set_names, without
 from maexp.agents.config.resolved import flatten
-from maexp.agents.config.schema import default_values, schema
+from maexp.agents.config.schema import default_values
+from maexp.agents.config.verbs import SCHEMAS
 from maexp.agents.errors import UserError
 from maexp.conf import groups_of_choice, list_choices
 from maexp.envs.config import BODY
@@ -22,7 +23,7 @@ GROUPS = (*ENV, "algorithm", "model")
 PLAYED = (*ENV, "num_envs", "num_robots", "seed", "num_threads")
 """Settings that matter to who only plays."""
 SHARED = ("num_robots", "seed")  # the other settings without a group mean something else to each verb
-SOURCES = {
+SUPPLIERS = {
     f"{group}.{setting.name}": f"scenario.{source}"
     for group, kind in ENV_GROUPS.items()
     for setting in fields(kind)
@@ -59,14 +60,14 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
         new: overrides of the command line
         leave_out: settings of the run that do not matter here
     """
-    known = default_values(schema(verb))
+    known = default_values(SCHEMAS[verb])
     values = {"algorithm.learn_share": 1.0} | flatten(saved["settings"])  # runs from before that was a setting
     for name in ("preset", "tuning"):
         if choice := find_override(new, name):
             raise UserError(
                 f"{name}={choice} stands for many settings, and those of {path} are kept: name the ones to change."
             )
-    foreign = [name for name in default_values(schema("train")) if name not in known]
+    foreign = [name for name in default_values(SCHEMAS["train"]) if name not in known]
     chosen = _chosen_anew(values, new)
     leave_out += ("preset", "tuning") * (verb != "train")
     if verb != "train" and find_override(saved["overrides"], "episodes") == "0":  # of a training alone: none
@@ -112,7 +113,7 @@ def _gone_with_the_scenario(saved: dict, values: dict[str, Any], new: list[str],
     if place != values["scenario.name"] or "scenario.path" in names:
         return followers
     gone = [
-        follower for follower in followers if SOURCES.get(follower, f"scenario.{follower.partition('.')[2]}") in names
+        follower for follower in followers if SUPPLIERS.get(follower, f"scenario.{follower.partition('.')[2]}") in names
     ]
     if "scenario.decision_seconds" in names:
         gone += ["scenario.local_steps", "scenario.macro_steps"]

@@ -22,11 +22,6 @@ NO_LIMITS = dict.fromkeys(("low", "high", "above", "below"), None) | {"infinite"
 TRUE, FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 
 
-def schema(verb: str) -> type:
-    """The dataclass of a verb's settings."""
-    return SCHEMAS[verb]
-
-
 def settings_of(cls: type) -> list[Field]:
     """The fields of a dataclass that are settings."""
     return [setting for setting in fields(cls) if setting.init and not setting.metadata.get("internal")]
@@ -34,7 +29,7 @@ def settings_of(cls: type) -> list[Field]:
 
 def group_of(cls: type, name: str) -> type | None:
     """The dataclass of a group of settings; None where the setting is a single one."""
-    kind = kinds(cls)[name][0]
+    kind: type = kinds(cls)[name][0]
     return kind if is_dataclass(kind) else None
 
 
@@ -74,7 +69,7 @@ def make_settings(cls: type, values: Mapping[str, Any], prefix: str = "") -> Any
     names = {setting.name for setting in settings_of(cls)}
     if unknown := next((name for name in values if name not in names), None):
         raise UserError(f"{prefix}{unknown} is not a setting: choose one of {', '.join(sorted(names))}.")
-    given = {}
+    given: dict[str, Any] = {}
     for setting in settings_of(cls):
         name, value = prefix + setting.name, values.get(setting.name, UNSET)
         kind = group_of(cls, setting.name)
@@ -97,7 +92,7 @@ def make_algorithm(values: Mapping[str, Any]) -> AlgorithmSettings:
     """
     try:
         tunings = find_tunings(values["name"])
-        cls = type(tunings.default)
+        cls: type = type(tunings.default)
         metadata = {setting.name: setting.metadata for setting in fields(cls)}
         given = {name: value for name, value in values.items() if name != "name" and value is not None}
         for name in metadata.keys() & given.keys():
@@ -108,7 +103,7 @@ def make_algorithm(values: Mapping[str, Any]) -> AlgorithmSettings:
 
 
 def _shared_value(name: str, value: Any) -> Any:
-    cls = algorithm_names()[name]
+    cls: type = algorithm_names()[name]
     found = next(setting for setting in fields(cls) if setting.name == name)
     return None if value is None else make_value(f"algorithm.{name}", value, kinds(cls)[name], found.metadata)
 
@@ -150,7 +145,7 @@ def _converted(value: Any, plain: set[type]) -> Any:
 
 def check_name(name: str, verb: str) -> None:
     """Raise UserError unless a verb has a setting or a group of that full name."""
-    values, path = default_values(schema(verb)), ""
+    values, path = default_values(SCHEMAS[verb]), ""
     for part in name.split("."):
         path = f"{path}.{part}".lstrip(".")
         if not isinstance(values, dict) and _is_open(name, verb):
@@ -162,9 +157,9 @@ def check_name(name: str, verb: str) -> None:
 
 def _is_open(name: str, verb: str) -> bool:
     """Whether a setting holds values under names of its own, as policy_per_map.maze=4."""
-    cls: type | None = schema(verb)
+    cls: type | None = SCHEMAS[verb]
     for part in name.split("."):
-        if cls is None or part not in cls.__dataclass_fields__:
+        if cls is None or part not in kinds(cls):
             return False
         if Any in kinds(cls)[part]:
             return True
@@ -174,7 +169,7 @@ def _is_open(name: str, verb: str) -> bool:
 
 def _suggest(name: str, verb: str) -> str:
     """The settings that hold the name as a word, or a close one among the verb's, or the settings beside it."""
-    names = list(flat_names(default_values(schema(verb))))
+    names = list(flat_names(default_values(SCHEMAS[verb])))
     holding = [candidate for candidate in names if name in re.split(r"[._]", candidate)]
     nearest = [candidate for candidate in holding if candidate.count(".") == min(other.count(".") for other in holding)]
     if meant := nearest or difflib.get_close_matches(name, names, 1, 0.7):

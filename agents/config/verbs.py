@@ -286,20 +286,6 @@ class PoliciesSettings:
     name: str | None = setting(None, "show: the policy, or the folder of one")
 
 
-Settings = (
-    TrainSettings
-    | EvaluateSettings
-    | ViewSettings
-    | ExportSettings
-    | BenchmarkSettings
-    | BenchSettings
-    | MapsSettings
-    | IrsimSettings
-    | SuiteSettings
-    | Ros2Settings
-    | LeaderboardSettings
-    | PoliciesSettings
-)
 EpisodeSettings = TrainSettings | EvaluateSettings
 """Of the verbs that play evaluation episodes with several policies."""
 SCHEMAS: dict[str, type] = {

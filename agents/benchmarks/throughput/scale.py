@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator
 from maexp.agents.benchmarks.throughput.env import MeasuredBatch
 from maexp.agents.benchmarks.throughput.shared import LEAST_LAPS, write_report
 from maexp.agents.build import load_maps, make_env
-from maexp.agents.config.checks import check_counts, check_distinct
+from maexp.agents.config.checks import check_distinct, team_sizes
 from maexp.agents.config.compose import compose_settings
 from maexp.agents.config.overrides import without
 from maexp.agents.config.verbs import BenchSettings
@@ -127,7 +127,7 @@ def plan_axis(axis: Axis, cfg: BenchSettings, overrides: list[str]) -> list[tupl
     meanwhile = [f"{name}={value}" for name, value in axis.meanwhile.items() if name not in given]
     points = [compose_settings("bench", [*meanwhile, *kept, axis.setting(value)]) for value in values]
     for point in points:
-        check_counts(point, "num_envs", "num_robots")
+        team_sizes(point.num_robots)
     return list(zip(values, points, strict=True))
 
 

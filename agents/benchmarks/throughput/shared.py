@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from maexp.agents.config.checks import check_counts, team_sizes
+from maexp.agents.config.checks import team_sizes
 from maexp.agents.config.compose import compose_settings
 from maexp.agents.config.groups import CommonSettings
 from maexp.agents.config.overrides import find_sweeps, without
@@ -45,8 +45,6 @@ def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], ver
     fixed = without(overrides, *drop, *swept)
     axes.append([f"num_robots={n}" for n in (sizes if cfg.num_robots is None else team_sizes(cfg.num_robots))])
     points = [compose_settings(verb, [*fixed, *point]) for point in itertools.product(*axes)]
-    for point in points:
-        check_counts(point, "num_envs", "num_robots")
     return points
 
 

@@ -11,7 +11,7 @@ import torch
 from maexp.agents.algorithms import ALGORITHMS
 from maexp.agents.cli import main
 from maexp.agents.config.model import SIZES, ModelConfig
-from maexp.agents.config.schema import schema, settings_of
+from maexp.agents.config.schema import settings_of
 from maexp.agents.config.verbs import SCHEMAS
 from maexp.envs.config import (
     CommConfig,
@@ -222,7 +222,7 @@ def test_large_numbers_that_mean_something_pass(settings):
 @pytest.mark.parametrize("verb", SCHEMAS)
 def test_every_setting_has_a_line_of_help(verb):
     """But names of choices and what only the command line fills in."""
-    settings = schema(verb)
+    settings = SCHEMAS[verb]
     missing = {field.name for field in settings_of(settings) if not field.metadata.get("help")}
     groups = {name for name in missing if is_dataclass(kinds(settings)[name][0])}
     allowed = {

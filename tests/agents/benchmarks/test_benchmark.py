@@ -71,7 +71,7 @@ def test_every_setting_reaches_every_cell():
     run, _ = cell_config(cfg, list_cells(cfg)[1])
     assert (run.planner.name, run.radar.range, run.algorithm.lr, run.seed) == ("dwa", 7.0, 0.5, 3)
     assert list(run.scenario.maps) == [0, 1] and run.scenario.held_out_count == 1
-    assert run.robot.team[0].radar.range == 3
+    assert run.robot.team[0]["radar"]["range"] == 3
 
 
 def test_benchmark_json_holds_no_null_and_yet_all_that_must_stay(tmp_path):

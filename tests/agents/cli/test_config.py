@@ -3,16 +3,18 @@
 from dataclasses import asdict, fields
 
 import pytest
+from hydra._internal.hydra import Hydra
 
 from maexp.agents.algorithms.registry import ALGORITHMS, TRAININGS
 from maexp.agents.build import load_maps, make_env, make_learner, map_indices
+from maexp.agents.cli import main
 from maexp.agents.config.algorithms import KINDS
 from maexp.agents.config.checks import team_sizes
 from maexp.agents.config.compose import compose, compose_settings
 from maexp.agents.config.env import planner_config, team_configs
 from maexp.agents.config.model import SIZES
 from maexp.agents.config.overrides import find_override, make_overrides, quote, without
-from maexp.agents.config.schema import default_values, schema
+from maexp.agents.config.schema import default_values
 from maexp.agents.config.verbs import SCHEMAS
 from maexp.agents.errors import UserError
 from maexp.conf import groups, list_choices, read_choice, read_file
@@ -32,7 +34,7 @@ def refusal(verb: str, *words: str) -> str:
 def test_every_choice_composes_and_is_described(group):
     for choice, text in list_choices(group).items():
         assert text, f"conf/{group}/{choice}.yaml has no description on its first line"
-        verb = "train" if group in schema("train").__dataclass_fields__ else "benchmark"
+        verb = "train" if group in SCHEMAS["train"].__dataclass_fields__ else "benchmark"
         words = [f"{group}={choice}", *["scenario.path=x.npz"] * (choice in ("pointcloud", "ir2"))]
         assert getattr(compose_settings(verb, words), group) is not None
 
@@ -72,11 +74,41 @@ def test_the_command_line_takes_what_the_env_takes_by_itself(scenario, planner):
     assert planner_config(cfg, row).completed(row) == whole
 
 
+@pytest.mark.parametrize("verb", ["train", "evaluate", "export", "view"])
+@pytest.mark.parametrize(
+    ("words", "algorithm"),
+    [
+        (["action=targets"], None),
+        (["action=regions"], "mappo"),
+        (["action='regions'"], "mappo"),
+        (["preset=paper"], "mappo"),
+        (["action=regions", "algorithm=ippo"], "ippo"),
+    ],
+)
+def test_the_default_algorithm_goes_with_the_action(verb, words, algorithm):
+    """Expert iteration, the default, learns what targets are worth."""
+    if "preset" not in default_values(SCHEMAS[verb]) and words == ["preset=paper"]:
+        return
+    assert compose_settings(verb, words).algorithm.name == (algorithm or "expert_iteration")
+
+
+def test_hydra_composes_once_for_a_command(monkeypatch, capsys):
+    calls, compose_once = [], Hydra.compose_config
+
+    def count(*words, **settings):
+        calls.append(words)
+        return compose_once(*words, **settings)
+
+    monkeypatch.setattr(Hydra, "compose_config", count)
+    assert main(["train", "scenario=maze", "--cfg", "job"]) == 0
+    assert len(calls) == 1 and "name: maze\n" in capsys.readouterr().out
+
+
 def test_every_setting_of_a_file_differs_from_its_default():
     """A value stands once: in the dataclass, or where a choice changes it."""
     chosen, open_ = 0, ("name", "kind", "path", "defaults")
     car = {field.name: field.default for field in fields(Scenario)}
-    for group, defaults in default_values(schema("train")).items():
+    for group, defaults in default_values(SCHEMAS["train"]).items():
         for choice in list_choices(group) if isinstance(defaults, dict) else ():
             content = read_file(group, choice)
             held, usual = content.get(group, content), defaults | {"row": car}

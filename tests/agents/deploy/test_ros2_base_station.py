@@ -107,11 +107,11 @@ def test_strangers_and_times_that_have_not_come_connect_nobody():
         ([f"only={BASE}", "comm.base_station=true"], "comm.base_station=True says no place"),
         ([f"only={BASE}", "comm.base_station=[1]"], "comm.base_station=[1] must be"),
         ([f"only={BASE}", "comm.base_station=[1,2]", "comm.range=-1"], "comm.range=-1.0 must be"),
-        ([f"only={BASE}", "comm.base_station=[1,2]", "memory=-1"], "memory=-1 must be a number above 0 [s], or inf"),
+        ([f"only={BASE}", "comm.base_station=[1,2]", "memory=-1"], "memory=-1.0 must be a number above 0 [s], or inf"),
         (["comm.range=8"], "comm.* is for robots that plan for themselves: give only=NAME"),
         (["only=a", "comm.range=8"], "comm= is for policies trained with observation.radio=true, and cost_utility"),
         (["only=a", "comm.reach=8"], "comm.reach is not a setting of maexp ros2"),
-        (["only=a", "time_limit=-1"], "time_limit=-1 must be above 0"),
+        (["only=a", "time_limit=-1"], "time_limit=-1.0 must be above 0"),
     ],
 )
 def test_words_that_cannot_be(words, told, tmp_path, monkeypatch, capsys):

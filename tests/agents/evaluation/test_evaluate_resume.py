@@ -192,7 +192,7 @@ def test_batches_are_of_what_their_bits_follow_from(tmp_path):
 
 def test_a_digest_changes_with_the_weights():
     env = build()
-    policy = make_policy(env(compose_settings("evaluate", ["policy=random", "action=regions"])))
+    policy = make_policy(env, compose_settings("evaluate", ["policy=random", "action=regions"]).model)
     before = digest_weights(policy)
     assert before == digest_weights(policy) != "" and digest_weights(POLICIES["random"]) == ""
     with torch.no_grad():

@@ -238,7 +238,7 @@ def test_nobody_there_is_told_before_anything_is_played():
 
 
 @pytest.mark.parametrize(
-    "word", ["socket:", "socket:5000", "socket:a:", "socket:a:0", "socket:a:65536", "socket:a:x", "socket:a:²"]
+    "spec", ["socket:", "socket:5000", "socket:a:", "socket:a:0", "socket:a:65536", "socket:a:x", "socket:a:²"]
 )
 def test_what_is_no_address_is_told(spec):
     with pytest.raises(UserError, match="is no HOST:PORT, as localhost:5000") as error:

@@ -26,7 +26,7 @@ def test_one_is_shown(capsys):
 
 
 @pytest.mark.parametrize(
-    "words",
+    "specs",
     [
         ["policies", "show", "universl"],
         ["evaluate", "policy=universl"],
@@ -99,7 +99,7 @@ def test_it_plays_on_several_floors_with_teams_of_every_size(tmp_path, monkeypat
         ),
     ],
 )
-@pytest.mark.parametrize("words", [["evaluate", "policy=mine"], ["view", "policy=mine"], ["train", "warm_start=mine"]])
+@pytest.mark.parametrize("specs", [["evaluate", "policy=mine"], ["view", "policy=mine"], ["train", "warm_start=mine"]])
 def test_a_damaged_folder_is_a_sentence(file, change, part, specs, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(SHIPPED / "universal", "mine")

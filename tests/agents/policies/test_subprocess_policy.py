@@ -105,7 +105,7 @@ def test_the_next_episode_has_a_new_process():
 
 
 @pytest.mark.parametrize(
-    ("word", "told"),
+    ("spec", "told"),
     [
         ("hostile:Nobody", "AttributeError"),
         ("nowhere:Nobody", "ModuleNotFoundError"),
@@ -169,7 +169,7 @@ time.sleep(1000)
 
 
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="NO LINUX: policies of a killed run may stay")
-@pytest.mark.parametrize("word", ["sleeper:Sleeper", "exec:sh -c 'setsid sleep 1000 & exec sleep 1000'"])
+@pytest.mark.parametrize("spec", ["sleeper:Sleeper", "exec:sh -c 'setsid sleep 1000 & exec sleep 1000'"])
 def test_a_run_that_is_killed_outright_leaves_no_policy_behind(spec, tmp_path):
     """Nor what that has started, though it left the session; the thread that started the policy is gone by then."""
     (tmp_path / "sleeper.py").write_text(

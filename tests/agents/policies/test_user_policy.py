@@ -138,7 +138,7 @@ def test_a_callable_may_choose_targets_and_a_word_means_the_same_from_python():
 
 
 @pytest.mark.parametrize(
-    ("word", "told"),
+    ("spec", "told"),
     [
         ("nowhere:make", "policy=nowhere:make: there is no module nowhere, neither in this folder nor installed"),
         ("my_robots.sub:make", "importing my_robots.sub raised|there is no module my_robots.sub"),

@@ -112,7 +112,7 @@ def test_a_benchmark_of_ones_own_goes_on_and_says_what_changed(capsys, place):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("specs", "told"),
     [
         (["policies=nobody"], "policies=nobody is unknown: choose one of random"),
         (["policies=teachers:nobody"], "policies=teachers:nobody: teachers has no nobody"),

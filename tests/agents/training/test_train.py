@@ -167,7 +167,10 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
         ("scenario.also=[maze_small]", "names maze_small twice"),
         ("scenario.also=[{local_steps:5}]", "neither a scenario's name nor settings of one"),
         ("scenario.also=[{name:maze_small,steps:5}]", "scenario.also has no setting steps: choose among"),
-        ("scenario.also=[{name:maze_small,local_steps:few}]", "local_steps=few of maze_small cannot be"),
+        (
+            "scenario.also=[{name:maze_small,local_steps:few}]",
+            "of maze_small, local_steps='few' must be a whole number",
+        ),
         ("scenario.also=[{name:maze_small,local_steps:0}]", "local_steps=0"),
         ("scenario.also=[pointcloud]", "or give {name: pointcloud, path: FILES}"),
         ("scenario.also=[{name:pointcloud,path:nowhere.yaml}]", "nowhere.yaml"),
@@ -189,7 +192,7 @@ def test_entries_of_several_scenarios_have_settings_of_their_own(tmp_path):
             f"scenario.also=[{{name:maze_small,local_steps:5,maps:[1]}},{{name:pointcloud,path:{tmp_path}/mine.npz}}]",
         ],
     )
-    short, mine = other_scenarios(cfg, cfg)
+    short, mine = other_scenarios(cfg)
     env = make_env(short, load_maps(short.scenario).train, 2, 1)
     assert (env.local_steps, env.macro_steps) == (5, 15)
     assert [world.name for world in env.maps] == ["maze_small_1"]
