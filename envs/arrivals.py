@@ -24,7 +24,7 @@ class Arrivals:
     """When the robots of an env decide, and what they hold to until then.
 
     A decision of a team lasts until one of its robots has arrived at its target, or that is explored or taken by
-    another; the env's `local_steps` at most, after which all decide.
+    another, or the robot has held it for the env's `local_steps`.
 
     Args:
         env: only read.
@@ -32,7 +32,8 @@ class Arrivals:
     Attributes:
         every: local steps from look to look.
         state: tensors that later decisions depend on: ``deciding`` bool [E, N], ``aim`` float32 [E, N, 2] [m], the
-            target of each robot, and ``has_aim`` bool [E, N], whether it has one.
+            target of each robot, ``has_aim`` bool [E, N], whether it has one, and ``since`` int32 [E, N], local steps
+            since it decided.
     """
 
     def __init__(self, env: ExplorationEnv):
@@ -44,6 +45,7 @@ class Arrivals:
             "deciding": torch.ones(shape, dtype=torch.bool, device=device),
             "aim": torch.zeros((*shape, 2), device=device),
             "has_aim": torch.zeros(shape, dtype=torch.bool, device=device),
+            "since": torch.zeros(shape, dtype=torch.int32, device=device),
         }
         self._paint = record(self.known.paint, self.known.known.device)
         self.clearance = float(env.simulation.robot_tensors["clearance"].max())
@@ -90,21 +92,26 @@ class Arrivals:
     def play(self, hook) -> None:
         """The local steps of a decision, until somebody of each team decides."""
         env, state = self.env, self.env.simulation.tensors
-        running = state["active"].clone()
+        running, since = state["active"].clone(), self.state["since"] * ~self.state["deciding"]
         found = torch.zeros_like(self.state["deciding"])
         for start in range(0, env.local_steps, self.every):
             env.simulation.step(start, self.every)
             if hook is not None:
                 hook(env)
-            arrived = self._look()
+            since += self.every * state["active"].unsqueeze(-1)
+            arrived = self._look() | ((since >= env.local_steps) & self._alive())
             found |= arrived
             over = arrived.any(-1) | (state["local_step"] >= env.settings.episode_steps)
             state["active"] *= 1 - over.to(torch.int32)
             if not bool(state["active"].any()):
                 break
-        by_clock = (state["active"] != 0).unsqueeze(-1)
         state["active"] |= running * (state["terminated"] == 0)
-        self.state["deciding"] = found | by_clock | ~self.state["has_aim"]
+        self.state["deciding"], self.state["since"] = found | ~self.state["has_aim"], since
+
+    def _alive(self) -> torch.Tensor:
+        """Robots that move, of teams that play: bool [E, N]."""
+        state = self.env.simulation.tensors
+        return (state["active"] != 0).unsqueeze(-1) & (state["collided"] == 0)
 
     def _look(self) -> torch.Tensor:
         """Who decides now, bool [E, N]."""

@@ -60,7 +60,8 @@ class ExpertUpdater(Updater):
         for _ in range(math.ceil(self.settings.epochs * new / self.settings.minibatch_size)):
             meter.add(self._descend())
         known = sum(len(memory) for memory in self.memory.values())
-        log = {"branched": known, "headroom": _headroom(found)} | meter.means()
+        log = dict.fromkeys(("advantage_error", "gradient_norm"), math.nan) | meter.means()  # nan: none was new
+        log |= {"branched": known, "headroom": _headroom(found)}
         return log | {"advantage": between - begin, "update": time.perf_counter() - between}
 
     def _remember(self, batch: TensorDictBase) -> TensorDict:

@@ -80,7 +80,8 @@ def find_chooser(policy: torch.nn.Module) -> TargetChooser:
 
 def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: dict[str, Any]) -> dict[str, Any]:
     """What goes in and out, in which units, and what the policy was trained for."""
-    places = {scenario: numbers_of(find_scenario(scenario)) for scenario in trained.get("scenarios", [])}
+    protocol = env.local_steps == env.scenario.local_steps  # else all scenarios were played at the usual pace
+    places = {scenario: numbers_of(find_scenario(scenario), protocol) for scenario in trained.get("scenarios", [])}
     own = numbers_of_env(env)
     if env.scenario.name in places:
         places[env.scenario.name] = own
@@ -102,7 +103,7 @@ def describe(chooser: TargetChooser, env: ExplorationEnv, name: str, trained: di
             "starts_from": chooser.starts_from,
             "score_weight": chooser.score_weight,
         },
-        **(numbers_of(find_scenario("pointcloud")) if several else own),
+        **(numbers_of(find_scenario("pointcloud"), protocol) if several else own),
         "trained": trained | {"scenarios": places},
         "team_sizes": {"trained": trained.get("num_robots", [env.num_robots]), "most": MOST["robots"]},
         "opset": OPSET,
@@ -124,14 +125,14 @@ def numbers_of_env(env: ExplorationEnv) -> dict[str, float]:
     }
 
 
-def numbers_of(row: Scenario) -> dict[str, float]:
-    """The same of a scenario."""
+def numbers_of(row: Scenario, protocol: bool) -> dict[str, float]:
+    """The same of a scenario, at the pace of its protocol or at the usual one."""
     return {
         "radar_range": row.radar_range,
         "robot_radius": row.collision_threshold,
         "max_speed": row.max_speed,
         "max_accel": row.max_accel,
-        "seconds": DT * row.local_steps,
+        "seconds": DT * (row.local_steps if protocol else row.decision_steps()),
         "resolution": row.resolution,
     }
 

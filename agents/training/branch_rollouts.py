@@ -170,7 +170,7 @@ class BranchingActor(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase, env: ExplorationEnv, settings: ExpertSettings):
         super().__init__()
-        self.policy, self.share = policy, settings.branch_share
+        self.policy, self.share = policy, settings.at_pace().branch_share
         horizon, learn_from = settings.branch_horizon, settings.learn_from
         self.rollouts = BranchRollouts(env, settings.candidates, horizon, learn_from=learn_from)
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, TRIED, ADVANTAGE]

@@ -80,7 +80,7 @@ class EnvSettings:
     decide: Literal["together", "arrival"] = setting(
         "together",
         "when: together, all robots at once; or arrival: each when it has arrived or its target is explored or taken, "
-        "and all after decision_seconds at the latest",
+        "after decision_seconds at the latest",
     )
     first_env: int = setting(
         0, "number of the first env in the random keys, where processes share one batch of envs", low=0

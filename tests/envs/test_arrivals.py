@@ -52,9 +52,20 @@ def test_decisions_end_early_at_arrivals_and_mates_go_on(office):
         assert deciding.any(-1)[going].all()  # else nobody would have stopped the team
         shorter += int((spent[going] < env.local_steps).sum())
         held += int((~deciding)[going].sum())
-        full = going & (spent == env.local_steps)
-        assert len(env.arrivals.state["aim"]) == 3 and deciding.shape == (3, 3) and full.shape == (3,)
     assert shorter > 20 and held > 20
+
+
+def test_a_robot_decides_after_its_seconds_whether_it_has_arrived_or_not(office):
+    env, longest = make(office, decision_seconds=1.0), 0
+    policy, after = make_policy("multi_criteria", env), env.reset()
+    for _ in range(20):
+        after = env.step(policy(after))["next"]
+        since = env.arrivals.state["since"]
+        due = (since >= env.local_steps) & after["agents", "observation", "alive"] & ~after["done"]
+        longest = max(longest, int(since.max()))
+        assert (since <= env.local_steps).all()
+        assert after["agents", "deciding"][due].all()
+    assert longest == env.local_steps
 
 
 def test_who_does_not_decide_keeps_its_goal_and_target(office):

@@ -340,7 +340,7 @@ def test_an_env_is_made_of_its_settings(maps):
     env = ExplorationEnv(maps[0], 2, robot=team)
     again = ExplorationEnv(maps[0], **vars(env.settings))
     assert again.settings == env.settings == complete_settings(env.settings, env.maps)
-    assert env.settings.local_steps == env.scenario.local_steps and len(env.settings.radar) == 3
+    assert env.settings.local_steps == env.scenario.decision_steps() and len(env.settings.radar) == 3
     with pytest.raises(TypeError, match="num_robot"):
         ExplorationEnv(maps[0], num_robot=3)
 

@@ -125,7 +125,7 @@ def pace(cfg) -> tuple[int, int]:
         (["scenario.decision_seconds=2"], ["scenario.decision_seconds=0.5"], (5, 120)),
         (["scenario.local_steps=5"], ["scenario.decision_seconds=0.5", "scenario.macro_steps=7"], (5, 7)),
         (["scenario.local_steps=8"], [], (8, 15)),
-        (["scenario.decision_seconds=2"], ["scenario=maze_small"], (20, 15)),
+        (["scenario.decision_seconds=2"], ["scenario=maze_small"], (10, 30)),
     ],
 )
 def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):

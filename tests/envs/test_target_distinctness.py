@@ -21,7 +21,11 @@ PREFERENCE = ("agents", "action", "preference")
 
 def make_env(num_envs=4, num_robots=3, shown=24, **settings) -> ExplorationEnv:
     """Teams whose robots begin close to each other, so that they want the same."""
-    settings = {"planner": PlannerConfig(name="wavefront"), "success_coverage": 0.999} | settings
+    settings = {
+        "planner": PlannerConfig(name="wavefront"),
+        "success_coverage": 0.999,
+        "decision_seconds": "protocol",
+    } | settings
     env = ExplorationEnv(
         MAPS[0],
         num_envs=num_envs,

@@ -151,6 +151,7 @@ def setups() -> dict:
         "map errors, near": (dict(planner=wavefront, comm=near, odometry=astray), "lookahead"),
         "rollouts": (dict(planner=wavefront), "lookahead"),
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
+        "arrivals": (dict(planner=wavefront, decide="arrival"), "multi_criteria"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),
     }
 

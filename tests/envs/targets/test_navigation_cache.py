@@ -19,6 +19,7 @@ def assert_up_to_date(nav: Navigation, env: ExplorationEnv) -> None:
     fresh.update()
     for name in ("known", "frontier", "size", "target", "block", "cell", "distance"):
         assert torch.equal(getattr(nav, name), getattr(fresh, name)), name
+    assert torch.equal(nav.known_count, (nav.known != 0).sum(-1).int())
     for kept, found in zip(nav.look_from_targets(), fresh.look_around(nav.radar_range, nav.cell), strict=True):
         assert torch.equal(kept, found)
 

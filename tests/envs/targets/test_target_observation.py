@@ -177,7 +177,7 @@ def test_bad_actions_and_settings_are_named():
 
 @pytest.mark.parametrize("reach", [math.inf, 12.0])
 def test_features_agree_with_their_definitions(reach):
-    env = make_env(comm=CommConfig(range=reach))
+    env = make_env(comm=CommConfig(range=reach), decision_seconds="protocol")
     td = play(env, 3)[-1]
     view, robots = env.target_view, env.num_robots
     nav, state, sim = view.tracker.nav, view.state, env.simulation
