@@ -12,7 +12,7 @@ from maexp.agents.settings.compose import compose_config
 from maexp.agents.settings.overrides import POLICIES, find_override, find_sweeps
 from maexp.agents.settings.resolved import resolve, without_hydra
 from maexp.agents.settings.verbs.evaluate import NAMES
-from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.scenarios import SCENARIOS, VOLUMES
 
 RUNS = ("resume", "checkpoint", "place")
 """Settings that may name a run, whose settings come before the words."""
@@ -50,7 +50,7 @@ def check_sweep(verb: str, overrides: list[str]) -> None:
 
 def check_names(cfg: DictConfig) -> None:
     """Raise UserError unless the scenarios and algorithms of a benchmark are those there are."""
-    known = {"scenarios": [*SCENARIOS], "algorithms": [*TUNINGS]}
+    known = {"scenarios": [*SCENARIOS, *VOLUMES], "algorithms": [*TUNINGS]}
     for name, choices in known.items():
         allowed = [*choices, *NAMES] if name == "algorithms" else choices
         for value in as_list(cfg[name]):

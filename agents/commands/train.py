@@ -15,6 +15,7 @@ from maexp.agents.evaluation.cache import FOLDER
 from maexp.agents.evaluation.comparison import find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import command, lock, short
+from maexp.agents.policies.classical import PLANAR
 from maexp.agents.policies.registry import NamedPolicy, find_players, suit_observation
 from maexp.agents.settings.checks import team_sizes, words_of
 from maexp.agents.settings.overrides import find_override
@@ -31,6 +32,7 @@ from maexp.agents.training.train import (
 )
 from maexp.agents.training.validation import judged
 from maexp.envs import ExplorationEnv
+from maexp.envs.scenarios import find_scenario
 
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
@@ -80,7 +82,10 @@ def check(cfg: TrainSettings) -> None:
 
 def find_others(cfg: TrainSettings) -> list[NamedPolicy]:
     """The policies played at the end beside the trained one."""
-    words = list(dict.fromkeys(["random", *words_of(cfg.classical)]))
+    beside = words_of(cfg.classical)
+    if find_scenario(cfg.scenario.name).kind == "volume":
+        beside = [word for word in beside if word not in PLANAR]
+    words = list(dict.fromkeys(["random", *beside]))
     others = find_players(words, "classical")
     return (
         [player for player in others if player.direct] if cfg.planner.name == "direct" else others

@@ -11,7 +11,7 @@ from maexp.agents.settings.groups import SUPPLIED
 from maexp.agents.settings.model import SIZES, SUMMARIES
 from maexp.agents.settings.verbs import SCHEMAS
 from maexp.envs.config import CLEARANCE, PLANNERS
-from maexp.envs.scenarios import SCENARIOS, Scenario
+from maexp.envs.scenarios import SCENARIOS, VOLUMES, Scenario
 
 RULES: dict[str, dict[str, Any]] = {
     "ir2": {
@@ -51,7 +51,7 @@ def register_schema(verb: str) -> None:
 def stored_choices() -> dict[str, dict[str, tuple[str, dict[str, Any]]]]:
     """Choices of groups that tables of the code hold: {"scenario": {"maze": (summary, values)}}."""
     return {
-        "scenario": {name: (row.summary, _place(row)) for name, row in SCENARIOS.items()},
+        "scenario": {name: (row.summary, _place(row)) for name, row in (SCENARIOS | VOLUMES).items()},
         "algorithm": {name: (row.summary, {"name": name} | asdict(row.default)) for name, row in TUNINGS.items()},
         "planner": {name: (summary, _planner(name)) for name, summary in PLANNERS.items()},
         "model": {name: (SUMMARIES[name], asdict(sizes)) for name, sizes in SIZES.items()},

@@ -3,6 +3,7 @@
 from maexp.envs.scenarios.table import (
     GENERATED,
     SCENARIOS,
+    VOLUMES,
     Scenario,
     cut_last_fifth,
     default_macro_steps,
@@ -14,6 +15,7 @@ from maexp.envs.scenarios.table import (
 __all__ = [
     "GENERATED",
     "SCENARIOS",
+    "VOLUMES",
     "Scenario",
     "cut_last_fifth",
     "default_macro_steps",

@@ -16,6 +16,7 @@ from maexp.envs.scenarios.random_obstacles import build_adaptive, build_random_o
 from maexp.kernels.constants import DT
 
 LEAST_MACRO_STEPS = 10
+SWEEPS_OF_VOLUME = 8.0  # the same of an imported volume, by the squares of the radars' ranges
 SWEEPS = 2.0
 """A team that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -41,6 +42,11 @@ class Scenario:
     max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
     summary: str = ""  # a line for `--help`
+    kind: str = "plane"  # or "volume": its maps are voxels, in `VOLUMES`
+    height: float | None = None  # of the maps of a volume [m]
+    vertical_fov: float | None = None  # of the radar of a volume [rad]
+    robot_kind: str = "ackermann"  # how robots move that are not told otherwise
+    scan_every: int | None = None  # local steps from one scan to the next in a volume
 
     def with_radius(self, radius: float | None) -> "Scenario":
         """With a round robot of that radius [m], which collides where its body touches a wall; None: as it is."""
@@ -181,20 +187,84 @@ _ROWS = [
     ),
 ]
 
+_FLYING: dict[str, Any] = dict(
+    kind="volume",
+    resolution=0.25,
+    size=30.0,
+    height=6.0,
+    radar_range=5.0,
+    vertical_fov=math.pi / 2,
+    max_speed=2.0,
+    max_accel=2.0,
+    body_length=0.5,
+    body_width=0.5,
+    collision_threshold=0.25,
+    clearance_factor=3.0,
+    local_steps=20,
+    robot_kind="quadrotor",
+    scan_every=3,
+)
+
+
+def _build_volume(name: str, index: int) -> Any:
+    """A map of voxels; those who stay in the plane never load what makes them."""
+    from maexp.envs.volume.generate import build_volume
+
+    return build_volume(name, index)
+
+
+_VOLUME_ROWS = [
+    Scenario(
+        "cave",
+        summary="30 x 30 x 6 m of caves on several levels, 0.25 m voxels",
+        count=40,
+        macro_steps=60,
+        build=partial(_build_volume, "cave"),
+        **_FLYING,
+    ),
+    Scenario(
+        "office_3d",
+        summary="two office storeys of 30 x 30 m joined by stairs, 0.25 m voxels",
+        count=40,
+        macro_steps=90,
+        build=partial(_build_volume, "office_3d"),
+        **_FLYING,
+    ),
+    Scenario(
+        "town_3d",
+        summary="30 x 30 m of houses, trees and roofs under a closed sky, 0.25 m voxels",
+        count=40,
+        macro_steps=50,
+        build=partial(_build_volume, "town_3d"),
+        **_FLYING,
+    ),
+    Scenario(
+        "volume",
+        summary="voxels of your own: set scenario.path=FILE (.pcd .ply .las .laz .stl .obj .glb .bt .ot .npz)",
+        count=None,
+        macro_steps=None,
+        **_FLYING | dict(size=None, height=None),
+    ),
+]
+
 SCENARIOS: dict[str, Scenario] = {row.name: row for row in _ROWS}
+"""Scenarios in the plane."""
+VOLUMES: dict[str, Scenario] = {row.name: row for row in _VOLUME_ROWS}
+"""Scenarios of voxels, apart from the others: what is made for the plane never meets them."""
 GENERATED = tuple(name for name, row in SCENARIOS.items() if row.build is not None)
 """Those with maps of their own; the user brings the map of the others."""
 
 
 def find_scenario(name: str) -> Scenario:
     """The scenario called `name`; ValueError naming the choices if there is none."""
-    if name not in SCENARIOS:
-        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(SCENARIOS)}.")
-    return SCENARIOS[name]
+    rows = SCENARIOS | VOLUMES
+    if name not in rows:
+        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(rows)}.")
+    return rows[name]
 
 
-def make_map(name: str, index: int = 0) -> PointCloudMap:
-    """Map `index` (any integer >= 0) of scenario `name`: the same points on every call.
+def make_map(name: str, index: int = 0) -> Any:
+    """Map `index` (any integer >= 0) of scenario `name`: the same points, or voxels (`VoxelMap`), on every call.
 
     ValueError for an unknown scenario, a negative index, or a scenario whose map the user brings.
     """
@@ -239,8 +309,12 @@ def default_macro_steps(
     """
     team = team or [(scenario.max_speed, scenario.radar_range)] * 3
     seconds = DT * (local_steps or scenario.local_steps)
-    area = max(m.free_area for m in maps)
     across = max(math.dist(*m.extent) for m in maps)
-    sweeping = area / sum(speed * reach for speed, reach in team)
     crossing = across / min(speed for speed, _ in team)
+    if scenario.kind == "volume":
+        volume = max(m.free_volume for m in maps)
+        sweeping = volume / sum(speed * reach**2 for speed, reach in team)
+        return max(LEAST_MACRO_STEPS, math.ceil(max(SWEEPS_OF_VOLUME * sweeping, SWEEPS * crossing) / seconds - 1e-9))
+    area = max(m.free_area for m in maps)
+    sweeping = area / sum(speed * reach for speed, reach in team)
     return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * max(sweeping, crossing) / seconds - 1e-9))
