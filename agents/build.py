@@ -27,7 +27,7 @@ from maexp.conf import groups_of_choice
 from maexp.envs import ExplorationEnv, PointCloudMap, make_map
 from maexp.envs.config import GROUPS, STARTS
 from maexp.envs.config_fields import kinds
-from maexp.envs.scenarios import GENERATED, SCENARIOS, find_scenario
+from maexp.envs.scenarios import GENERATED, SCENARIOS, VOLUMES, find_scenario
 from maexp.envs.spawn import read_starts
 
 if TYPE_CHECKING:
@@ -198,7 +198,8 @@ def _check_entry(entry: Any) -> None:
             "{name: maze, local_steps: 5}."
         )
     name, path = entry["name"], entry.get("path")
-    if name not in SCENARIOS or (SCENARIOS[name].build is None and path is None):
+    rows = SCENARIOS | VOLUMES
+    if name not in rows or (rows[name].build is None and path is None):
         known = ", ".join(GENERATED)
         raise UserError(
             f"scenario.also={name} is no scenario with maps of its own: choose among {known}, or give "

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from maexp.agents.errors import UserError
-from maexp.envs import PointCloudMap
+from maexp.envs import PointCloudMap, VoxelMap
 from maexp.envs.atomic_write import whole_file
 
 
@@ -141,15 +141,18 @@ def _let_go() -> None:
 os.register_at_fork(after_in_child=_let_go)
 
 
-def checksum(world: PointCloudMap) -> str:
-    """Sixteen hexadecimal digits that follow from the points of a map."""
+def checksum(world: PointCloudMap | VoxelMap) -> str:
+    """Sixteen hexadecimal digits that follow from the points or voxels of a map."""
     digest = hashlib.sha256()
-    for points in (world.free, world.obstacles, world.boundary):
-        digest.update(str(points.shape).encode() + points.tobytes())
+    voxels = isinstance(world, VoxelMap)
+    for array in (world.free, world.occupied) if voxels else (world.free, world.obstacles, world.boundary):
+        digest.update(str(array.shape).encode() + array.tobytes())
+    if voxels:
+        digest.update(repr((world.resolution, world.origin)).encode())
     return digest.hexdigest()[:16]
 
 
-def checksums(maps: list[PointCloudMap]) -> dict[str, str]:
+def checksums(maps: list[PointCloudMap] | list[VoxelMap]) -> dict[str, str]:
     """Name and checksum of every map."""
     return {world.name: checksum(world) for world in maps}
 

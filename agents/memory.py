@@ -14,12 +14,10 @@ def check_batch_memory(env, steps: int, num_envs: int | None = None) -> None:
     Raises:
         UserError: names the settings to lower.
     """
-    from maexp.envs.simulation import bytes_per_env  # here, for the command line starts without torch
-
     num_envs = num_envs or env.num_envs
     specs = [env.observation_spec, env.full_action_spec]
     one_step = sum(leaf.zero().nbytes for spec in specs for leaf in spec.values(True, True)) / env.num_envs
-    simulation = bytes_per_env(env.settings, env.bank) * num_envs
+    simulation = env.space.bytes_per_env(env.settings, env.bank) * num_envs
     need = simulation + COPIES * 2 * one_step * num_envs * steps  # each step is stored as it was and as it became
     if env.device.type == "cuda":
         import torch

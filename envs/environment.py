@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary
 from torchrl.envs import EnvBase
 
+from maexp.envs import plane
 from maexp.envs.arrivals import Arrivals
 from maexp.envs.comm.strategy import Strategy
 from maexp.envs.config import (
@@ -17,30 +19,18 @@ from maexp.envs.config import (
     STARTS,
     EnvSettings,
 )
-from maexp.envs.maps.map_batch import MapBank, build_bank
+from maexp.envs.maps.map_batch import MapBank
 from maexp.envs.maps.point_cloud import MapError, PointCloudMap
 from maexp.envs.pickling import describe, rebuild
-from maexp.envs.render.snapshot import take_snapshot
 from maexp.envs.scenarios import Scenario, find_scenario
-from maexp.envs.settings import complete_settings, positive_count
-from maexp.envs.simulation import build_simulation, check_memory
-from maexp.envs.spawn import NO_ROOM, check_gathering, check_room, check_starts, fixed_starts
+from maexp.envs.settings import positive_count
+from maexp.envs.spawn import NO_ROOM
 from maexp.envs.specs import REWARD_TERMS, action_spec, done_spec, info_shapes, observation_spec, reward_spec
 from maexp.envs.targets.observation import TargetView, draw_targets
-from maexp.envs.targets.region_action import from_regions
-from maexp.kernels.observe import picture_shapes
+from maexp.envs.volume.map import VoxelMap
 from maexp.kernels.reset import EVALUATION
 from maexp.kernels.reward import MARKS
-from maexp.kernels.state import STATE
-from maexp.kernels.types import (
-    ERROR_ACTION,
-    ERROR_CAPACITY,
-    ERROR_REGION,
-    ERROR_START,
-    ERRORS,
-    REGIONS,
-    ROOM_UNIT,
-)
+from maexp.kernels.types import ERROR_ACTION, ERROR_CAPACITY, ERROR_REGION, ERROR_START, ERRORS, REGIONS, ROOM_UNIT
 
 PICTURES = (("agents", "observation", "map"), ("team", "map"))
 """Observations that are pictures."""
@@ -51,11 +41,24 @@ def _setting(name: str, meaning: str) -> property:
     return property(lambda env: getattr(env.settings, name), doc=meaning)
 
 
+def find_space(maps: Sequence[PointCloudMap | VoxelMap]) -> ModuleType:
+    """What an env does on maps of their kind: `maexp.envs.plane` or `maexp.envs.volume.space`."""
+    voxels = [isinstance(m, VoxelMap) for m in maps]
+    if any(voxels) and not all(voxels):
+        raise ValueError("maps holds VoxelMaps and maps in the plane: give an env of its own to each kind")
+    if not any(voxels):
+        return plane
+    from maexp.envs.volume import space  # whoever plays in the plane never loads it
+
+    return space
+
+
 class ExplorationEnv(EnvBase):
     """``num_envs`` teams of ``num_robots`` robots, each on one of ``maps``, chosen anew at every reset.
 
     Args:
-        maps: one map or several; they may differ in size.
+        maps: one map or several, all in the plane (`PointCloudMap`) or all volumes (`VoxelMap`); they may differ in
+            size.
         num_envs, num_robots, device, seed: the first fields of `maexp.envs.EnvSettings`.
         starts: "drawn" anew at every reset; "together": a place for the team is drawn at every reset, in which robots
             stand beside each other, as far from walls and from each other as always; "fixed": drawn once for each map,
@@ -87,7 +90,7 @@ class ExplorationEnv(EnvBase):
     @torch.inference_mode(False)  # made within it, the env is used outside, too
     def __init__(
         self,
-        maps: PointCloudMap | Sequence[PointCloudMap],
+        maps: PointCloudMap | VoxelMap | Sequence[PointCloudMap | VoxelMap],
         num_envs: int = 1,
         num_robots: int = 3,
         device: str | torch.device = "cpu",
@@ -96,23 +99,21 @@ class ExplorationEnv(EnvBase):
         starts: str | np.ndarray | torch.Tensor = "drawn",
         **settings: Any,
     ):
-        maps = [maps] if isinstance(maps, PointCloudMap) else list(maps)
-        settings = complete_settings(EnvSettings(num_envs, num_robots, device, seed, **settings), maps)
-        for m in maps:
-            check_room(m, [r.collision_threshold for r in settings.robot])
-        self._set_up(settings, build_bank(maps, settings.radar), starts)
+        maps = [maps] if isinstance(maps, PointCloudMap | VoxelMap) else list(maps)
+        space = find_space(maps)
+        settings = space.complete_settings(EnvSettings(num_envs, num_robots, device, seed, **settings), maps)
+        self._set_up(settings, space.prepare_maps(maps, settings), starts)
 
     @torch.inference_mode(False)
     def _set_up(self, settings: EnvSettings, bank: MapBank, starts: str | np.ndarray | torch.Tensor = "drawn") -> None:
         """Build everything of an env from its complete settings and its maps."""
         EnvBase.__init__(self, device=settings.device, batch_size=torch.Size([settings.num_envs]))
-        self.settings, self.bank, self.maps = settings, bank, bank.maps
-        check_memory(settings, self.bank)
+        self.settings, self.bank, self.maps, self.space = settings, bank, bank.maps, find_space(bank.maps)
+        self.space.check_memory(settings, self.bank)
         together = isinstance(starts, str) and starts == "together"
         if together:
-            for m in self.maps:
-                check_gathering(m, [r.collision_threshold for r in settings.robot])
-        self.simulation = build_simulation(settings, self.bank, together)
+            self.space.check_together(self.bank, settings)
+        self.simulation = self.space.build_simulation(settings, self.bank, together)
         self._hook: tuple[Callable, int] | None = None
         self.starts = starts if isinstance(starts, str) else "drawn"  # unless poses are given
         self._fix_starts()
@@ -129,12 +130,14 @@ class ExplorationEnv(EnvBase):
             self.rand_action = partial(draw_targets, super().rand_action)
         e, n = settings.num_envs, settings.num_robots
         info, pictures = info_shapes(settings), settings.observation.pictures
+        info[0].update(self.space.INFO)
         shown, radio = (shown and self.target_view.shown), settings.observes_radios
-        self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown, radio)
+        dims = self.space.DIMENSIONS
+        self.observation_spec = observation_spec(e, n, self.device, info, pictures, shown, radio, dims)
         if self.arrivals is not None:
             deciding = Binary(n, shape=(e, n), dtype=torch.bool, device=self.device)
             self.observation_spec["agents", "deciding"] = deciding
-        self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown)
+        self.action_spec = action_spec(e, n, settings.planner.name == "direct", self.device, shown, dims)
         self.reward_spec = reward_spec(e, n, self.device)
         self.done_spec = done_spec(e, self.device)
 
@@ -217,22 +220,15 @@ class ExplorationEnv(EnvBase):
             state["wanted"].copy_(goals if self.arrivals is None else self.arrivals.take(goals))
 
     def _find_goals(self, action: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Goals float32 [E, N, 2] [m] of the action, by targets, in metres, or by regions and offsets as in the paper;
-        and who is to tell the base station."""
+        """Goals of the action, as the simulation takes them: by targets, or as the env's space has them; and who is to
+        tell the base station."""
         if "target" not in action.keys():
             if self.target_view is not None:
                 self.target_view.forget()
-            given = action.get("goal", None)
-            return self._from_regions(action) if given is None else given, None
+            return self.space.find_goals(self, action), None
         if self.target_view is None:
             raise ValueError("the action names targets and the env shows none: set observation.targets to how many")
         return self.target_view.take(action["target"], action.get("preference", None)), self.target_view.tells
-
-    def _from_regions(self, action: TensorDictBase) -> torch.Tensor:
-        region = action["region"]
-        odd = ((region < 0) | (region >= REGIONS**2)).flatten(1).any(1)
-        self.simulation.tensors["error"] |= odd.to(torch.int32) * ERROR_REGION
-        return from_regions(self.simulation, region, action["offset"])
 
     def _done(self) -> dict[str, torch.Tensor]:
         state = self.simulation.tensors
@@ -255,21 +251,15 @@ class ExplorationEnv(EnvBase):
         New tensors, never the simulation's own: collectors keep what they get. ``mask`` int32 [E]: pictures and
         targets of these envs only, the others' are black and 0.
         """
-        e, n, r = self.num_envs, self.num_robots, REGIONS
-        pictures = self.observation_config.pictures
-        picture, team = (blank(shape, self.device) if pictures else None for shape in picture_shapes(e, n))
-        pose = torch.empty((e, n, 4), dtype=torch.float32, device=self.device)
-        grid = torch.empty((e, n, 4, r, r), dtype=torch.float32, device=self.device)
-        self.simulation.observe(picture, team, pose, grid, mask)
+        e, n = self.num_envs, self.num_robots
+        own, team = self.space.observe(self, mask)
         state = self.simulation.tensors
         left = self.time_left(state)
-        observation = {
-            "pose": pose,
-            "grid": grid,
+        observation = own | {
             "comm": state["comm"].clone(),
             "time_left": left.reshape(e, 1, 1).repeat(1, n, 1),
             "alive": (state["collided"] == 0) & (state["failed"] == 0),
-        } | ({"map": picture} if pictures else {})
+        }
         if self.target_view is not None:
             seen = self.target_view.observe(mask)
             observation |= {"targets": seen["features"], "targets_mask": seen["mask"]}
@@ -284,8 +274,8 @@ class ExplorationEnv(EnvBase):
             "agents": agents,
             "info": TensorDict(self._info(), batch_size=[e], device=self.device),
         }
-        if pictures:
-            parts["team"] = TensorDict({"map": team}, batch_size=[e], device=self.device)
+        if team:
+            parts["team"] = TensorDict(team, batch_size=[e], device=self.device)
         return TensorDict(parts, batch_size=[e], device=self.device)
 
     def _info(self) -> dict[str, torch.Tensor]:
@@ -314,7 +304,7 @@ class ExplorationEnv(EnvBase):
             info["odometry_error"] = (self.simulation.believed["center"] - s["center"]).norm(dim=-1)
         if self.settings.odometry.map_errors:
             info["map_error"] = self.simulation.map_error().unsqueeze(-1)
-        return info | (self._radio_info(total) if self.settings.limited else {})
+        return info | self.space.measure(self) | (self._radio_info(total) if self.settings.limited else {})
 
     def _radio_info(self, total: torch.Tensor) -> dict[str, torch.Tensor]:
         """Who knows how much; ``total`` is the weight of each team's map, int32 [E]."""
@@ -378,11 +368,11 @@ class ExplorationEnv(EnvBase):
         if poses is None:
             given.fill_(torch.inf)
         else:
-            given.copy_(torch.from_numpy(check_starts(self, poses)))
+            given.copy_(torch.from_numpy(self.space.check_starts(self, poses)))
 
     def _fix_starts(self) -> None:
         if self.starts == "fixed":
-            fixed = fixed_starts(self, int(self.simulation.tensors["seed"]))
+            fixed = self.space.fixed_starts(self, int(self.simulation.tensors["seed"]))
             self.simulation.map_starts.copy_(torch.from_numpy(fixed))
 
     def set_episodes(self, ids: torch.Tensor) -> None:
@@ -393,7 +383,7 @@ class ExplorationEnv(EnvBase):
 
     def state_dict(self, *args, **kwargs) -> dict[str, torch.Tensor]:
         """The simulator's state, copied: loading it continues bit for bit on the same device."""
-        state = {name: self.simulation.tensors[name].clone() for name in STATE}
+        state = {name: self.simulation.tensors[name].clone() for name in self.space.STATE}
         return state | self._memories()
 
     def _memories(self) -> dict[str, torch.Tensor]:
@@ -404,14 +394,14 @@ class ExplorationEnv(EnvBase):
     def load_state_dict(self, state_dict: dict[str, torch.Tensor], strict: bool = True, **kwargs) -> None:
         """Continue from a state taken by `state_dict` of an env with the same settings and maps."""
         own = self.simulation.tensors
-        wanted = {name: own[name] for name in STATE} | self._memories()
+        wanted = {name: own[name] for name in self.space.STATE} | self._memories()
         wrong = [n for n, value in wanted.items() if n not in state_dict or state_dict[n].shape != value.shape]
         if wrong:
             raise ValueError(
                 f"the saved simulator state does not fit this env ({', '.join(wrong[:3])}): "
                 "use the maps, num_envs, num_robots and version of MAexp it was saved with"
             )
-        for name in STATE:
+        for name in self.space.STATE:
             own[name].copy_(state_dict[name])
         self._fix_starts()
         for part in (self.strategy, self.target_view, self.arrivals):
@@ -432,7 +422,7 @@ class ExplorationEnv(EnvBase):
 
     def snapshot(self, index: int = 0) -> dict:
         """What env ``index`` looks like now, as NumPy arrays, points in the order of its map (for drawing)."""
-        return take_snapshot(self, index)
+        return self.space.take_snapshot(self, index)
 
     def render(self, index: int | Sequence[int] = 0, size: int = 512, mode: str = "rgb_array") -> np.ndarray:
         """A picture of env ``index``, or of several side by side: uint8 [height, width, 3], ``size`` wide each.
@@ -445,14 +435,3 @@ class ExplorationEnv(EnvBase):
         if mode != "rgb_array":
             raise ValueError(f"mode={mode!r} is unknown: this env renders rgb_array")
         return draw_teams([self.snapshot(team) for team in check_teams(self, index)], size)
-
-
-def blank(shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Black pictures, uint8.
-
-    On the CPU NumPy's: its pages are zero until they are drawn on. `torch.zeros` shares 250 kB among OpenMP's threads
-    already, and waits for one that does not run where the machine is busy.
-    """
-    if device.type == "cpu":
-        return torch.from_numpy(np.zeros(shape, dtype=np.uint8))
-    return torch.zeros(shape, dtype=torch.uint8, device=device)

@@ -42,9 +42,9 @@ def episode_metrics(
         the scales w and v, ``reward_variance_scaled`` with them. Lengths are means over robots [m],
         ``longest_path`` the way of the robot that drove farthest. Where communication is limited: `RADIO`,
         ``connected``, ``told_step_95`` and ``bytes_sent``, by all radios; where robots may fail: ``failed``, how many
-        have at the end; where odometry drifts: ``odometry_error`` [m], how far robots then are from where they believe
-        to be, on average; where maps have errors: ``map_error`` [m], how far known ground then is from where it is
-        drawn, on average over points, then over maps.
+        have at the end; in volumes: ``surface_coverage``; where odometry drifts: ``odometry_error`` [m], how far robots
+        then are from where they believe to be, on average; where maps have errors: ``map_error`` [m], how far known
+        ground then is from where it is drawn, on average over points, then over maps.
         Which marks an episode can reach: `in_reach`.
     """
     info = {name: final[name].cpu().numpy().astype(np.float64) for name in final.keys()}
@@ -58,7 +58,7 @@ def episode_metrics(
         "path_length": info["path_length"].mean(axis=1),
         "longest_path": info["path_length"].max(axis=1),
     }
-    metrics |= {name: info[name][:, 0] for name in RADIO if name in info}
+    metrics |= {name: info[name][:, 0] for name in (*RADIO, "surface_coverage") if name in info}
     if "failed" in info:
         metrics["failed"] = info["failed"].sum(axis=1)
     if "odometry_error" in info:

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 
 from maexp.envs.config import (
+    ROBOT_KINDS,
+    VOLUME_KINDS,
     CommConfig,
     EnvSettings,
     FaultsConfig,
@@ -46,8 +48,9 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
             f"map {fewest.name} has {len(fewest.free)} free points and no room for num_robots={num_robots}: "
             "use fewer robots or a larger map"
         )
-    device = _device(settings.device)
+    device = find_device(settings.device)
     settings = settings.completed(find_scenario(maps[0].scenario), maps)
+    check_plane(settings.robot, settings.radar)
     check_bodies(maps, settings.robot)
     comm, faults = settings.comm, settings.faults
     check_observation(settings.observation, settings.planner, comm)
@@ -57,11 +60,17 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
     check_done(settings.done, comm)
     check_decide(settings.decide, settings)
     check_failing(faults, num_robots, settings.episode_steps)
+    return finish_settings(settings, device)
+
+
+def finish_settings(settings: EnvSettings, device: torch.device) -> EnvSettings:
+    """With numbers of Python's own kinds, and as many threads as help."""
+    comm, faults = settings.comm, settings.faults
     threads = settings.num_threads or max(1, min(len(os.sched_getaffinity(0)), settings.num_envs // 4))
     return replace(
         settings,
         num_envs=int(settings.num_envs),
-        num_robots=int(num_robots),
+        num_robots=int(settings.num_robots),
         device=device,
         seed=int(settings.seed),
         first_env=int(settings.first_env),
@@ -71,6 +80,23 @@ def complete_settings(settings: EnvSettings, maps: Sequence[PointCloudMap]) -> E
         success_coverage=float(settings.success_coverage),
         limited=settings.limited or comm.limited or faults.enabled,
     )
+
+
+def check_plane(robots: Sequence[RobotConfig], radars: Sequence[RadarConfig]) -> None:
+    """Raise ValueError for what moves or sees in volumes alone."""
+    for robot in robots:
+        if robot.kind in VOLUME_KINDS:
+            raise ValueError(
+                f"robot.kind={robot.kind!r} moves in volumes, and these maps are of the plane: choose "
+                f"{', '.join(ROBOT_KINDS)}, or use a scenario of volumes"
+            )
+    for radar in radars:
+        for name in ("vertical_fov", "every"):
+            if (value := getattr(radar, name)) is not None:
+                raise ValueError(
+                    f"radar.{name}={value:g} is for volumes, and these maps are of the plane: leave it out, or use a "
+                    "scenario of volumes"
+                )
 
 
 def check_bodies(maps: Sequence[PointCloudMap], robots: Sequence[RobotConfig]) -> None:
@@ -187,7 +213,7 @@ def positive_count(name: str, value: int) -> int:
     return int(value)
 
 
-def _device(device: str | torch.device) -> torch.device:
+def find_device(device: str | torch.device) -> torch.device:
     """The device, if there is one of that name."""
     try:
         found = torch.device(device)

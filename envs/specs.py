@@ -71,9 +71,10 @@ def observation_spec(
     pictures: bool = True,
     targets: int = 0,
     radio: bool = False,
+    dims: int = 2,
 ) -> Composite:
     """Observation of every robot, with so many targets to choose from that tell of radios or not, the team's map, and
-    `info_shapes`."""
+    `info_shapes`; in a volume (3 ``dims``) without regions."""
     (pictured, merged), regions = picture_shapes(envs, robots), REGIONS
 
     def picture(shape):
@@ -84,11 +85,12 @@ def observation_spec(
         return Unbounded(shape=shape, dtype=torch.float32, device=device)
 
     own = {"map": picture(pictured)} if pictures else {}
+    own["pose"] = real(envs, robots, 2 + dims)
+    if dims == 2:
+        own["grid"] = real(envs, robots, 4, regions, regions)
     team = {"team": Composite(map=picture(merged), shape=(envs,), device=device)} if pictures else {}
     observation = Composite(
         **own,
-        pose=real(envs, robots, 4),
-        grid=real(envs, robots, 4, regions, regions),
         comm=Binary(robots, shape=(envs, robots, robots), dtype=torch.bool, device=device),
         time_left=Bounded(0.0, 1.0, shape=(envs, robots, 1), dtype=torch.float32, device=device),
         alive=Binary(robots, shape=(envs, robots), dtype=torch.bool, device=device),
@@ -116,13 +118,17 @@ def _value(shape, dtype, device):
     return Unbounded(shape=shape, dtype=dtype, device=device)
 
 
-def action_spec(envs: int, robots: int, direct: bool, device: torch.device, targets: int = 0) -> Composite:
-    """Which target every robot takes, where it is shown some; else region and offset of its goal, or its controls
-    where the planner is ``direct``."""
+def action_spec(
+    envs: int, robots: int, direct: bool, device: torch.device, targets: int = 0, dims: int = 2
+) -> Composite:
+    """Which target every robot takes, where it is shown some; else region and offset of its goal, in a volume the goal
+    itself, or its controls where the planner is ``direct``."""
     if direct:
         action = {"control": Bounded(-1.0, 1.0, shape=(envs, robots, 2), dtype=torch.float32, device=device)}
     elif targets:
         action = {"target": Categorical(targets, shape=(envs, robots), dtype=torch.int64, device=device)}
+    elif dims == 3:
+        action = {"goal": Unbounded(shape=(envs, robots, dims), dtype=torch.float32, device=device)}
     else:
         action = {
             "region": Categorical(REGIONS**2, shape=(envs, robots), dtype=torch.int64, device=device),

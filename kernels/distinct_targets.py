@@ -5,10 +5,13 @@ and the others take what they like best of the rest. Where too little is left, w
 get none.
 """
 
+from typing import Any
+
 import torch
 import warp as wp
 
 from maexp.kernels.launches import launch_on, view
+from maexp.kernels.points import VECTORS, for_points
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import NOTHING
 
@@ -20,7 +23,7 @@ def find_holder(
     e: int,
     i: int,
     k: int,
-    point: wp.array3d(dtype=wp.vec2),
+    point: wp.array3d(dtype=Any),
     hears: wp.array3d(dtype=wp.bool),
     body: wp.array2d(dtype=wp.float32),
     taken: wp.array2d(dtype=wp.int64),
@@ -41,7 +44,7 @@ def find_best_free(
     e: int,
     i: int,
     preference: wp.array3d(dtype=wp.float32),
-    point: wp.array3d(dtype=wp.vec2),
+    point: wp.array3d(dtype=Any),
     hears: wp.array3d(dtype=wp.bool),
     body: wp.array2d(dtype=wp.float32),
     taken: wp.array2d(dtype=wp.int64),
@@ -63,7 +66,7 @@ def take_over(
     i: int,
     preference: wp.array3d(dtype=wp.float32),
     way: wp.array3d(dtype=wp.float32),
-    point: wp.array3d(dtype=wp.vec2),
+    point: wp.array3d(dtype=Any),
     hears: wp.array3d(dtype=wp.bool),
     body: wp.array2d(dtype=wp.float32),
     taken: wp.array2d(dtype=wp.int64),
@@ -120,7 +123,7 @@ def _share_targets(
     # In:
     preference: wp.array3d(dtype=wp.float32),  # [env, robot, target], below `NOTHING`: out of reach
     way: wp.array3d(dtype=wp.float32),  # [env, robot, target] [m]
-    point: wp.array3d(dtype=wp.vec2),  # [env, robot, target] [m]
+    point: wp.array3d(dtype=Any),  # [env, robot, target] [m]
     hears: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
     body: wp.array2d(dtype=wp.float32),  # [env, robot], radius [m]
     # Scratch:
@@ -163,6 +166,9 @@ def _share_targets(
                     robot = take_over(e, robot, preference, way, point, hears, body, taken)
 
 
+_SHARE_TARGETS = for_points(_share_targets)
+
+
 def share_targets(
     preference: torch.Tensor, way: torch.Tensor, point: torch.Tensor, hears: torch.Tensor, body: torch.Tensor
 ) -> torch.Tensor:
@@ -174,7 +180,7 @@ def share_targets(
         preference: float32 [E, N, K], what each robot thinks of each target, the highest is what it wants; -inf: out of
             reach.
         way: float32 [E, N, K], way from robot to target [m].
-        point: float32 [E, N, K, 2], where the targets are [m].
+        point: float32 [E, N, K, 2] or [E, N, K, 3], where the targets are [m].
         hears: bool [E, N, N], who hears whom.
         body: float32 [E, N], radii of the robots [m].
 
@@ -186,12 +192,12 @@ def share_targets(
     taken = torch.empty(preference.shape[:2], dtype=torch.int64, device=preference.device)
     wish, waiting = torch.empty_like(taken, dtype=torch.int32), torch.empty_like(taken, dtype=torch.bool)
     launch_on(preference.device)(
-        _share_targets,
+        _SHARE_TARGETS[point.shape[-1]],
         len(taken),
         [
             view(preference),
             view(way),
-            view(point, wp.vec2),
+            view(point, VECTORS[point.shape[-1]]),
             view(hears),
             view(body),
             view(wish),

@@ -3,10 +3,13 @@
 All pairs of robots are compared, so each comparison is kept small: nothing here is a tensor over pairs.
 """
 
+from typing import Any
+
 import torch
 import warp as wp
 
 from maexp.kernels.launches import launch_on, view
+from maexp.kernels.points import VECTORS, for_points
 from maexp.kernels.startup import MODULE_OPTIONS
 from maexp.kernels.types import NOTHING
 
@@ -19,6 +22,12 @@ CLOSE = 1.000001  # more than what rounding may add to a squared distance
 def squared(gap: wp.vec2) -> float:
     """Squared length, rounded as in torch's `norm`: the second product is added as it is."""
     return wp.float32(wp.float64(gap[0] * gap[0]) + wp.float64(gap[1]) * wp.float64(gap[1]))
+
+
+@wp.func
+def squared(gap: wp.vec3) -> float:  # noqa: F811
+    """The same in space."""
+    return wp.dot(gap, gap)
 
 
 @wp.func
@@ -55,7 +64,7 @@ def _choose_in_turn(
     # In:
     gain: wp.array3d(dtype=wp.float32),  # [env, robot, candidate]
     value: wp.array3d(dtype=wp.float32),  # [env, robot, candidate], below `NOTHING`: there is none
-    point: wp.array3d(dtype=wp.vec2),  # [env, robot, candidate] [radar ranges]
+    point: wp.array3d(dtype=Any),  # [env, robot, candidate] [radar ranges]
     hears: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
     # Scratch:
     left: wp.array3d(dtype=wp.float32),  # [env, robot, candidate], share of the gain that nobody has claimed
@@ -103,6 +112,9 @@ def _choose_in_turn(
                     find_best(e, i, gain, value, left, best, taken)
 
 
+_CHOOSE_IN_TURN = for_points(_choose_in_turn)
+
+
 def choose_in_turn(
     gain: torch.Tensor, value: torch.Tensor, point: torch.Tensor, hears: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -110,7 +122,7 @@ def choose_in_turn(
 
     Args:
         gain, value: float32 [E, N, M]; value -inf: there is none.
-        point: float32 [E, N, M, 2] [radar ranges].
+        point: float32 [E, N, M, 2 or 3] [radar ranges].
         hears: bool [E, N, N].
 
     Returns:
@@ -122,12 +134,12 @@ def choose_in_turn(
     taken = torch.empty(gain.shape[:2], dtype=torch.int64, device=gain.device)
     waiting, best = torch.empty_like(taken, dtype=torch.bool), torch.empty_like(taken, dtype=torch.float32)
     launch_on(gain.device)(
-        _choose_in_turn,
+        _CHOOSE_IN_TURN[point.shape[-1]],
         len(gain),
         [
             view(gain),
             view(value),
-            view(point, wp.vec2),
+            view(point, VECTORS[point.shape[-1]]),
             view(hears),
             *(view(tensor) for tensor in (left, waiting, best, taken, score, claimed)),
         ],
@@ -138,13 +150,13 @@ def choose_in_turn(
 @wp.kernel
 def _compare_with_others(
     # In:
-    point: wp.array3d(dtype=wp.vec2),  # [env, robot, candidate] [m]
+    point: wp.array3d(dtype=Any),  # [env, robot, candidate] [m]
     best: wp.array3d(dtype=wp.int64),  # [env, robot, candidate], which of the targets it is
     ways: wp.array3d(dtype=wp.float32),  # [env, robot, target]
     hears: wp.array3d(dtype=wp.bool),  # [env, robot, robot]
-    plan: wp.array2d(dtype=wp.vec2),  # [env, robot], where it would go [m]
+    plan: wp.array2d(dtype=Any),  # [env, robot], where it would go [m]
     has_plan: wp.array2d(dtype=wp.bool),  # [env, robot]
-    last: wp.array2d(dtype=wp.vec2),  # [env, robot], its last target [m]
+    last: wp.array2d(dtype=Any),  # [env, robot], its last target [m]
     has_last: wp.array2d(dtype=wp.bool),  # [env, robot]
     # Out:
     rival: wp.array3d(dtype=wp.float32),  # [env, robot, candidate], the least way of another that is heard
@@ -179,6 +191,9 @@ def _compare_with_others(
         mates_last[e, i, k] = wp.sqrt(mates_last[e, i, k])
 
 
+_COMPARE_WITH_MATES = for_points(_compare_with_others)
+
+
 def compare_with_mates(
     point: torch.Tensor,
     best: torch.Tensor,
@@ -190,11 +205,12 @@ def compare_with_mates(
     """Each robot's candidates against the ways, plans and last targets of the robots that it hears.
 
     Args:
-        point: float32 [E, N, M, 2], where the candidates are [m].
+        point: float32 [E, N, M, 2 or 3], where the candidates are [m].
         best: int64 [E, N, M], which of the T targets they are.
         ways: float32 [E, N, T], from every robot to every target, in any unit; infinite: none.
         hears: bool [E, N, N].
-        plans, last: where robots would go and where they last went, float32 [E, N, 2] [m], and whether: bool [E, N].
+        plans, last: where robots would go and where they last went, float32 [E, N, 2 or 3] [m], and whether: bool
+            [E, N].
 
     Returns:
         Four times float32 [E, N, M], infinite where there is nothing to compare with: the least way of another; the
@@ -206,14 +222,14 @@ def compare_with_mates(
         values.contiguous() for values in (best, ways, hears, plans[1], last[1])
     )
     launch_on(point.device)(
-        _compare_with_others,
+        _COMPARE_WITH_MATES[point.shape[-1]],
         tuple(best.shape[:2]),
         [
-            view(point, wp.vec2),
+            view(point, VECTORS[point.shape[-1]]),
             *map(view, (best, ways, hears)),
-            view(goes, wp.vec2),
+            view(goes, VECTORS[point.shape[-1]]),
             view(plans_some),
-            view(went, wp.vec2),
+            view(went, VECTORS[point.shape[-1]]),
             view(last_some),
             *map(view, found),
         ],
@@ -224,7 +240,7 @@ def compare_with_mates(
 @wp.kernel
 def _gather_gain(
     # In:
-    point: wp.array3d(dtype=wp.vec2),  # [env, robot, candidate] [m]
+    point: wp.array3d(dtype=Any),  # [env, robot, candidate] [m]
     gain: wp.array3d(dtype=wp.float32),  # [env, robot, candidate]
     # Settings:
     reach: float,  # [m]
@@ -241,23 +257,26 @@ def _gather_gain(
         around_gain[e, i, k, j] = wp.where(gap < around, gain[e, i, j], 0.0)
 
 
+_GATHER_GAIN = for_points(_gather_gain)
+
+
 def gather_gain(
     point: torch.Tensor, gain: torch.Tensor, reach: float, near: float, around: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The gain of a robot's candidates within ``near`` and within ``around`` [``reach``] of each, float32 [E, N, M].
 
     Args:
-        point: float32 [E, N, M, 2] [m].
+        point: float32 [E, N, M, 2 or 3] [m].
         gain: float32 [E, N, M].
         reach: [m].
     """
     parts = [torch.empty((*gain.shape, gain.shape[-1]), dtype=torch.float32, device=gain.device) for _ in range(2)]
     point, gain = point.contiguous(), gain.contiguous()
     launch_on(gain.device)(
-        _gather_gain,
+        _GATHER_GAIN[point.shape[-1]],
         tuple(gain.shape),
         [
-            view(point, wp.vec2),
+            view(point, VECTORS[point.shape[-1]]),
             view(gain),
             reach,
             near,

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maexp.agents.cli import Command, maps_fetch
+from maexp.agents.cli import Command, maps_fetch, maps_volume
 from maexp.agents.cli.maps_folder import describe_import, find_files
 from maexp.agents.cli.maps_folder import run as run_folder
 from maexp.agents.config.overrides import find_override
@@ -19,7 +19,8 @@ from maexp.envs.io.options import make_options
 from maexp.envs.maps.checker import check_map, repair_map
 from maexp.envs.maps.plot import draw_map
 from maexp.envs.maps.point_cloud import PointCloudMap
-from maexp.envs.scenarios import GENERATED, SCENARIOS, make_map
+from maexp.envs.scenarios import GENERATED, SCENARIOS, VOLUMES, make_map
+from maexp.envs.volume.surfaces import VOLUME_FILES
 
 UNUSABLE = 1
 FORMATS = ".yaml (ROS map_server) .pgm .png .pcd .ply .xyz .las .laz .obj .stl .glb .bt .npz .npy .mcap .db3 (rosbag2)"
@@ -40,8 +41,9 @@ def check(cfg: MapsSettings) -> None:
     if cfg.task == "fetch":
         maps_fetch.check(cfg.file, cfg.mirror)
         return
-    if cfg.task == "make" and cfg.file not in SCENARIOS:
-        raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(GENERATED)}.")
+    if cfg.task == "make" and cfg.file not in SCENARIOS | VOLUMES:
+        known = [*GENERATED, *(name for name, row in VOLUMES.items() if row.build)]
+        raise UserError(f"{cfg.file} is no scenario: choose one of {', '.join(known)}.")
     if cfg.out and Path(cfg.out).exists():
         raise UserError(f"out={cfg.out} exists already and is left alone: choose another name.")
     if cfg.out and cfg.task == "check" and Path(cfg.out).suffix != ".npz":
@@ -54,8 +56,16 @@ def check(cfg: MapsSettings) -> None:
         raise UserError(f"out={cfg.out} lies in no folder: make {Path(cfg.out).parent} first.")
     if _is_folder(cfg):
         check_folder(cfg)
+    maps_volume.check(cfg)
     with blame_input():
         make_options(None, import_options(cfg))
+
+
+def is_volume(cfg: MapsSettings) -> bool:
+    """Whether it is about voxels: a scenario of them, an import that asks for them, or a saved map of them."""
+    if cfg.volume or (cfg.file in VOLUMES and not Path(cfg.file).exists()):
+        return True
+    return cfg.task != "make" and maps_volume.is_voxels(cfg.file)
 
 
 def _is_folder(cfg: MapsSettings) -> bool:
@@ -81,6 +91,8 @@ def run(cfg: MapsSettings, where: Path | None, overrides: list[str]) -> int:
         return maps_fetch.run(cfg.file, cfg.out, cfg.mirror, import_options(cfg))
     if _is_folder(cfg):
         return run_folder(Path(cfg.file), where, import_options(cfg))
+    if is_volume(cfg):
+        return maps_volume.run(cfg, where, import_options(cfg))
     with blame_input():
         world, imported = read_map(cfg)
         story = "" if imported is None else imported.table()
@@ -150,7 +162,9 @@ def print_scenarios() -> None:
             f"{name:<26}{scenario.count or 'yours':>6}{scenario.resolution:>11g}{size:>8}{scenario.radar_range:>9g}"
             f"{scenario.max_speed:>11g}  {steps}"
         )
+    maps_volume.print_scenarios()
     print(f"\nFiles that can be imported: {FORMATS}")
+    print(f"With volume=true: {' '.join(VOLUME_FILES)} .npz")
 
 
 COMMAND = Command(run, check, folder=folder)

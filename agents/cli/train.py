@@ -20,6 +20,7 @@ from maexp.agents.evaluation.cache import FOLDER
 from maexp.agents.evaluation.comparison import find_typical
 from maexp.agents.evaluation.evaluate import EvaluationResult
 from maexp.agents.files import command, lock, short
+from maexp.agents.policies.classical import PLANAR
 from maexp.agents.policies.registry import NamedPolicy, find_named_policies, suit_observation
 from maexp.agents.training.checkpoint import START, find_checkpoint, load_checkpoint, restore_policy
 from maexp.agents.training.imitation import check_warm_start, starts_as, warm_start
@@ -32,6 +33,7 @@ from maexp.agents.training.train import (
 )
 from maexp.agents.training.validation import judged
 from maexp.envs import ExplorationEnv
+from maexp.envs.scenarios import find_scenario
 
 NEEDED = ("best", "average", "seconds", "updater", "collector", "random")
 
@@ -81,8 +83,10 @@ def check(cfg: TrainSettings) -> None:
 
 def find_others(cfg: TrainSettings) -> list[NamedPolicy]:
     """The policies played at the end beside the trained one."""
-    words = list(dict.fromkeys(["random", *choices_of(cfg.classical)]))
-    others = find_named_policies(words, "classical")
+    beside = choices_of(cfg.classical)
+    if find_scenario(cfg.scenario.name).kind == "volume":
+        beside = [name for name in beside if name not in PLANAR]
+    others = find_named_policies(list(dict.fromkeys(["random", *beside])), "classical")
     return (
         [player for player in others if player.direct] if cfg.planner.name == "direct" else others
     )  # the rest pick goals

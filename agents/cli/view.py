@@ -23,7 +23,7 @@ from maexp.envs.render import show
 from maexp.envs.render.episode import Episode
 from maexp.envs.render.frames import percent
 from maexp.envs.render.stage import Stage
-from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.scenarios import SCENARIOS, VOLUMES
 
 CUT_SHARE = 0.06  # walls of an episode's picture are cut here, a share of the map's longer side: robots stay in sight
 ENDINGS = (".png", ".html")
@@ -181,7 +181,7 @@ def find_map(cfg: ViewSettings, place: Path | None) -> PointCloudMap:
             raise UserError(f"index={cfg.index} picks a map of a scenario, and {place} is one map: leave one out.")
         return import_file(str(place), cfg.scenario.importing)
     index = cfg.index or 0
-    if SCENARIOS[cfg.scenario.name].build is not None:
+    if (SCENARIOS | VOLUMES)[cfg.scenario.name].build is not None:
         return make_map(cfg.scenario.name, index)
     maps = import_files(cfg.scenario)
     if index >= len(maps):

@@ -8,7 +8,7 @@ from maexp.agents.config.groups import LAST_SEED
 from maexp.agents.config.verbs import NAMES, BenchmarkSettings
 from maexp.agents.errors import UserError
 from maexp.envs.config_fields import WHOLE_LIMIT, shown
-from maexp.envs.scenarios import SCENARIOS
+from maexp.envs.scenarios import SCENARIOS, VOLUMES
 
 
 def check_seed(value: Any, name: str = "seed") -> None:
@@ -52,7 +52,7 @@ def team_sizes(value: Any) -> list[int]:
 
 def check_names(cfg: BenchmarkSettings) -> None:
     """Raise UserError unless the scenarios and algorithms of a benchmark are those there are."""
-    known = {"scenarios": [*SCENARIOS], "algorithms": [*TUNINGS]}
+    known = {"scenarios": [*SCENARIOS, *VOLUMES], "algorithms": [*TUNINGS]}
     for name, choices in known.items():
         allowed = [*choices, *NAMES] if name == "algorithms" else choices
         for value in as_list(getattr(cfg, name)):

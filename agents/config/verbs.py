@@ -191,6 +191,7 @@ class MapsSettings:
     )
     mirror: str | None = setting(None, "fetch: address in place of the one where the set is published")
     num_robots: int = setting(3, "the team that must find room", low=1)
+    volume: bool = setting(False, "import: keep a cloud, mesh or octree in three dimensions, as voxels")
     repair: bool = setting(False, "check: mend what can be mended and write the mended map")
     robot: RoundSettings = group(RoundSettings)
     importing: ImportOptions = group(ImportOptions, robot_radius="${robot.radius}", num_robots="${num_robots}")

@@ -14,7 +14,7 @@ from maexp.agents.config.verbs import EpisodeSettings
 from maexp.agents.evaluation.evaluate import EvaluationResult, evaluate
 from maexp.agents.evaluation.metric_format import compared, verdict
 from maexp.agents.evaluation.results import result_names
-from maexp.agents.policies.classical import CLASSICAL, POLICIES
+from maexp.agents.policies.classical import CLASSICAL, PLANAR, POLICIES
 from maexp.agents.progress import Progress
 from maexp.envs import ExplorationEnv
 
@@ -71,6 +71,7 @@ def choose_best(cfg: EpisodeSettings, suite: MapSuite, names: Sequence[str], num
 
 def play_best(env: ExplorationEnv, planners: Sequence[str], count: int, seed: int) -> EvaluationResult:
     """The episodes 0 .. `count` - 1 of the classical planner that sees most over time in them."""
+    planners = [name for name in planners if env.space.DIMENSIONS == 2 or name not in PLANAR]
     with Progress("best classical planner on validation maps", count * len(planners)) as progress:
 
         def play(name: str) -> EvaluationResult:

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from maexp.agents.config.verbs import EvaluateSettings
 from maexp.agents.errors import UserError
 from maexp.envs import ExplorationEnv
-from maexp.envs.render.episode import Episode, EpisodeRecorder
+from maexp.envs.render.episode import Episode
 from maexp.envs.render.frames import add_headline, draw_frame, draw_grid, watch_episode
 from maexp.envs.render.video import write_gif, write_mp4
 
@@ -55,7 +55,7 @@ def play_teams(
         every: local steps from one record to the next; None: about 150 records in a full episode
     """
     teams = range(env.num_envs) if teams is None else teams
-    recorders = [EpisodeRecorder(name) for _ in teams]
+    recorders = [env.space.EpisodeRecorder(name) for _ in teams]
 
     def look(snapshots: list[dict]) -> None:
         for recorder, snapshot in zip(recorders, snapshots, strict=True):

@@ -100,7 +100,7 @@ def observation_shape(env, config: ModelConfig) -> ObservationShape:
     actions = env.full_action_spec.keys(True, True)
     return ObservationShape(
         channels=spec[MAP].shape[-3] if MAP in spec.keys(True, True) else 0,
-        side=spec[GRID].shape[-1],
+        side=spec[GRID].shape[-1] if GRID in spec.keys(True, True) else 0,
         regions=(*ACTION, "control") not in actions,
         radio=TARGETS in spec.keys(True, True) and spec[TARGETS].shape[-1] > len(FEATURES),
     )

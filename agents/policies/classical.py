@@ -1,6 +1,7 @@
 """Classical planners, batched on the env's device: the yardstick for what is learned.
 
-A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset").
+A policy is a `TensorDictModule` that writes ("agents", "action", "region") and ("agents", "action", "offset"), in
+volumes ("agents", "action", "goal") and ("agents", "action", "heading").
 All but `random` look into the env: what the team knows as a grid, its frontiers gathered in targets, and the way from
 every robot to every target. They differ in which targets each robot likes best (`envs/targets/heuristics.py`). That the
 robots of a team go to different ones, and how a target is approached, they share (`envs/targets/tracker.py`).
@@ -20,10 +21,9 @@ from tensordict.nn import TensorDictModule
 from maexp.envs import ExplorationEnv
 from maexp.envs.maps.nav_grid import build_nav_grid, open_cells
 from maexp.envs.targets.heuristics import CLASSICAL, rank_by_utility
-from maexp.envs.targets.region_action import to_regions
-from maexp.envs.targets.tracker import TargetTracker, TensorScene, keyed_uniform
+from maexp.envs.targets.observation import gather_points
+from maexp.envs.targets.tracker import TensorScene, keyed_uniform, make_tracker
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.kernels.types import REGIONS
 
 
 class FrontierPlanner:
@@ -36,7 +36,7 @@ class FrontierPlanner:
     """
 
     def __init__(self, env: ExplorationEnv, rank: Callable[[TensorScene], torch.Tensor]):
-        self.rank, self.tracker = rank, TargetTracker(env)
+        self.rank, self.tracker = rank, make_tracker(env)
 
     def look(self) -> TensorScene:
         """What there is to choose from."""
@@ -44,17 +44,18 @@ class FrontierPlanner:
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Region [E, N] and offset [E, N, 2] of `goals`; the argument only ties the policy to an observation."""
-        return to_regions(self.tracker.env.simulation, self.goals())
+        """`goals` as an action: region [E, N] and offset [E, N, 2], in volumes goal [E, N, 3] and heading [E, N]; the
+        argument only ties the policy to an observation."""
+        return self.tracker.env.space.to_action(self.tracker.env, self.goals())
 
     @torch.no_grad()
     def goals(self) -> torch.Tensor:
-        """Where each robot goes, float32 [E, N, 2] [m]."""
+        """Where each robot goes, as `TargetTracker.take` gives it."""
         scene = self.look()
         chosen, waits = self.choose(scene)
         index = chosen.clamp_min(0).unsqueeze(-1)
         cell, block = scene.cells().gather(2, index), scene.block.gather(2, index).squeeze(-1)
-        toward = scene.middle.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2)).squeeze(2)
+        toward = gather_points(scene.middle, index).squeeze(2)
         return self.tracker.take(torch.where(chosen >= 0, block, -1), cell.squeeze(-1), toward, waits)
 
     def choose(self, scene: TensorScene) -> tuple[torch.Tensor, torch.Tensor]:
@@ -82,27 +83,37 @@ class OraclePlanner(FrontierPlanner):
 
 
 class RandomPolicy:
-    """A region and an offset drawn evenly for every robot."""
+    """A region and an offset, in volumes a goal, drawn evenly for every robot."""
 
     def __init__(self, env: ExplorationEnv):
         self.env = env
 
     @torch.no_grad()
     def __call__(self, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        draw = keyed_uniform(self.env, 3)
-        region = (draw[..., 0] * REGIONS**2).long()
-        return region, 2.0 * draw[..., 1:] - 1.0
+        return self.env.space.anywhere(self.env, keyed_uniform(self.env, 3))
 
 
 def as_module(make: Callable, env: ExplorationEnv) -> TensorDictModule:
-    """`make(env)`, which gives regions and offsets, as a policy on tensordicts."""
+    """`make(env)`, which gives regions and offsets, in volumes goals and headings, as a policy on tensordicts."""
     if env.planner_config.name == "direct":
         raise ValueError("planner=direct takes controls, and this policy picks goals: use planner=dwa or wavefront")
     return TensorDictModule(
         make(env),
         in_keys=[("agents", "observation", "pose")],
-        out_keys=[("agents", "action", "region"), ("agents", "action", "offset")],
+        out_keys=[("agents", "action", name) for name in env.space.ACTION],
     )
+
+
+def in_the_plane(name: str, make: Callable) -> Callable[[ExplorationEnv], TensorDictModule]:
+    """`as_module` for what searches the plane; ValueError in volumes."""
+
+    def build(env: ExplorationEnv) -> TensorDictModule:
+        if env.space.DIMENSIONS > 2:
+            others = ", ".join(word for word in POLICIES if word not in PLANAR)
+            raise ValueError(f"policy={name} plans in the plane: choose one of {others} for volumes")
+        return as_module(make, env)
+
+    return build
 
 
 def _plan_ahead(env: ExplorationEnv, true_world: bool = False) -> Callable:
@@ -114,11 +125,15 @@ def _plan_ahead(env: ExplorationEnv, true_world: bool = False) -> Callable:
 POLICIES: dict[str, Callable[[ExplorationEnv], TensorDictModule]] = {
     "random": partial(as_module, RandomPolicy),
     **{name: partial(as_module, partial(FrontierPlanner, rank=rank)) for name, rank in CLASSICAL.items()},
-    "lookahead": partial(as_module, _plan_ahead),
-    "oracle": partial(as_module, OraclePlanner),
-    "clairvoyant": partial(as_module, partial(_plan_ahead, true_world=True)),
+    "lookahead": in_the_plane("lookahead", _plan_ahead),
+    "oracle": in_the_plane("oracle", OraclePlanner),
+    "clairvoyant": in_the_plane("clairvoyant", partial(_plan_ahead, true_world=True)),
 }
+POLICIES["rrt_frontiers"] = in_the_plane("rrt_frontiers", partial(FrontierPlanner, rank=CLASSICAL["rrt_frontiers"]))
 """Name -> callable(env) -> policy."""
+
+PLANAR = ("rrt_frontiers", "lookahead", "oracle", "clairvoyant")
+"""Those that there are in the plane alone."""
 
 REFERENCES = ("random", "oracle", "clairvoyant")
 """None is a classical planner that a learned policy competes with: one knows nothing, the others the true map."""

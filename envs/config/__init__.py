@@ -12,7 +12,7 @@ from maexp.envs.config.observation import ObservationConfig
 from maexp.envs.config.planner import PlannerConfig
 from maexp.envs.config.radar import RadarConfig
 from maexp.envs.config.reward import TIME_ON, RewardConfig
-from maexp.envs.config.robot import BODY, ROBOT_KINDS, RobotConfig
+from maexp.envs.config.robot import BODY, ROBOT_KINDS, VOLUME_KINDS, RobotConfig
 from maexp.envs.config.targets import TargetsConfig
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "STARTS",
     "STRATEGIES",
     "TIME_ON",
+    "VOLUME_KINDS",
     "CommConfig",
     "EnvSettings",
     "FaultsConfig",

@@ -2,16 +2,17 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from maexp.envs.config.group import Group
-from maexp.envs.config_fields import check_value, choices_of, kinds, setting
+from maexp.envs.config_fields import check_value, kinds, setting
 from maexp.envs.scenarios import Scenario
 
 RobotKind = Literal["ackermann", "differential", "omnidirectional"]
 
 BODY = ("length", "width", "collision_threshold")
 """What a radius decides of a robot."""
+VolumeKind = Literal["quadrotor", "climber"]
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,9 @@ class RobotConfig(Group):
 
     group = "robot"
 
-    kind: RobotKind = setting("ackermann", "how it drives")
+    kind: Literal[RobotKind, VolumeKind] | None = setting(
+        None, "how it drives; in volumes quadrotor or climber, which drives on the ground and climbs steps"
+    )
     length: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_length")
     width: float | None = setting(None, "of the body", unit="m", above=0, scenario="body_width")
     wheelbase: float | Literal["width", "length"] | None = setting(
@@ -37,6 +40,7 @@ class RobotConfig(Group):
     radius: float | None = setting(
         None, "of a round body, which says length, width and collision_threshold", unit="m", above=0
     )
+    step_height: float = setting(0.25, "highest step of a climber, rounded up to whole voxels", unit="m", low=0)
 
     def completed(self, scenario: Scenario) -> "RobotConfig":
         """With what the radius or the scenario fixes."""
@@ -44,6 +48,8 @@ class RobotConfig(Group):
             self._check_radius(self.radius)
             scenario = scenario.with_radius(self.radius)
         config = super().completed(scenario)
+        if config.kind is None:
+            config = replace(config, kind=scenario.robot_kind)
         if config.wheelbase in (None, "width", "length"):
             config = replace(config, wheelbase=getattr(config, config.wheelbase or "width"))
         if config.max_steer is not None and config.max_steer >= math.pi / 2:
@@ -63,4 +69,5 @@ class RobotConfig(Group):
                 )
 
 
-ROBOT_KINDS = choices_of(RobotConfig, "kind")
+ROBOT_KINDS, VOLUME_KINDS = get_args(RobotKind), get_args(VolumeKind)
+"""Those that drive in the plane, and those that move in volumes."""

@@ -99,7 +99,7 @@ def read_octree(path: Path) -> Cloud:
     if not leaves:
         raise MapError(f"{path} promises {promised} nodes and none could be read; save it again")
     table = np.array(leaves, dtype=np.float64)
-    expanded = _split_voxels(table[:, :3], table[:, 3], resolution)
+    expanded = split_voxels(table[:, :3], table[:, 3], resolution)
     occupied = np.repeat(table[:, 4] > 0, np.rint(table[:, 3] / resolution).astype(int).clip(1) ** 3)
     if not occupied.any():
         raise MapError(f"{path} has no occupied voxel; nothing would bound the free space")
@@ -124,7 +124,7 @@ def _check_octree(path: Path) -> tuple[float, int]:
     return resolution, nodes
 
 
-def _split_voxels(centres: np.ndarray, sizes: np.ndarray, resolution: float) -> np.ndarray:
+def split_voxels(centres: np.ndarray, sizes: np.ndarray, resolution: float) -> np.ndarray:
     """Centres [m] of the finest voxels that make up voxels of `sizes` [m], in their order."""
     ratio = np.rint(sizes / resolution).astype(np.int64).clip(1)
     total = int((ratio**3).sum())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from maexp.envs.io.bags import BAGS, bag_name, is_bag, read_bag
 from maexp.envs.io.clouds import CLOUDS, make_source, read_cloud
@@ -18,29 +19,39 @@ from maexp.envs.io.sources import GridSource
 from maexp.envs.maps.checker import check_map, repair_map
 from maexp.envs.maps.point_cloud import MapError, PointCloudMap, check_file
 
+if TYPE_CHECKING:
+    from maexp.envs.volume.map import VoxelMap
+
 GRIDS = (".yaml", ".yml", ".pgm", ".png", ".bmp", ".tif", ".tiff")
 POINTS = (".npz", ".npy")
 
 
-def import_map(path: str | os.PathLike, options: ImportOptions | None = None, **overrides) -> PointCloudMap:
+def import_map(
+    path: str | os.PathLike, options: ImportOptions | None = None, *, volume: bool = False, **overrides
+) -> PointCloudMap | VoxelMap:
     """Reads a file and makes it a map a team can explore; see `ImportOptions` for what can be set by hand.
 
     Args:
         path: .yaml (ROS map_server), .pgm, .png, .npz, .npy, .ply, .pcd, .xyz, .las, .laz, .obj, .stl, .glb, .bt, or a
             bag of ROS: .mcap, .db3 or the folder of a rosbag2.
         options: settings; None: everything automatic.
+        volume: keep the file in three dimensions, as a `VoxelMap`.
         overrides: single settings by name, over `options`.
 
     Raises:
         MapError: the file cannot be read, or has no room for the team; says what was found and what to do.
     """
-    return import_map_with_report(path, options, **overrides)[0]
+    return import_map_with_report(path, options, volume=volume, **overrides)[0]
 
 
 def import_map_with_report(
-    path: str | os.PathLike, options: ImportOptions | None = None, **overrides
-) -> tuple[PointCloudMap, ImportReport]:
+    path: str | os.PathLike, options: ImportOptions | None = None, *, volume: bool = False, **overrides
+) -> tuple[PointCloudMap | VoxelMap, ImportReport]:
     """`import_map`, and what each step did."""
+    if volume:
+        from maexp.envs.volume.importing import import_volume  # late: the plane alone needs none of it
+
+        return import_volume(path, make_options(options, overrides))
     begin = time.perf_counter()
     path = Path(path)
     options = make_options(options, overrides)

@@ -27,7 +27,7 @@ UNPACK = "save it without (gltf-transform copy IN.glb OUT.glb, or Blender's expo
 def read_mesh(path: Path, spacing: float) -> Cloud:
     """Points spread evenly over a mesh, one for every `spacing` squared of its surface [file units]; seeded."""
     need("trimesh", "mesh", path)
-    vertices, triangles = _read_triangles(path)
+    vertices, triangles = read_triangles(path)
     return spread_points(path, vertices, triangles, spacing)
 
 
@@ -79,7 +79,7 @@ def _outward(faces: Faces) -> Faces:
     return replace(faces, normals=-faces.normals) if inside_out else faces
 
 
-def _read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     suffix = path.suffix.lower()
     if suffix == ".obj":
         return _read_obj(path)

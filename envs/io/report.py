@@ -135,7 +135,7 @@ def draw_import(world: PointCloudMap, report: ImportReport, path: str | os.PathL
     if isinstance(report.before, ScannedImage):
         _paint_image(before.add_subplot(), report.before)
     else:
-        _paint_cloud(before, report.before)
+        paint_cloud(before, report.before)
     before.suptitle(f"before: {printable(Path(report.path).name)}", fontsize=11)
     paint_map(after.add_subplot(), world, PANEL)
     after.suptitle("after", fontsize=11)
@@ -154,7 +154,7 @@ def _paint_image(axes, image: ScannedImage) -> None:
     axes.set_title(f"{width} x {height} pixels of {image.pixel:g} m", fontsize=9)
 
 
-def _paint_cloud(figure, scan: ScannedPoints) -> None:
+def paint_cloud(figure, scan: ScannedPoints) -> None:
     """The cloud along its third axis and along its second, as an X-ray: walls, floor and ceiling are dark lines."""
     low, high = np.percentile(scan.points, SHOWN, axis=0)
     span = np.maximum(high - low, 1e-3 * (high - low).max() + 1e-9)

@@ -18,6 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from maexp.envs.maps.raster import MapRaster, map_raster
 from maexp.envs.render.video import write_gif, write_mp4
+from maexp.envs.volume.map import VoxelMap
 from maexp.kernels.constants import DT
 
 __all__ = ["draw_frame", "draw_grid", "draw_teams", "record_episode", "watch_episode", "write_gif", "write_mp4"]
@@ -90,6 +91,10 @@ def draw_frame(snapshot: dict, size: int = 512) -> np.ndarray:
     if int(size) != size or size < 64:
         raise ValueError(f"size={size} is not a picture width; give an integer of at least 64 pixels")
     size = int(size)
+    if isinstance(snapshot["map"], VoxelMap):
+        from maexp.envs.volume.render import draw_volume  # builds on what this file draws
+
+        return draw_volume(snapshot, size)
     raster = map_raster(snapshot["map"], size)
     picture = Image.fromarray(raster.paint(point_colours(snapshot, raster.num_free, raster.num_boundary)))
     picture = _draw_moving(snapshot, raster, picture)

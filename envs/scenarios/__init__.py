@@ -6,6 +6,7 @@ from maexp.kernels.lazy import lazy_names
 __all__ = [
     "GENERATED",
     "SCENARIOS",
+    "VOLUMES",
     "Scenario",
     "cut_last_fifth",
     "default_macro_steps",
@@ -14,4 +15,4 @@ __all__ = [
     "split",
 ]
 
-__getattr__ = lazy_names(__name__, {"GENERATED": "table", "SCENARIOS": "table"})
+__getattr__ = lazy_names(__name__, dict.fromkeys(("GENERATED", "SCENARIOS", "VOLUMES"), "table"))

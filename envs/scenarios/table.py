@@ -19,6 +19,7 @@ from maexp.kernels.constants import DT
 LEAST_MACRO_STEPS = 10
 PROTOCOL = "protocol"
 """The pace at which a scenario was published: `Scenario.local_steps` and `macro_steps`."""
+SWEEPS_OF_VOLUME = 8.0  # as `SWEEPS`, of an imported volume, by the squares of the radars' ranges
 SWEEPS = 2.0
 """A team that drove without pause could sweep an imported map this many times in an episode, as in `maze`."""
 
@@ -64,6 +65,11 @@ class Scenario:
     num_steering: int = setting(25, "DWA's candidates of the steering angle")
     max_steer: float = setting(math.pi / 3, "steering limit of a car", unit="rad")
     build: Callable[[int], PointCloudMap] | None = None  # index -> map; None: the user brings the map
+    kind: str = "plane"  # or "volume": its maps are voxels
+    height: float | None = None  # of the maps of a volume [m]
+    vertical_fov: float | None = None  # of the radar of a volume [rad]
+    robot_kind: str = "ackermann"  # how robots move unless `robot.kind` is set
+    scan_every: int | None = None  # local steps from one scan to the next in a volume
     decision_seconds: float | str = setting(
         1.0, "from decision to decision, or protocol: as the scenario was published", unit="s"
     )
@@ -123,29 +129,34 @@ def _read_scenario(name: str) -> Scenario:
 
 
 @cache
-def scenarios() -> dict[str, Scenario]:
+def all_scenarios() -> dict[str, Scenario]:
     """The table. Its files are read when it is first asked for: robots that only plan do without."""
     return {name: _read_scenario(name) for name in list_choices("scenario")}
 
 
 def __getattr__(name: str) -> Any:
-    """`SCENARIOS`, the table, and `GENERATED`: those with maps of their own; the user brings the map of the others."""
+    """`SCENARIOS`, the table of the plane; `VOLUMES`, that of voxels; and `GENERATED`: those of the plane with maps of
+    their own; the user brings the map of the others."""
+    rows = all_scenarios().items() if name in ("SCENARIOS", "VOLUMES", "GENERATED") else ()
     if name == "SCENARIOS":
-        return scenarios()
+        return {name: row for name, row in rows if row.kind == "plane"}
+    if name == "VOLUMES":
+        return {name: row for name, row in rows if row.kind == "volume"}
     if name == "GENERATED":
-        return tuple(name for name, row in scenarios().items() if row.build is not None)
+        return tuple(name for name, row in rows if row.kind == "plane" and row.build is not None)
     raise AttributeError(name)
 
 
 def find_scenario(name: str) -> Scenario:
     """The scenario called `name`; ValueError naming the choices if there is none."""
-    if name not in scenarios():
-        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(scenarios())}.")
-    return scenarios()[name]
+    rows = all_scenarios()
+    if name not in rows:
+        raise ValueError(f"scenario={name!r} is unknown: choose one of {', '.join(rows)}.")
+    return rows[name]
 
 
-def make_map(name: str, index: int = 0) -> PointCloudMap:
-    """Map `index` (any integer >= 0) of scenario `name`: the same points on every call.
+def make_map(name: str, index: int = 0) -> Any:
+    """Map `index` (any integer >= 0) of scenario `name`: the same points, or voxels (`VoxelMap`), on every call.
 
     ValueError for an unknown scenario, a negative index, or a scenario whose map the user brings.
     """
@@ -190,8 +201,12 @@ def default_macro_steps(
     """
     team = team or [(scenario.max_speed, scenario.radar_range)] * 3
     seconds = DT * (local_steps or scenario.local_steps)
-    area = max(m.free_area for m in maps)
     across = max(math.dist(*m.extent) for m in maps)
-    sweeping = area / sum(speed * reach for speed, reach in team)
     crossing = across / min(speed for speed, _ in team)
+    if scenario.kind == "volume":
+        volume = max(m.free_volume for m in maps)
+        sweeping = volume / sum(speed * reach**2 for speed, reach in team)
+        return max(LEAST_MACRO_STEPS, math.ceil(max(SWEEPS_OF_VOLUME * sweeping, SWEEPS * crossing) / seconds - 1e-9))
+    area = max(m.free_area for m in maps)
+    sweeping = area / sum(speed * reach for speed, reach in team)
     return max(LEAST_MACRO_STEPS, math.ceil(SWEEPS * max(sweeping, crossing) / seconds - 1e-9))

@@ -70,16 +70,17 @@ class Contacts:
 @dataclass(frozen=True)
 class FeatureInputs:
     """What is known when N robots of a team choose among M candidates each; `...` are the teams, where there are
-    several. What stands for candidates that are absent is left to whoever fills it in.
+    several, and D the coordinates of a point, 2 or 3. What stands for candidates that are absent is left to whoever
+    fills it in.
 
     Attributes:
         xp: torch or numpy.
         reach: the radar's range [m].
         mask: bool [..., N, M], which candidates there are.
         travel: [..., N, M], length of the way [radar ranges], 0 for those that are absent.
-        to: [..., N, M, 2], from the robot to the candidate [m].
-        way: [..., N, M, 2], from the robot to a point near the beginning of its way [m].
-        toward: [..., N, M, 2], from the candidate to the middle of the unknown beyond it [m].
+        to: [..., N, M, D], from the robot to the candidate [m].
+        way: [..., N, M, D], from the robot to a point near the beginning of its way [m].
+        toward: [..., N, M, D], from the candidate to the middle of the unknown beyond it [m].
         gain: [..., N, M], what is to be seen from there [radar discs].
         gain_near, gain_around: [..., N, M], the same of all candidates within `NEAR` and `AROUND` of it, added up.
         size: [..., N, M], frontier cells.
@@ -89,12 +90,12 @@ class FeatureInputs:
         plan_gap, own_last, mates_last: [..., N, M], distance to the nearest candidate that another robot takes there,
             to the own latest target, to the nearest latest target of another [radar ranges], large where there is none.
         rival: [..., N, M], the shortest way of another robot [radar ranges], large where there is none.
-        at: [..., N, 2], where the robots are [m].
+        at: [..., N, D], where the robots are [m].
         heading, speed, max_speed: of the robots, [..., N, 1] [rad, m/s, m/s]; a limit that all share may be a number.
         drive: [..., N, 1], how far they get until the next decision [m].
         mates: bool [..., N, N], others that move and that a robot hears.
         time_left: share of the whole time, [..., 1, 1], or a number where there is one team.
-        area: what the robots know [m^2], [..., 1 or N, 1] or a number.
+        area: what the robots know [m^2], [..., 1 or N, 1] or a number; of a volume, that of as many radar discs.
         radio: what they know of who has heard what, where they are told (``observation.radio``).
     """
 
@@ -154,7 +155,7 @@ class FeatureInputs:
 
     def _bearing(self, vector: Array) -> tuple[Array, Array]:
         xp, ahead = self.xp, self.ahead
-        unit = vector / xp.clip(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6, None)
+        unit = (vector / xp.clip(xp.linalg.norm(vector, axis=-1, keepdims=True), 1e-6, None))[..., :2]
         return xp.sum(unit * ahead, axis=-1), unit[..., 1] * ahead[..., 0] - unit[..., 0] * ahead[..., 1]
 
     def length(self, vectors: Array) -> Array:

@@ -315,6 +315,10 @@ class Navigation:
         """Edge of a cell of each env's grid [m]: float32 [E]."""
         return self.cell_size[self.state["map_id"].long()]
 
+    def known_area(self) -> torch.Tensor:
+        """What is known [m^2]: float32 [E, R]."""
+        return (self.known != 0).sum(-1).float() * self.cell_of_env().unsqueeze(-1) ** 2
+
     def points(self, cells: torch.Tensor) -> torch.Tensor:
         """Centres of cells [m]: int64 [E, ...] -> float32 [E, ..., 2]."""
         m = self.state["map_id"].long()

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from maexp.envs.comm.radio_features import ContactView
 from maexp.envs.targets.features import AROUND, EDGE, NEAR, FeatureInputs, feature_names
 from maexp.envs.targets.heuristics import WAY_AHEAD, value_targets
-from maexp.envs.targets.tracker import TargetTracker, TensorScene, plan_in_turn
+from maexp.envs.targets.tracker import TargetTracker, TensorScene, make_tracker, plan_in_turn
 from maexp.kernels.greedy_assignment import compare_with_mates, gather_gain
 
 if TYPE_CHECKING:
@@ -39,21 +39,21 @@ class TargetView:
     """
 
     def __init__(self, env: ExplorationEnv, count: int, tracker: TargetTracker | None = None):
-        self.env, self.count, self.tracker = env, count, tracker or TargetTracker(env)
-        shape, device = (env.num_envs, env.num_robots), env.device
+        self.env, self.count, self.tracker = env, count, tracker or make_tracker(env)
+        shape, device, dims = (env.num_envs, env.num_robots), env.device, self.tracker.dims
         self.contacts = ContactView(env) if env.settings.observes_radios else None
         self.shown = count + (self.contacts is not None)
         self.features = len(feature_names(self.contacts is not None))
         self.tells = torch.zeros(shape, dtype=torch.bool, device=device)
         self.state = {
             # where each robot's latest target was [m]
-            "last": torch.zeros((*shape, 2), dtype=torch.float32, device=device),
+            "last": torch.zeros((*shape, dims), dtype=torch.float32, device=device),
             "has_last": torch.zeros(shape, dtype=torch.bool, device=device),
             "block": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # the candidates' numbers
             "cell": torch.zeros((*shape, count), dtype=torch.int64, device=device),  # and grid cells
-            "point": torch.zeros((*shape, count, 2), dtype=torch.float32, device=device),  # and where they are [m]
+            "point": torch.zeros((*shape, count, dims), dtype=torch.float32, device=device),  # and where they are [m]
             # middle of the unknown, from there [m]
-            "toward": torch.zeros((*shape, count, 2), dtype=torch.float32, device=device),
+            "toward": torch.zeros((*shape, count, dims), dtype=torch.float32, device=device),
             "way": torch.zeros((*shape, count), dtype=torch.float32, device=device),  # how far it is to drive there [m]
             "mask": torch.zeros((*shape, count), dtype=torch.bool, device=device),
         }
@@ -128,7 +128,6 @@ class TargetView:
         speed, at = tracker.speed(nav), nav.centers()
         own = torch.eye(best.shape[1], dtype=torch.bool, device=best.device)
         left = env.time_left(nav.state)
-        cells = nav.known_count.float() * nav.cell_of_env().unsqueeze(-1) ** 2
         return FeatureInputs(
             xp=torch,
             reach=reach,
@@ -156,16 +155,16 @@ class TargetView:
             drive=tracker.drive(nav, speed).unsqueeze(-1),
             mates=hears & ~own & scene.alive.unsqueeze(1),
             time_left=left.view(-1, 1, 1),
-            area=cells.unsqueeze(-1),
+            area=nav.known_area().unsqueeze(-1),
         )
 
     def note(self, chosen: torch.Tensor, where: torch.Tensor) -> None:
-        """Remember where robots go: what they chose, int64 [E, N], -1 = nothing, and where that is, float32 [E, N, 2]
-        [m]."""
+        """Remember where robots go: what they chose, int64 [E, N], -1 = nothing, and where that is, float32
+        [E, N, 2] [m], in volumes [E, N, 3]."""
         self.state["has_last"], self.state["last"] = chosen >= 0, where
 
     def take(self, index: torch.Tensor, preference: torch.Tensor | None = None) -> torch.Tensor:
-        """Send every robot to a candidate, int64 [E, N]; the goals, float32 [E, N, 2] [m].
+        """Send every robot to a candidate, int64 [E, N]; the goals, as `TargetTracker.take` gives them.
 
         With `targets.distinct` a robot gets another one where the one that is named is taken.
 
@@ -244,5 +243,5 @@ def _best(value: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def gather_points(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Entries [E, N, M, 2] of [E, N, K, 2]; ``index`` int64 [E, N, M]."""
-    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, 2))
+    """Entries [E, N, M, D] of [E, N, K, D]; ``index`` int64 [E, N, M]."""
+    return values.gather(2, index.unsqueeze(-1).expand(-1, -1, -1, values.shape[-1]))

@@ -145,7 +145,10 @@ class TargetTracker:
             ``stood`` [E, N, 2] [m], ``counted`` [E], the macro step that `dwell` was last counted in, ``home``
             [E, N, 2], where robots started [m]; NaN before the first look.
         body: float32 [E, N], radius of a circle around a robot [m]: what it takes up, whichever way it stands.
+        dims: coordinates of a point.
     """
+
+    dims = 2
 
     def __init__(self, env: ExplorationEnv):
         self.env, self.nav = env, Navigation(env)
@@ -332,6 +335,11 @@ class TargetTracker:
         launch_named(nav.launch, targets._drop_targets, robots, values)
         launch_named(nav.launch, targets._try_again, robots, values)
         return kept
+
+
+def make_tracker(env: ExplorationEnv) -> TargetTracker:
+    """The tracker of an env's targets, in the plane or in a volume."""
+    return env.space.make_tracker(env)
 
 
 def keyed_uniform(env: ExplorationEnv, count: int) -> torch.Tensor:

@@ -13,7 +13,6 @@ from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.progress import Progress
 from maexp.agents.tables import print_table
 from maexp.envs import ExplorationEnv
-from maexp.envs.simulation import bytes_per_env
 
 TEAM_SIZES = [2, 4, 6, 8]
 PAPER_SECONDS_PER_STEP = {
@@ -142,7 +141,7 @@ class MeasuredBatch:
             "laps": len(self.rates),
             "seconds": self.seconds,
             "first_step_seconds": self.first,
-            "memory_per_env": bytes_per_env(env.settings, env.bank),
+            "memory_per_env": env.space.bytes_per_env(env.settings, env.bank),
             "collided_at_end": env.simulation.tensors["collided"].float().mean().item(),
         }
 

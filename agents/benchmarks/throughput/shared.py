@@ -21,6 +21,7 @@ from maexp.agents.config.verbs import BenchSettings
 from maexp.agents.files import write_json
 from maexp.agents.versions import PACKAGES, find_commit
 from maexp.envs import ExplorationEnv
+from maexp.envs.scenarios import find_scenario
 
 OWN = ("task", "seconds", "baseline", "sweep", "axes")
 """Settings of `maexp bench` alone; the rest is that of the runs it measures."""
@@ -45,6 +46,8 @@ def sweep_points(cfg: BenchSettings, overrides: list[str], sizes: list[int], ver
     fixed = without(overrides, *drop, *swept)
     axes.append([f"num_robots={n}" for n in (sizes if cfg.num_robots is None else team_sizes(cfg.num_robots))])
     points = [compose_settings(verb, [*fixed, *point]) for point in itertools.product(*axes)]
+    there = [p for p in points if p.planner.name == "wavefront" or find_scenario(p.scenario.name).kind == "plane"]
+    points = there or points  # in volumes one planner is enough
     return points
 
 

@@ -130,7 +130,12 @@ def test_every_size_of_a_network_has_its_range(name):
     ("kind", "name", "value", "sentence"),
     [
         (RobotConfig, "length", -1, "robot.length=-1 must be a finite number above 0 [m]."),
-        (RobotConfig, "kind", "boat", "robot.kind='boat' must be one of ackermann, differential, omnidirectional."),
+        (
+            RobotConfig,
+            "kind",
+            "boat",
+            "robot.kind='boat' must be one of ackermann, differential, omnidirectional, quadrotor, climber.",
+        ),
         (RadarConfig, "alpha1", 3.0, "radar.alpha1=3.0 must be a number from 0 to 2."),
         (RadarConfig, "fov", 0, "radar.fov=0 must be a finite number above 0 [rad]."),
         (CommConfig, "cell", "big", "comm.cell='big' must be auto or a finite number above 0 [m]."),

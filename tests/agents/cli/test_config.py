@@ -19,7 +19,7 @@ from maexp.agents.config.verbs import SCHEMAS
 from maexp.agents.errors import UserError
 from maexp.conf import groups, list_choices, read_choice, read_file
 from maexp.envs.config import PlannerConfig, RadarConfig, RobotConfig
-from maexp.envs.scenarios import SCENARIOS, Scenario
+from maexp.envs.scenarios import SCENARIOS, VOLUMES, Scenario
 
 
 def refusal(verb: str, *words: str) -> str:
@@ -40,7 +40,7 @@ def test_every_choice_composes_and_is_described(group):
 
 
 def test_choices_match_the_tables_of_the_code():
-    assert set(list_choices("scenario")) == set(SCENARIOS)
+    assert set(list_choices("scenario")) == {*SCENARIOS, *VOLUMES}
     assert set(list_choices("algorithm")) == set(TRAININGS)
     assert set(list_choices("model")) == set(SIZES)
 

@@ -1,0 +1,1 @@
+"""Warp kernels of volumes: voxels as bits, beside those of the plane."""
