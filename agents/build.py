@@ -24,7 +24,7 @@ from maexp.agents.config.verbs import TrainSettings
 from maexp.agents.errors import UserError
 from maexp.agents.models.actor import make_policy
 from maexp.conf import groups_of_choice
-from maexp.envs import ExplorationEnv, PointCloudMap, make_map
+from maexp.envs import ExplorationEnv, PointCloudMap, VoxelMap, make_map
 from maexp.envs.config import GROUPS, STARTS
 from maexp.envs.config_fields import kinds
 from maexp.envs.scenarios import GENERATED, SCENARIOS, VOLUMES, find_scenario
@@ -105,11 +105,11 @@ TOLD: set[str] = set()
 """Warnings of imports in this process: a file that is read again is told of once."""
 
 
-def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
+def import_file(path: str | Path, options: "ImportOptions", volume: bool = False) -> PointCloudMap | VoxelMap:
     """The map of a file; what its import left out is told."""
     from maexp.envs.io import import_map_with_report
 
-    world, report = import_map_with_report(path, options)
+    world, report = import_map_with_report(path, options, volume=volume)
     for text in (f"map {world.name}: {text}" for text in report.warnings):
         if text not in TOLD:
             TOLD.add(text)
@@ -117,11 +117,12 @@ def import_file(path: str | Path, options: "ImportOptions") -> PointCloudMap:
     return world
 
 
-def import_files(scenario: ScenarioSettings) -> list[PointCloudMap]:
+def import_files(scenario: ScenarioSettings) -> list[PointCloudMap] | list[VoxelMap]:
     """The maps of a scenario that builds none: `scenario.path` names a file, or several with commas between them."""
     if not scenario.path:
         raise UserError(f"scenario={scenario.name} needs a map: add scenario.path=FILE.")
-    maps = [import_file(path, scenario.importing) for path in split_paths(scenario.path)]
+    volume = find_scenario(scenario.name).kind == "volume"
+    maps = [import_file(path, scenario.importing, volume) for path in split_paths(scenario.path)]
     names = [world.name for world in maps]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise UserError(f"scenario.path={scenario.path} names two maps called {twice}: rename one of the files.")

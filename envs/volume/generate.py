@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy import ndimage
 
 from maexp.envs.scenarios.lattice import largest_component, make_generator
 from maexp.envs.volume.cave import draw_cave
 from maexp.envs.volume.map import VoxelMap
 from maexp.envs.volume.office import draw_office
-from maexp.envs.volume.reach import DRIVING, Body, ball, label_reachable, passable
+from maexp.envs.volume.reach import DRIVING, Body, label_reachable, passable
 from maexp.envs.volume.town import draw_town
 
 RESOLUTION = 0.25  # [m]
@@ -63,9 +62,3 @@ def _has_joined_storeys(free: np.ndarray) -> bool:
         return False
     height = np.nonzero((labels == int(sizes.argmax()) + 1).sum(axis=(0, 1)) > 0.02 * SHAPE[0] * SHAPE[1])[0]
     return len(height) > 1 and (height.max() - height.min()) * RESOLUTION > 2.0
-
-
-def widen(free: np.ndarray) -> np.ndarray:
-    """Without the slits that no robot of the table fits in."""
-    shape = ball(BODY.radius, RESOLUTION)
-    return ndimage.binary_opening(free, shape)

@@ -304,7 +304,8 @@ def _keep_pieces(free: np.ndarray, side: float, options: ImportOptions, report: 
     labels, count = ndimage.label(free)
     if not count:
         raise MapError(
-            f"{report.path}: no voxel of {side:g} m is free; set importing.resolution, or check up and units"
+            f"{report.path}: voxels of {side:g} m leave no passage: nothing is free; set a smaller "
+            "importing.resolution, or check importing.up and importing.units"
         )
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     body = Body(radius=options.robot_radius or Body().radius)

@@ -110,7 +110,7 @@ def read_full_octree(path: Path) -> Cloud:
     if not 1e-3 <= resolution <= 100 or not 0 < nodes <= rest // bytes_per_node:
         raise MapError(f"{path} is truncated: it promises {nodes} nodes of {resolution:g} m and holds {rest} bytes")
     try:
-        tree = getattr(pyoctomap, kind).read(str(path))
+        tree = getattr(pyoctomap, kind)(resolution).read(str(path))
         leaves = [(*leaf.getCoordinate(), leaf.getSize(), tree.isNodeOccupied(leaf)) for leaf in tree.begin_leafs()]
     except Exception as error:
         raise MapError(f"{path} is not a readable octree ({error}); save it again") from error

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
+FEW = 2000  # places to see from: with fewer ones all offsets are tried
 NEAREST = 1500  # offsets that are all tried; of the farther ones every `SKIPPED`-th
 SKIPPED = 8
-FINE = 4  # points a voxel along a line of sight
+FINE = 8  # points a voxel along a line of sight
 
 
 def seeable(world, sensor_range: float, vertical_fov: float, reachable: np.ndarray, exact: bool = False) -> np.ndarray:
@@ -22,7 +23,7 @@ def seeable(world, sensor_range: float, vertical_fov: float, reachable: np.ndarr
         sensor_range: [m].
         vertical_fov: all of it, half above and half below the horizon [rad].
         reachable: voxels where the sensor can be, bool [X, Y, Z], as of `maexp.envs.volume.reach`.
-        exact: try all offsets; else far ones are sampled, which misses a few voxels in far corners.
+        exact: try all offsets; else, where there are many places, far ones are sampled, which misses a few voxels.
     """
     margin = int(sensor_range / world.resolution + 1e-6)
     free = np.pad(world.free, margin)
@@ -30,6 +31,7 @@ def seeable(world, sensor_range: float, vertical_fov: float, reachable: np.ndarr
     sources = np.pad(reachable & world.free, margin).ravel()
     seen = sources.copy()
     left = np.flatnonzero(flat & ~seen)
+    exact = exact or np.count_nonzero(sources) < FEW
     for offset in _offsets(margin, sensor_range / world.resolution, vertical_fov, exact):
         if not len(left):
             break
