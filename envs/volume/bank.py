@@ -26,6 +26,7 @@ from maexp.kernels.volume.scan import Sensors
 from maexp.kernels.volume.seeable import mark_seeable
 
 CELL = 0.5  # side of the cells that ways and gains are found on, at most [m]
+MOST_SIDE = 6  # voxels along a cell: the kernels count those unknown in a byte
 BLOCKS_PER_RANGE = 2.5  # blocks of frontiers in a radar's range
 DISC_OF_VIEW = 0.27
 """Gains count in this share of a full view: so 0.3 of it, what is worth a way in the plane (`choices.LEAST_GAIN`), is
@@ -70,7 +71,7 @@ class VoxelBank:
     @property
     def side(self) -> int:
         """Voxels along a cell."""
-        return max(1, round(CELL / self.resolution - 1e-6))
+        return max(1, min(MOST_SIDE, round(CELL / self.resolution - 1e-6)))
 
     @property
     def block(self) -> int:
@@ -223,7 +224,8 @@ def _sensors(bank: VoxelBank, array) -> Sensors:
     offset, skip, begin = _join(trees)
     sensors.offset, sensors.skip = array(offset, wp.vec3i), array(skip, wp.int32)
     sensors.begin = array(np.repeat(begin[:, None], count, axis=1), wp.int32)
-    sensors.reach = array(np.array([radar.range for radar in bank.radars], dtype=np.float32), wp.float32)
+    farthest = [max(radar.range, START_BALL) for radar in bank.radars]
+    sensors.reach = array(np.array(farthest, dtype=np.float32), wp.float32)
     sensors.cos_fov = array(np.array([_cos_fov(radar) for radar in bank.radars], dtype=np.float32), wp.float32)
     sensors.every = array(np.array([radar.every for radar in bank.radars], dtype=np.int32), wp.int32)
     return sensors

@@ -290,7 +290,8 @@ def _flood(
     # Out:
     distance: wp.array3d(dtype=wp.int16),  # [env, robot, cell], steps; `UNREACHED`
 ):
-    """Steps from each robot to all cells, by turns to the 6 and to the 26 neighbours."""
+    """Steps from each robot to all cells, by turns to the 6 and to the 26 neighbours; from a cell to those beside it
+    and in one step or two to those askew."""
     e, i = wp.tid()
     if looked[e] == 0:
         return
@@ -354,8 +355,18 @@ def _flood(
                                     bits = bits & below
                                     distance[e, i, n * shape[2] + layer] = wp.int16(step)
         for k in range(count):
+            c = listed[e, i, half + k]
+            if not all26:  # these are left askew in the next step
+                some = int(0)
+                for w in range(words):
+                    some = some | wave[e, i, other + c, w]
+                if some == 0:
+                    listed[e, i, other + found] = c
+                    found += 1
             for w in range(words):
-                wave[e, i, half + listed[e, i, half + k], w] = 0
+                if not all26:
+                    wave[e, i, other + c, w] = wave[e, i, other + c, w] | wave[e, i, half + c, w]
+                wave[e, i, half + c, w] = 0
         half = other
         count = found
 
@@ -388,7 +399,8 @@ def place_in_cell(maps: VoxelMaps, m: int, cells: Cells, room: wp.array2d(dtype=
 
 @wp.func
 def step_back(distance: wp.array(dtype=wp.int16), shape: wp.vec3i, cell: int) -> int:
-    """The cell before this one on the way from the robot, straight before askew; -1: it is the first."""
+    """The cell before this one on the way from the robot, straight before askew, one step before two; -1: it is the
+    first."""
     here = int(distance[cell])
     if here == 0 or here >= UNREACHED:
         return -1
@@ -396,15 +408,19 @@ def step_back(distance: wp.array(dtype=wp.int16), shape: wp.vec3i, cell: int) ->
     y = cell / shape[2] % shape[1]
     z = cell % shape[2]
     best = int(-1)
-    least = int(4)
+    least = int(8)
     for dx in range(-1, 2):
         for dy in range(-1, 2):
             for dz in range(-1, 2):
-                steps = wp.abs(dx) + wp.abs(dy) + wp.abs(dz)
-                fits = steps == 1 or here % 2 == 0
-                if fits and steps > 0 and steps < least and is_inside(shape, x + dx, y + dy, z + dz):
+                if is_inside(shape, x + dx, y + dy, z + dz):
                     n = ((x + dx) * shape[1] + y + dy) * shape[2] + z + dz
-                    if int(distance[n]) == here - 1:
+                    steps = wp.abs(dx) + wp.abs(dy) + wp.abs(dz)
+                    gap = here - int(distance[n])
+                    fits = gap == 1 and (steps == 1 or here % 2 == 0)
+                    if gap == 2 and here % 2 == 0:  # it waited for a step askew
+                        fits = True
+                        steps += 4
+                    if fits and steps < least:
                         best = n
                         least = steps
     return best

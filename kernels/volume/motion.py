@@ -115,8 +115,9 @@ def _find_way(
     last = place_in_cell(maps, m, cells, room[e, row], cell)
     if inside:
         v = voxel_of(maps, m, p)
-        if has_bit(room[e, row], v[0] * size[1] + v[1], v[2]):
-            last = p
+        if is_inside(size, v[0], v[1], v[2]):  # the last cell may reach over the edge
+            if has_bit(room[e, row], v[0] * size[1] + v[1], v[2]):
+                last = p
     steps = int(distance[e, i, cell])
     if steps < WAY_POINTS:
         way[e, i, steps] = last
@@ -125,7 +126,10 @@ def _find_way(
     while here >= 0:
         n = int(distance[e, i, here])
         if n < WAY_POINTS:
-            way[e, i, n] = place_in_cell(maps, m, cells, room[e, row], here)
+            point = place_in_cell(maps, m, cells, room[e, row], here)
+            for k in range(n, wp.min(steps, WAY_POINTS)):
+                way[e, i, k] = point
+        steps = n
         here = step_back(distance[e, i], shape, here)
 
 

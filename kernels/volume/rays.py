@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 OCTANTS = 8  # trees: one for each eighth of the voxel that the sensor is in
-DENSITY = 0.6  # rays for each voxel on the sphere of the sensor's range
+DENSITY = 0.65  # rays for each voxel on the sphere of the sensor's range
 TOUCH = 2.5  # voxels that a robot feels all around
 
 

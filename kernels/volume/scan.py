@@ -11,6 +11,8 @@ wp.set_module_options(MODULE_OPTIONS)
 
 NEAR = 2.0
 """Voxels this near are in view whichever way a sensor looks: they are under it."""
+WIDER = 1.5
+"""Rays are followed through voxels so far beside a view: what lies behind may be within it."""
 
 
 @wp.struct
@@ -20,7 +22,7 @@ class Sensors:
     offset: wp.array(dtype=wp.vec3i)  # [entry]
     skip: wp.array(dtype=wp.int32)  # [entry], within its tree
     begin: wp.array4d(dtype=wp.int32)  # [2, map, robot, 9], first entry of each eighth's tree; first those of a reset
-    reach: wp.array(dtype=wp.float32)  # [robot] [m]
+    reach: wp.array(dtype=wp.float32)  # [robot], of scans and of a reset's [m]
     cos_fov: wp.array(dtype=wp.float32)  # [robot], of half the view to the sides; -2: all around
     every: wp.array(dtype=wp.int32)  # [robot], local steps from one scan to the next
 
@@ -41,6 +43,16 @@ def is_ahead(d: wp.vec3i, ahead: wp.vec2, cos_fov: float, near: float) -> bool:
     flat = wp.vec2(float(d[0]), float(d[1]))
     size = wp.length(flat)
     return size <= near or wp.dot(flat, ahead) >= cos_fov * size
+
+
+@wp.func
+def leads_ahead(d: wp.vec3i, ahead: wp.vec2, cos_fov: float) -> bool:
+    """Whether rays through a voxel at an offset may come to others within a view to the sides."""
+    flat = wp.vec2(float(d[0]), float(d[1]))
+    sin_fov = wp.sqrt(wp.max(1.0 - cos_fov * cos_fov, 0.0))
+    fore = wp.dot(flat, ahead)
+    side = wp.abs(flat[0] * ahead[1] - flat[1] * ahead[0])
+    return fore * cos_fov + side * sin_fov >= 0.0 and side * cos_fov - fore * sin_fov <= WIDER
 
 
 @wp.func
@@ -87,20 +99,23 @@ def _scan(
         while k < end:
             d = sensors.offset[k]
             on = wp.bool(True)
+            follow = wp.bool(True)
             if limited and kind == 1:
                 on = is_ahead(d, look, sensors.cos_fov[i], NEAR)
+                follow = on or leads_ahead(d, look, sensors.cos_fov[i])
             x = v[0] + d[0]
             y = v[1] + d[1]
             z = v[2] + d[2]
             passes = wp.bool(False)
-            if on and is_inside(size, x, y, z):
+            if follow and is_inside(size, x, y, z):
                 c = x * size[1] + y
                 w = z / 32
                 bit = wp.uint32(1) << wp.uint32(z % 32)
                 if (wp.uint32(maps.free[base + c, w]) & bit) != wp.uint32(0):
-                    free[c, w] = int(wp.uint32(free[c, w]) | bit)
+                    if on:
+                        free[c, w] = int(wp.uint32(free[c, w]) | bit)
                     passes = True
-                elif (wp.uint32(maps.occupied[base + c, w]) & bit) != wp.uint32(0):
+                elif on and (wp.uint32(maps.occupied[base + c, w]) & bit) != wp.uint32(0):
                     set_bit(surface, c, z)
             if passes:
                 k += 1

@@ -153,18 +153,30 @@ def setups() -> dict:
         "rollouts, near": (dict(planner=wavefront, comm=near), "lookahead"),
         "arrivals": (dict(planner=wavefront, decide="arrival"), "multi_criteria"),
         "direct": (dict(planner=PlannerConfig(name="direct")), None),
+        "volumes": (dict(volumes=True, num_robots=3, radar=RadarConfig(range=2.0)), "cost_utility"),
+        "volumes, near": (
+            dict(
+                volumes=True,
+                num_robots=4,
+                comm=CommConfig(range=1.5, line_of_sight=True, loss=0.2),
+                radar=RadarConfig(range=2.0, fov=2.0, every=2),
+                faults=FaultsConfig(probability=0.9, duration=0.5),
+            ),
+            "hungarian",
+        ),
     }
 
 
 def play(settings: dict, policy: str | None, steps: int = 3) -> str:
     """Hash of what two envs come to on maps of different kinds."""
+    from voxel_worlds import maps
     from worlds import act, room
 
     from maexp.agents.policies import POLICIES
     from maexp.envs import ExplorationEnv
-    from maexp.kernels.state import STATE
 
-    worlds = [room(29, 22, "rotated"), room(24, 31)]
+    settings = dict(settings)
+    worlds = maps() if settings.pop("volumes", False) else [room(29, 22, "rotated"), room(24, 31)]
     env = ExplorationEnv(worlds, num_envs=2, seed=5, local_steps=6, macro_steps=2, num_threads=1, **settings)
     generator, found = torch.Generator().manual_seed(1), []
     chooser = POLICIES[policy](env) if policy else lambda td: td.update(act(env, generator))
@@ -172,7 +184,7 @@ def play(settings: dict, policy: str | None, steps: int = 3) -> str:
     for _ in range(steps):
         stepped, after = env.step_and_maybe_reset(chooser(td))
         found += [leaf for part in (stepped, after) for _, leaf in sorted_leaves(part)]
-        found += [env.simulation.tensors[name].clone() for name in sorted(STATE)]
+        found += [env.simulation.tensors[name].clone() for name in sorted(env.space.STATE)]
         td = after
     return digest(*found)
 
@@ -193,7 +205,20 @@ def play_alone() -> str:
     distance = mk.geodesic_distance(grid, torch.tensor([[5, 200]] * 3))
     power = mk.received_power(grid[0], points[:60], points[60:120], edge=0.7)
     frontier = mk.frontier_cells(grid, ~grid & (points[:51, 0].view(3, 17, 1) > 6.0))
-    return digest(visible, merged, distance, power, frontier)
+    return digest(visible, merged, distance, power, frontier, *play_seeable())
+
+
+def play_seeable() -> list[torch.Tensor]:
+    """What can be seen of a map of voxels from some of its places."""
+    from voxel_worlds import hall
+
+    from maexp.kernels.volume.rays import grow_trees
+    from maexp.kernels.volume.seeable import mark_seeable
+
+    m = hall()
+    free, occupied = (words.reshape(-1, m.num_words) for words in m.words())
+    places = np.argwhere(m.free)[::500]
+    return [torch.from_numpy(words) for words in mark_seeable(m.shape, free, occupied, places, grow_trees(6.0, 1.6))]
 
 
 def main(cache: str) -> None:

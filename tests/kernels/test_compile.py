@@ -24,6 +24,8 @@ def kernel_modules() -> list[str]:
 def test_the_stages_of_the_step_are_found():
     stages = {"visibility", "merge", "dynamics", "collision", "planner", "reward", "observe", "reset"}
     assert stages <= {name.rsplit(".", 1)[1] for name in kernel_modules()}
+    volumes = {"scan", "mapping", "coarse", "gain", "motion", "reset", "seeable"}
+    assert {f"maexp.kernels.volume.{name}" for name in volumes} <= set(kernel_modules())
 
 
 @pytest.mark.slow
