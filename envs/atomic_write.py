@@ -24,7 +24,9 @@ def whole_file(path: Path) -> Iterator[str]:
         os.replace(part, path)
     except BaseException as error:
         os.unlink(part)
-        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say which file it was
+        if (
+            isinstance(error, OSError) and error.errno is not None and error.filename is None
+        ):  # a full disk does not say which file it was
             error.filename = str(path)
         raise
     _sync(path.parent)  # the new name, too, is on the disk

@@ -72,7 +72,7 @@ def attend(parts: Sequence[Tensor], bias: Tensor) -> Tensor:
         shape [batch, members, width]
     """
     heads = len(parts) // 3
-    scale, bias = parts[0].shape[-1] ** -0.5, bias.expand(-1, parts[0].shape[1], -1)
+    scale, bias = parts[0].shape[-1] ** -0.5, bias.to(parts[0].dtype).expand(-1, parts[0].shape[1], -1)
     mixed = []
     for query, key, value in zip(parts[:heads], parts[heads : 2 * heads], parts[2 * heads :], strict=True):
         mixed.append(torch.baddbmm(bias, query, key.mT, alpha=scale).softmax(-1) @ value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +12,7 @@ from maexp.envs.io.occupancy import label_ones
 from maexp.envs.io.options import ImportOptions
 from maexp.envs.io.report import ImportReport
 from maexp.envs.maps.point_cloud import MapError
-
-
-def read_yaw(turn) -> float:
-    """Angle about z [rad] of a geometry_msgs/Quaternion; 0 where nobody filled it in."""
-    return math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
-
-
-def fill_turn(turn, yaw: float) -> None:
-    """Writes an angle about z [rad] into a geometry_msgs/Quaternion."""
-    turn.x, turn.y, turn.z, turn.w = 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
-
+from maexp.envs.quaternions import read_yaw
 
 OCCUPIED, FREE_BELOW = 0.65, 0.25  # shares of 100, as nav2's map saver has them
 REALS = {7: "f4", 8: "f8"}  # PointField's codes of float32 and float64

@@ -36,7 +36,7 @@ def test_an_episode_lasts_as_long_as_its_robots_need():
     assert steps(0.5, 1.0, robots=1) == pytest.approx(3 * steps(0.5, 1.0), abs=3)
     assert steps(0.5, local_steps=40) == pytest.approx(steps(0.5) / 2, abs=1)
     slow = [RobotConfig(max_speed=0.25), RobotConfig(max_speed=1.0)]
-    env = ExplorationEnv(FLOOR, 1, 2, robot=slow, radar=RadarConfig(range=2.0))
+    env = ExplorationEnv(FLOOR, 1, 2, robot=slow, radar=RadarConfig(range=2.0), decision_seconds="protocol")
     assert env.macro_steps == default_macro_steps([FLOOR], ROW, [(0.25, 2.0), (1.0, 2.0)])
     assert ExplorationEnv(FLOOR, 1, 2, robot=slow, macro_steps=7).macro_steps == 7
 

@@ -266,7 +266,7 @@ def test_collided_robots_stay_and_pay_once():
 def test_bad_actions(maps):
     env = ExplorationEnv(maps[0], num_envs=3)
     td = env.reset()
-    td["agents", "action", "region"] = torch.full((3, 3), 10**12)
+    td["agents", "action", "region"] = torch.full((3, 3), 63)
     td["agents", "action", "offset"] = torch.full((3, 3, 2), 7.0)
     env.step(td.clone())
     (_, _), upper = maps[0].extent

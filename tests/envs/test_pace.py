@@ -129,14 +129,11 @@ def pace(cfg) -> tuple[int, int]:
     ],
 )
 def test_a_run_keeps_its_pace(run, new, wanted, tmp_path):
-    from maexp.agents.config.compose import compose_recipe
-    from maexp.agents.config.env import find_followers
-
     words = ["algorithm=mappo", "scenario=indoor_medium", *run]
     cfg = compose_settings("train", words)
-    saved = {"settings": resolve(cfg), "overrides": words, "followers": find_followers(cfg)}
+    saved = {"settings": resolve(cfg), "overrides": words, "followers": list(cfg.followers)}
     for verb in ("train", "evaluate"):
-        again = compose_recipe(verb, continue_run(tmp_path, saved, new, verb))
+        again = compose_settings(verb, continue_run(tmp_path, saved, new, verb))
         assert pace(again) == wanted
 
 

@@ -8,6 +8,7 @@ GOAL = ("agents", "action", "goal")
 
 
 def make_env(num_envs=4, planner="wavefront", clearance=None, **settings) -> ExplorationEnv:
-    settings = {"maps": MAPS, "seed": 11, "macro_steps": 80} | settings
+    pace = {} if {"local_steps", "decision_seconds"} & {*settings} else {"decision_seconds": "protocol"}
+    settings = {"maps": MAPS, "seed": 11, "macro_steps": 80} | pace | settings
     planning = PlannerConfig(name=planner, clearance_factor=clearance)
     return ExplorationEnv(num_envs=num_envs, planner=planning, num_threads=1, **settings)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from maexp.agents.deploy.planner.grid import check_grid
-from maexp.envs.io.ros_messages import fill_turn, read_yaw
+from maexp.envs.quaternions import fill_turn, read_yaw
 
 Pose = tuple[float, float, float]
 """x, y [m] and yaw [rad]."""

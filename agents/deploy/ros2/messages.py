@@ -13,7 +13,7 @@ from cyclonedds.idl import IdlStruct, types
 
 from maexp.agents.deploy.irsim.simulator import FloorCells
 from maexp.agents.deploy.planner.frames import NOWHERE, OccupancyGrid, Pose, fill_grid, fill_pose
-from maexp.envs.io.ros_messages import fill_turn
+from maexp.envs.quaternions import fill_turn
 
 NAVIGATE = "nav2_msgs/action/NavigateToPose"
 TABLE = {

@@ -49,7 +49,7 @@ def test_nothing_is_null(scenario, planner):
     assert None not in settings.values()
     row = SCENARIOS[scenario]
     assert settings["radar.range"] == row.radar_range and settings["robot.max_speed"] == row.max_speed
-    assert settings["scenario.local_steps"] == row.local_steps
+    assert settings["scenario.local_steps"] == row.decision_steps()
     assert settings["scenario.maps"] and settings["scenario.held_out"]
     assert ("planner.num_steering" in settings) == (planner != "direct")
     assert ("planner.replan_steps" in settings) == (planner == "wavefront")
@@ -163,7 +163,10 @@ def test_another_scenario_brings_its_own_values_but_not_what_the_run_had_set():
     saved = save("scenario=maze", "robot.max_speed=3", "scenario.maps=[1]", reward__overlap=0.3, radar__range=99.0)
     after, row = play(saved, "scenario=indoor_medium"), SCENARIOS["indoor_medium"]
     assert after["radar.range"] == row.radar_range and after["robot.length"] == row.body_length
-    assert after["scenario.macro_steps"] == row.macro_steps and after["planner.num_steering"] == row.num_steering
+    assert (
+        after["scenario.macro_steps"] == row.episode_decisions(None, row.decision_steps())
+        and after["planner.num_steering"] == row.num_steering
+    )
     assert after["scenario.maps"] == list(range(21)) and after["scenario.validation"] == list(range(21, 26))
     assert after["robot.max_speed"] == 3.0, "set by the run itself"
     assert after["reward.overlap"] == 0.3, "no matter of scenarios"

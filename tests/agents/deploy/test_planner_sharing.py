@@ -145,6 +145,7 @@ def test_who_goes_back_and_forth_gets_the_nearest_that_nobody_has():
         way = np.array([[1.0, 2.0, 3.0]] * 2)
         shares = DistinctTargets(-way, way, np.array([[0.0, 0.0], [5.0, 0.0], [9.0, 0.0]]), team.radius)
         shares.taken = np.array([2, other])
+        watch.near = np.zeros((2, 3), dtype=bool)
         notes = watch.settle(team, np.array([0, 1]), Blocks(), way, shares, 5.0)
         assert len(notes) == 1 and shares.taken.tolist() == [wanted, other]
         assert watch.tracks[0].hold == (wanted, 0)

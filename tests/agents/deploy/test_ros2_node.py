@@ -14,7 +14,7 @@ from paths import ROOT
 from maexp.agents.deploy.planner import frames
 from maexp.agents.deploy.planner.messages import read_word, write_word
 from maexp.agents.runtime import TeamPlanner, Word
-from maexp.envs.io.ros_messages import read_yaw
+from maexp.envs.quaternions import read_yaw
 
 pytest.importorskip("rosbags", reason="THE EXTRA maexp[rosbag] IS NOT INSTALLED: messages of ROS are not tested")
 from bag_writer import GRID, STORE, TF, grid, transforms

@@ -41,7 +41,9 @@ def plan(team: TeamPlanner, grid=None, poses=POSES, origin=(0.0, 0.0), now=0.0):
 def test_it_chooses_as_the_simulators_search(scenario, index):
     """On the simulator's own grids with the simulator's robots, also where that departs from `multi_criteria`."""
     robot = RobotConfig(radius=RADIUS, wheelbase=WHEELBASE * RADIUS)
-    env = ExplorationEnv(make_map(scenario, index), num_envs=1, num_robots=3, seed=1, robot=robot)
+    env = ExplorationEnv(
+        make_map(scenario, index), num_envs=1, num_robots=3, seed=1, robot=robot, decision_seconds="protocol"
+    )
     sight, search = TeamSight(env), LookaheadPlanner(env, LookaheadConfig())
     td, same, departs = env.reset(), [], []
     episode = sight.episode(0)

@@ -211,9 +211,9 @@ def policy(name: str, **shown) -> NamedPolicy:
 def test_an_env_shows_what_its_policies_look_at_and_no_more():
     from maexp.agents.config.compose import compose_settings
 
-    def suited(*players, words=()):
-        cfg = compose_settings("evaluate", ["policy=random", *words])
-        suit_observation(cfg, players)
+    def suited(*policies, specs=()):
+        cfg = compose_settings("evaluate", ["policy=random", *specs])
+        suit_observation(cfg, policies)
         return cfg.observation.targets, cfg.observation.pictures, cfg.observation.map
 
     assert suited(policy("a")) == (0, False, "seen"), "pictures that nobody looks at"
