@@ -41,7 +41,7 @@ class CoverageRecorder:
         if not self._batches:
             return  # the block began in the middle of an episode: it has no start to count from
         batch = self._batches[-1]
-        if np.array_equal(step, batch["step"][-1] if batch["step"] else None):
+        if batch["step"] and np.array_equal(step, batch["step"][-1]):
             return  # every team is done and stands still
         batch["step"].append(step)
         batch["coverage"].append((state["covered"] / totals[state["map_id"].long()]).cpu().numpy())
@@ -66,8 +66,8 @@ class CoverageRecorder:
         coverage = []
         for batch in self._batches:
             curves, steps = np.stack(batch["coverage"], axis=1), np.array(batch["step"])
-            steps = steps.T if steps.ndim > 1 else [steps] * len(curves)
-            coverage.append(np.stack([np.interp(times, *pair) for pair in zip(steps, curves, strict=True)]))
+            of_team = list(steps.T) if steps.ndim > 1 else [steps] * len(curves)
+            coverage.append(np.stack([np.interp(times, *pair) for pair in zip(of_team, curves, strict=True)]))
         return times * DT, np.concatenate(coverage)[:episodes]
 
     def contributions(self, episodes: int | None = None) -> np.ndarray:

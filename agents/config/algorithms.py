@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from maexp.conf import list_choices, read_choice
 from maexp.envs.config.env import Knower
@@ -74,12 +74,13 @@ class AlgorithmSettings:
             "lmbda": math.exp(-seconds / self.trace_seconds),
             "learn_share": share,
         }
-        return replace(self, **{name: value for name, value in found.items() if getattr(self, name) is None})
+        missing: dict[str, Any] = {name: value for name, value in found.items() if getattr(self, name) is None}
+        return replace(self, **missing)
 
     def loss_arguments(self) -> dict:
         """What the loss's constructor takes from these settings (`at_pace`)."""
-        names = ("gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage")
-        names += ("mask_collided",)
+        names = ["gamma", "lmbda", "finite_horizon", "entropy_coeff", "critic_coeff", "normalize_advantage"]
+        names += ["mask_collided"]
         return {name: getattr(self, name) for name in names}
 
 

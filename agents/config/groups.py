@@ -72,7 +72,7 @@ class ScenarioSettings:
         "drawn", "anew at every reset; together: in one place; fixed: once a map; or a .csv or .npy of poses"
     )
     decision_seconds: Any = same(EnvSettings, "decision_seconds")
-    decide: str = same(EnvSettings, "decide")
+    decide: Literal["together", "arrival"] = same(EnvSettings, "decide")
     success_coverage: float = same(EnvSettings, "success_coverage")
     done: Knower = same(EnvSettings, "done")
     collision: Literal["centre", "footprint"] = same(EnvSettings, "collision")

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from maexp.envs.config.group import Group
 from maexp.envs.config_fields import check_value, kinds, setting
@@ -49,7 +49,8 @@ class RobotConfig(Group):
             scenario = scenario.with_radius(self.radius)
         config = super().completed(scenario)
         if config.kind is None:
-            config = replace(config, kind=scenario.robot_kind)
+            kind: Any = scenario.robot_kind
+            config = replace(config, kind=kind)
         if config.wheelbase in (None, "width", "length"):
             config = replace(config, wheelbase=getattr(config, config.wheelbase or "width"))
         if config.max_steer is not None and config.max_steer >= math.pi / 2:

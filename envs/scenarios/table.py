@@ -94,7 +94,8 @@ class Scenario:
             seconds = self.decision_seconds if decide == "together" else PROTOCOL
         if seconds == PROTOCOL:
             return self.local_steps
-        steps = round(float(seconds) / DT)
+        seconds = float(seconds)
+        steps = round(seconds / DT)
         if steps < 1 or abs(steps * DT - seconds) > 1e-6:
             raise ValueError(
                 f"decision_seconds={seconds:g} is no whole number of control steps of {DT:g} s: give {DT:g} or a "
@@ -187,7 +188,7 @@ def cut_last_fifth(indices: range) -> tuple[range, range]:
 
 
 def default_macro_steps(
-    maps: Sequence[PointCloudMap],
+    maps: Sequence[Any],
     scenario: Scenario,
     team: Sequence[tuple[float, float]] | None = None,
     local_steps: int | None = None,
@@ -196,6 +197,7 @@ def default_macro_steps(
     of ``maps``), and its slowest robot drive across as many times.
 
     Args:
+        maps: point clouds, or voxels where the scenario is one of volumes.
         team: speed [m/s] and radar range [m] of every robot; None: three as the scenario has them.
         local_steps: of a macro step; None: the scenario's.
     """

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -141,7 +141,7 @@ class LearnedChoice:
         tell = np.full(len(found), -np.inf)
         if candidates.mask.shape[1] > count:
             tell = np.where(candidates.mask[:, count], found[:, count], -np.inf)
-        return rank(scene, logits, shown), tell
+        return rank(cast(Any, scene), logits, shown), tell  # a frozen dataclass is no Protocol with settable members
 
 
 def read_contract(folder: Path) -> Contract:
@@ -159,8 +159,8 @@ def read_contract(folder: Path) -> Contract:
     radio = content.get("features") == list(feature_names(radio=True))
     if not radio and content.get("features") != list(FEATURES):
         raise ValueError(f"{folder} was made for other features than this version of maexp has: {AGAIN}")
-    numbers = [content.get(name) for name in NUMBERS]
-    count = content.get("candidates")
+    numbers: list[Any] = [content.get(name) for name in NUMBERS]
+    count: Any = content.get("candidates")
     right = all(type(number) in (int, float) and 0 < number < 1e6 for number in numbers)
     if not right or type(count) is not int or not 0 < count <= 1024:
         raise ValueError(f"{folder / CONTRACT} lacks one of {', '.join(NUMBERS)}, candidates: {AGAIN}")

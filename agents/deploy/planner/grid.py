@@ -140,7 +140,7 @@ def fill_masked(grid) -> np.ndarray:
     """An array, with -1 in the masked cells of a masked one."""
     if not isinstance(grid, np.ma.MaskedArray) or grid.dtype.kind not in "iuf":
         return np.asarray(grid)
-    return (grid.astype(np.int64) if grid.dtype.kind == "u" else grid).filled(-1)
+    return np.ma.filled(grid.astype(np.int64) if grid.dtype.kind == "u" else grid, -1)
 
 
 def _check_origin(origin) -> tuple[float, float, float]:

@@ -94,7 +94,7 @@ def _numbers(value) -> np.ndarray | None:
     """float64, NaN where a masked array is masked; None: they are no numbers."""
     try:
         if isinstance(value, np.ma.MaskedArray):
-            value = value.astype(np.float64).filled(np.nan)
+            value = np.ma.filled(value.astype(np.float64), np.nan)
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
