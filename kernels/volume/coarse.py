@@ -64,8 +64,9 @@ def _find_room(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # State in:
+    # Scratch in:
     looked: wp.array(dtype=wp.int32),  # [env]
+    # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     # Out:
     room: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
@@ -100,8 +101,9 @@ def _find_cells(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # State in:
+    # Scratch in:
     looked: wp.array(dtype=wp.int32),  # [env]
+    # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     known_surface: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     # In:
@@ -216,8 +218,9 @@ def _place_targets(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # State in:
+    # Scratch in:
     looked: wp.array(dtype=wp.int32),  # [env]
+    # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     known_surface: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     # In:
@@ -278,8 +281,9 @@ def _flood(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # State in:
+    # Scratch in:
     looked: wp.array(dtype=wp.int32),  # [env]
+    # State in:
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
     # In:
     open: wp.array4d(dtype=wp.int32),  # [env, row, cell column, word]

@@ -42,7 +42,7 @@ def kernels() -> dict[str, wp.Kernel]:
     for name in kernel_modules():
         for kernel in vars(importlib.import_module(name)).values():
             if isinstance(kernel, wp.Kernel) and kernel.module.name == name:
-                found[f"{name.rsplit('.', 1)[1]}.{kernel.key}"] = kernel
+                found[f"{name.removeprefix('maexp.kernels.')}.{kernel.key}"] = kernel
     return found
 
 

@@ -16,10 +16,12 @@ from maexp.envs import (
 )
 from maexp.envs.simulation import TRACK_LENGTH
 from maexp.envs.specs import REWARD_TERMS
+from maexp.kernels import state as plane_state
 from maexp.kernels import step
 from maexp.kernels.observe import picture_shapes
 from maexp.kernels.planner import find_paths, pick_waypoints, set_goals
 from maexp.kernels.state import AXES, SCRATCH, STATE
+from maexp.kernels.volume import state as volume_state
 
 FIELDS = STATE | SCRATCH
 PLANNERS = ("dwa", "wavefront", "direct")
@@ -116,14 +118,15 @@ def test_headings_name_the_table_that_an_array_is_of(met):
     given = {}
     for kernel, fields in met:
         for argument, name in zip(arguments(kernel), fields, strict=True):
-            given.setdefault((kernel.key, argument.name), (argument, set()))[1].add(name)
+            given.setdefault((kernel.module.name, kernel.key, argument.name), (argument, set()))[1].add(name)
     for kernel in kernels().values():  # those of `Navigation` are met by their names only
         for argument in arguments(kernel):
             name = argument.name if argument.heading.startswith("State") else None
-            given.setdefault((kernel.key, argument.name), (argument, {name}))
-    for (kernel, _), (argument, names) in given.items():
+            given.setdefault((kernel.module.name, kernel.key, argument.name), (argument, {name}))
+    for (module, kernel, _), (argument, names) in given.items():
         own = names & {argument.name} or names  # `active` stands for `mask` where a reset scans
-        table = {"State" if name in STATE else "Scratch" if name in SCRATCH else "" for name in own}
+        tables = volume_state if module.startswith("maexp.kernels.volume.") else plane_state
+        table = {"State" if name in tables.STATE else "Scratch" if name in tables.SCRATCH else "" for name in own}
         heading = argument.heading
         kind = heading.split()[0] if heading.startswith("State") or heading.startswith("Scratch ") else ""
         assert table == {kind} or own == {"map_id"}, f"{kernel}: {argument.name} ({own}) under {heading!r}"

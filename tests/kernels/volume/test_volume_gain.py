@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from oracle import volume_gain
-from test_volume_kernels_cells import cell_shape, known_env
+from test_volume_cells import cell_shape, known_env
 from voxel_worlds import grid, map_of, run
 
 from maexp.envs import RadarConfig
