@@ -64,7 +64,7 @@ def _find_room(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # Scratch in:
+    # In:
     looked: wp.array(dtype=wp.int32),  # [env]
     # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
@@ -101,7 +101,7 @@ def _find_cells(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # Scratch in:
+    # In:
     looked: wp.array(dtype=wp.int32),  # [env]
     # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
@@ -218,7 +218,7 @@ def _place_targets(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # Scratch in:
+    # In:
     looked: wp.array(dtype=wp.int32),  # [env]
     # State in:
     known_free: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
@@ -281,7 +281,7 @@ def _flood(
     map_id: wp.array(dtype=wp.int32),  # [env]
     # Settings:
     cells: Cells,
-    # Scratch in:
+    # In:
     looked: wp.array(dtype=wp.int32),  # [env]
     # State in:
     center: wp.array2d(dtype=wp.vec3),  # [env, robot]
