@@ -59,9 +59,8 @@ def _look_around(
     # Settings:
     cells: Cells,
     views: Views,
-    # State in:
-    looked: wp.array(dtype=wp.int32),  # [env]
     # In:
+    looked: wp.array(dtype=wp.int32),  # [env]
     room: wp.array4d(dtype=wp.int32),  # [env, row, column, word]
     unknown: wp.array3d(dtype=wp.uint8),  # [env, row, cell], 255: it blocks rays
     distance: wp.array3d(dtype=wp.int16),  # [env, robot, cell]

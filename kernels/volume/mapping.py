@@ -219,7 +219,7 @@ def _share_maps(
 def _clear_words(
     # Scratch in:
     mask: wp.array(dtype=wp.int32),  # [env]
-    # State out:
+    # Out:
     words: wp.array3d(dtype=wp.int32),  # [env, column, word]
 ):
     e, c = wp.tid()
