@@ -16,7 +16,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maexp.agents.benchmarks.suites.play import Player, build_env, build_maps, play_batch
+from maexp.agents.benchmarks.suites.play import SuitePolicy, build_env, build_maps, play_batch
 from maexp.agents.benchmarks.suites.suite import load_suite
 from maexp.agents.deploy.planner.arena_policy import TeamAgent
 from maexp.agents.policies.remote.numpy_policy import as_policy
@@ -53,7 +53,7 @@ class Timed:
 @contextmanager
 def inside(name, suite):
     """A planner as the suite plays it; gives what the env shows, what makes the policy, and its process."""
-    player = Player(name)
+    player = SuitePolicy(name)
     yield player.observation(), player.open, lambda: None
 
 
@@ -71,7 +71,7 @@ def in_python(name, suite):
 @contextmanager
 def in_a_process(name, suite):
     """The same in a process of its own."""
-    player, opened = Player(f"process:{name}"), []
+    player, opened = SuitePolicy(f"process:{name}"), []
 
     @contextmanager
     def make(env):
@@ -94,7 +94,7 @@ def at_a_socket(name, suite):
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         server.stdout.readline()  # it listens
-        player = Player(f"socket:{address}")
+        player = SuitePolicy(f"socket:{address}")
         yield player.observation(), player.open, lambda: None
     finally:
         server.send_signal(signal.SIGINT)

@@ -88,7 +88,7 @@ class Ros2Player:
         name: what results call it.
     """
 
-    word = WORD
+    spec = WORD
     hosted = False
 
     def __init__(self, name: str, wire: Wire, serving: Serving):
