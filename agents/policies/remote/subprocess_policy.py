@@ -36,8 +36,8 @@ class HostedPolicy:
     """A foreign policy for all teams of an env, each with a guest of its own.
 
     Beside the action it writes ``lost``, bool [E, 1]: teams whose guest has failed in this episode, and
-    ``decision_seconds``, float64 [E, 1]: what the decision took (`PolicyProcess.seconds`) [s]. A team that is lost stays where
-    it is; its next episode has a new guest.
+    ``decision_seconds``, float64 [E, 1]: what the decision took (`PolicyProcess.seconds`) [s]. A team that is lost
+    stays where it is; its next episode has a new process.
 
     Args:
         env: with a planner that drives to goals.

@@ -32,7 +32,8 @@ from maexp.envs.maps.nav_grid import build_nav_grid, open_cells
 from maexp.envs.scenarios import GENERATED, cut_last_fifth, default_macro_steps, find_scenario, split
 from maexp.envs.targets.tracker import TensorScene, keyed_uniform
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.tests.tools.predictor.command import run
+
+from .command import run
 
 NEVER = 255  # a cell that does not get known
 LONGER = 2.0  # episodes go on for so many times the scenario's decisions: late beliefs count too

@@ -20,10 +20,11 @@ from maexp.agents.files import write_file, write_json, write_text
 from maexp.agents.models.map_predictor import CONTRACT, NETWORK, STRIDE, MapPredictor, finish_guess
 from maexp.agents.policies.export import OPSET, PACKAGES, trace_network
 from maexp.agents.versions import find_commit
-from maexp.tests.tools.predictor.beliefs import load_groups
-from maexp.tests.tools.predictor.command import run
-from maexp.tests.tools.predictor.score import count_tables
-from maexp.tests.tools.predictor.train import CHECKPOINT
+
+from .beliefs import load_groups
+from .command import run
+from .score import count_tables
+from .train import CHECKPOINT
 
 FORMAT = "maexp-predictor-1"
 MOST = {"batch": 4096, "rows": 256, "columns": 256}

@@ -21,9 +21,10 @@ from maexp.agents.models.map_predictor import load_predictor, predict, sample_wo
 from maexp.agents.tables import fixed, markdown_table
 from maexp.envs.config_fields import check_settings, setting
 from maexp.kernels.constants import FREE, OBSTACLE, UNKNOWN
-from maexp.tests.tools.predictor.beliefs import BeliefEpisode, load_groups
-from maexp.tests.tools.predictor.command import run
-from maexp.tests.tools.predictor.train import BAND, matters
+
+from .beliefs import BeliefEpisode, load_groups
+from .command import run
+from .train import BAND, matters
 
 MOST_DISTANCE = 48  # cells; a histogram takes what lies farther as lying there
 BINS = 15  # of the expected calibration error

@@ -23,8 +23,9 @@ from maexp.agents.files import write_file, write_text
 from maexp.agents.models.map_predictor import MapPredictor
 from maexp.envs.config_fields import check_settings, setting
 from maexp.kernels.constants import FREE, UNKNOWN
-from maexp.tests.tools.predictor.beliefs import BeliefEpisode, load_groups
-from maexp.tests.tools.predictor.command import run
+
+from .beliefs import BeliefEpisode, load_groups
+from .command import run
 
 BAND = 2.0  # radar ranges from known free ground within which cells count
 EDGE = 8  # cells at the edge of a crop that do not count: what is known beyond is cut off

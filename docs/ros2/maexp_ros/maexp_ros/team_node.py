@@ -20,9 +20,9 @@ from maexp.agents.deploy.planner.drivers import RadioDriver, make_driver
 from maexp.agents.deploy.planner.frames import fill_pose
 from maexp.agents.deploy.planner.radio_features import USED
 from maexp.agents.deploy.planner.team_driver import UPDATES, DriverSettings, Order, read_settings
-from maexp.docs.ros2.maexp_ros.maexp_ros import conversion
 from maexp.envs.config.comm import CommConfig
 
+from . import conversion
 from .mates import Mates
 
 OWN = {"robots": ["robot1"], "map_topics": ["/map"], "robot_radius": [0.3], "radar_range": 5.0, "offsets": [0.0]}
