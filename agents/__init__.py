@@ -29,6 +29,7 @@ redirect_modules(
         "measures": "evaluation.metric_format",
         "networks": "models",
         "policies.connection": "policies.remote.server",
+        "policies.wire": "policies.remote.protocol",
         "policies.foreign": "policies.remote.numpy_policy",
         "policies.load": "policies.pretrained",
         "ros2": "deploy.ros2",

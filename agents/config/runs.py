@@ -70,7 +70,7 @@ def continue_run(path: Path, saved: dict, new: list[str], verb: str, *leave_out:
     foreign = [name for name in default_values(SCHEMAS["train"]) if name not in known]
     chosen = _chosen_anew(values, new)
     leave_out += ("preset", "tuning") * (verb != "train")
-    if verb != "train" and find_override(saved["overrides"], "episodes") == "0":  # of a training alone: none
+    if verb != "train" and "episodes=0" in saved["overrides"]:  # of a training alone: none
         leave_out += ("episodes",)
     left_out = [*foreign, *leave_out, *chosen, "hydra", "resume", "checkpoint"]
     left_out += ["scenario.local_steps"] * ("scenario.decision_seconds" in set_names(new))

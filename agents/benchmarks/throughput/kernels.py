@@ -49,20 +49,20 @@ STAGES = ("goal", "plan path", "local step", "observe", "reset")
 COPY_BYTES = 2**28
 MATRIX = 1536
 MODULES = (
+    "braking",
     "collision",
     "dwa",
     "dynamics",
     "geodesic",
-    "known_grid",
     "merge",
     "neighbours",
     "observe",
-    "pace",
-    "passable",
+    "occupancy_grid",
     "planner",
     "reset",
     "reward",
-    "stopping",
+    "speed_limits",
+    "traversability",
     "visibility",
     "wavefront",
 )

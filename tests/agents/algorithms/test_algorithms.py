@@ -15,7 +15,7 @@ from maexp.agents.algorithms.registry import find_algorithm
 FAST = {  # the toy's best settings in few steps; the defaults are for long runs on real maps
     "clipped": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64),
     "trust": dict(fisher_size=64, max_kl=0.06, critic_epochs=2, minibatch_size=64),
-    "actor": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64, lmbda=0.95, entropy_coeff=3e-3),
+    "actor": dict(lr=4e-3, critic_lr=3e-3, minibatch_size=64, gamma=0.99, lmbda=0.95, entropy_coeff=3e-3),
 }
 STYLE = dict(ippo="clipped", mappo="clipped", vdppo="clipped", itrpo="trust", matrpo="trust", vda2c="actor")
 RANDOM, BEST = 0.67, 2.0

@@ -181,7 +181,7 @@ class Bad:
         (np.zeros((2, 2)), r"act\(\) returned numbers of shape \[2, 2\]"),
         (np.full((3, 2), np.inf), r"act\(\) returned a goal that is infinite"),
         (np.full((3, 2), 1j), r"act\(\) returned a ndarray"),
-        (KeyError("grids"), r"policy mine: act\(\) raised KeyError in test_foreign.py, line \d+: 'grids'\."),
+        (KeyError("grids"), r"policy mine: act\(\) raised KeyError in test_numpy_policy.py, line \d+: 'grids'\."),
     ],
 )
 def test_what_is_no_goal_is_told_in_a_sentence(answer, told):

@@ -137,7 +137,7 @@ def test_an_echo_is_no_policy():
 def test_the_processor_time_is_that_of_the_process():
     """Not the time that it waits for, nor ours."""
     program = (
-        "import sys, time; from maexp.agents.policies import wire\n"
+        "import sys, time; from maexp.agents.policies.remote import protocol as wire\n"
         "while (m := wire.read(sys.stdin.buffer)):\n"
         "    begin = time.process_time()\n"
         "    while time.process_time() - begin < m['spin']: pass\n"

@@ -66,7 +66,7 @@ def test_runs_play_beside_what_ships_with_the_checks_of_checkpoint(capsys):
     found = json.loads(Path("beside/results.json").read_text())
     assert list(found)[:3] == ["aims", "regions", "universal"] and set(found["difference"]["aims"]) > {"universal"}
     alone = ["checkpoint=aims", "episodes=2", "scenario.macro_steps=2", "reward=default"]
-    assert main(["evaluate", *alone, "scenario.local_steps=20", "hydra.run.dir=alone"]) == 0
+    assert main(["evaluate", *alone, "scenario.local_steps=10", "hydra.run.dir=alone"]) == 0
     trained = json.loads(Path("alone/results.json").read_text())["trained"]
     assert trained["coverage_auc"] == found["aims"]["coverage_auc"]
     saved = find_named_policy("aims").saved

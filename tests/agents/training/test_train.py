@@ -154,7 +154,7 @@ def test_several_scenarios_in_one_batch(tmp_path, capsys):
         "action=targets",
         "algorithm=mappo",
     ]
-    batch = 2 * 2 + 2 * 15
+    batch = 2 * 2 + 2 * 60
     assert main(["train", *words, "hydra.run.dir=whole", f"total_frames={2 * batch}"]) == 0
     assert main(["train", *words, "hydra.run.dir=halves", f"total_frames={batch}"]) == 0
     assert main(["train", "resume=halves", f"total_frames={2 * batch}"]) == 0

@@ -263,7 +263,7 @@ def test_view_of_a_run_plays_its_policy(tmp_path, capsys, monkeypatch):
     again = view(capsys, "run/checkpoints/best.pt", "num_robots=3", "hydra.run.dir=w", "size=300")
     assert "maze_small_70, trained, 3 robots" in again
     first = Episode.load("v/episodes/trained_0.npz")
-    assert first.step[-1] == 40 and len(first) > 10
+    assert first.step[-1] == 20 and len(first) > 10
     capsys.readouterr()
     assert main(["evaluate", "checkpoint=run", "episodes=2", "render=true", "hydra.run.dir=e"]) == 0
     film = Episode.load("e/episodes/trained_0.npz")

@@ -143,6 +143,7 @@ def play_maps(maps: list[PointCloudMap], robots: int, seed: int, departures: flo
         seed=seed,
         macro_steps=min(steps, NEVER),
         success_coverage=1.0,
+        decision_seconds="protocol",
         num_threads=1,
         planner=PlannerConfig(name="wavefront"),
         observation=ObservationConfig(pictures=False),
