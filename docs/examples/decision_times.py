@@ -80,7 +80,7 @@ def in_a_process(name, suite):
             yield policy
 
     def process():
-        return opened[-1].guests[0] and opened[-1].guests[0].process
+        return opened[-1].workers[0] and opened[-1].workers[0].process
 
     yield player.observation(), make, process
 

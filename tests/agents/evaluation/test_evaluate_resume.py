@@ -107,7 +107,8 @@ def test_what_cannot_go_on_is_a_sentence(unbroken, tmp_path, monkeypatch, capsys
 def test_a_checkpoint_that_was_trained_on_is_played_anew(tmp_path, monkeypatch, capsys):
     """The planner's episodes stay; a policy of two halves would be nobody's."""
     monkeypatch.chdir(tmp_path)
-    assert main(["train", *SMALL, "total_frames=8", "episodes=0", "algorithm.branch_share=0.5", "hydra.run.dir=run"]) == 0
+    training = [*SMALL, "total_frames=8", "episodes=0", "algorithm.branch_share=0.5", "hydra.run.dir=run"]
+    assert main(["train", *training]) == 0
     with monkeypatch.context() as patch:
         stop_after(patch, 3)
         words = ["checkpoint=run", "policy=cost_utility", "num_envs=2", "episodes=4", "hydra.run.dir=e"]
